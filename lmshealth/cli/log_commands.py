@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -14,6 +15,7 @@ from lmshealth.io.log import Log, Refusal
 
 if TYPE_CHECKING:
     from lmshealth.io.manifest import Manifest
+    from lmshealth.modal.frf.measured import MeasuredResponse
     from lmshealth.modal.identification import AmbientReading
     from lmshealth.report.tables import Row
     from lmshealth.tracking.history import LogEstimates
@@ -255,13 +257,17 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     epilog=options.examples(
         "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
         "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
+        "frf hammer.csv --input current_force --output acc_tool",
+        "frf analyser.uff --output 2+Z --plot response.html",
         "frf sweeps/*.h5 --input current_excitation --output acc_pitch --stage lms-y "
         "--format csv > modes.csv",
     )
 )
 @options.LOGS
-@click.option("--input", "source", required=True, metavar="NAME", help="Channel of the excitation.")
-@click.option("--output", required=True, metavar="NAME", help="Channel of the response.")
+@click.option("--input", "source", metavar="NAME", help="Channel of the excitation.")
+@click.option(
+    "--output", metavar="NAME", help="Channel of the response; of measured responses, which one."
+)
 @options.STAGE
 @options.band_option("Use only this band, in Hz; default: the excited band.")
 @click.option(
@@ -270,6 +276,23 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     metavar="S",
     help="Period of the excitation in s, to 1 %; default: found from a periodic input.",
 )
+@click.option(
+    "--impact/--no-impact",
+    default=None,
+    help="Blows of a hammer, which are averaged; default: recognised from the input.",
+)
+@click.option(
+    "--averages",
+    type=click.IntRange(2),
+    metavar="N",
+    help="Averages of a measured response: with its coherence they give the noise.",
+)
+@click.option(
+    "--exponential",
+    type=click.FloatRange(0, min_open=True),
+    metavar="S",
+    help="Time constant of the exponential window on a measured response; its damping is removed.",
+)
 @options.reading_options
 @_PLOT
 @_FORMAT
@@ -277,19 +300,32 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
 def frf(ctx: click.Context, /, **given: Any) -> None:
     """Measure the frequency response between two channels and identify its modes.
 
-    A periodic input is averaged over whole periods, any other over segments. csv lists the modes;
+    A periodic input is averaged over whole periods, blows of a hammer over blows (double hits and
+    overloads are refused), any other input over segments. Measured responses
+    (UFF58, or a table with frequency_hz, real, imag) need no channels. csv lists the modes;
     json also the response with H1, H2, Hv and coherence. With a stage, a mode is named
     if it is the only one in its search band.
     """
-    from lmshealth.modal.frf.identification import read_frf
+    from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
+    from lmshealth.modal.frf.measured import MeasuredResponse
     from lmshealth.modal.naming import name_response, why_unnamed
     from lmshealth.report.tables import fit_row, frf_rows, modes_rows
     from lmshealth.tracking.history import LogEstimates
 
     stage, band, period = given["stage"], options.checked_band(given["band"]), given["period"]
-    names = given["source"], given["output"]
+    source, output = given["source"], given["output"]
     _check_plot(given["plot"], given["logs"])
-    found, lost = _each(ctx, lambda log: (log, read_frf(log, *names, band=band, period=period)))
+    more: Any = {"averages": given["averages"], "window": given["exponential"]}
+
+    def analyse(log: Log | MeasuredResponse) -> tuple[Log | MeasuredResponse, FrfReading]:
+        if isinstance(log, MeasuredResponse):
+            return log, read_measured(log, band=band, **more)
+        impact = given["impact"]
+        return log, read_frf(log, source, output, band=band, period=period, impact=impact)
+
+    found, lost = _each(ctx, analyse, partial(_responses, source, output))
+    if given["plot"] and len(found) > 1:
+        raise click.UsageError(f"--plot draws one of {len(found)} responses; choose by --output.")
     estimates = []
     for log, own in found:
         named = name_response(own.modes, stage) if stage else own.modes
@@ -316,6 +352,31 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
     _exit(ctx, found, lost)
+
+
+def _responses(
+    source: str | None, output: str | None, path: Path, **reading: Any
+) -> list[Log | MeasuredResponse]:
+    """Read the measured responses of a file that are asked for, or its log."""
+    from lmshealth.io.formats.registry import format_name
+    from lmshealth.io.reading import read_log
+    from lmshealth.modal.frf.measured import FORMATS, read_responses
+
+    named = source is not None and output is not None
+    measured = read_responses(path, **reading) if named or format_name(path) in FORMATS else ()
+    if not measured:
+        if not named:
+            raise click.UsageError(
+                f"{path} has no column frequency_hz (or data set of function type 4), so it is a "
+                "log: needed are --input NAME and --output NAME."
+            )
+        return [read_log(path, **reading)]
+    used = [r for r in measured if output in (None, r.output) and source in (None, r.input)]
+    if not used:
+        there = ", ".join(f"{r.output} to {r.input}" for r in measured)
+        why = f"no response of {output or 'any'} to {source or 'any'}; there: {there}"
+        raise BadLog(str(path), "channel", why)
+    return list(used)
 
 
 def _publish(
@@ -349,9 +410,14 @@ def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:
 
 
 def _each(
-    ctx: click.Context, analyse: Callable[[Log], Result]
+    ctx: click.Context,
+    analyse: Callable[[Any], Result],
+    read: Callable[..., list[Any]] | None = None,
 ) -> tuple[list[Result], list[Refusal]]:
-    """Analyse one log after the other; return results and refused logs."""
+    """Analyse one log after the other; return results and refused logs.
+
+    ``read`` reads what a file holds, where that is not one log.
+    """
     from lmshealth.io.manifest import MANIFEST, NOT_LOGS, read_manifest_beside
     from lmshealth.io.reading import read_log
 
@@ -368,9 +434,18 @@ def _each(
                 faults = [refusal for refusal in beside.refused if refusal.log == MANIFEST]
                 terminal.print_notes(_sentences(faults))
             overrides = manifests[path.parent].overrides(path)
-            found.append(analyse(read_log(path, overrides=overrides, **reading)))
+            if read is None:
+                items = [read_log(path, overrides=overrides, **reading)]
+            else:
+                items = read(path, overrides=overrides, **reading)
         except BadLog as why:
             lost.append(Refusal(why.log, why.reason, why.detail))
+            continue
+        for item in items:
+            try:
+                found.append(analyse(item))
+            except BadLog as why:
+                lost.append(Refusal(why.log, why.reason, why.detail))
     return found, lost
 
 

@@ -146,19 +146,30 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     cells = [
         {
             "Hz": f"{row['frequency_hz']:.5g}",
-            "gain (SI)": f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
+            "gain"
+            if fit["method"] == "measured"
+            else "gain (SI)": f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
             "phase °": f"{math.degrees(row['phase_rad']):.1f}",
-            "coherence": f"{row['coherence']:.4f}",
+            "coherence": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
             "fit": f"{row['fit_gain']:.4g}",
         }
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
     print_table(title, cells, 0)
-    if math.isnan(fit["period_s"]):
-        print_text(f"H1 of {fit['n_averages']:.0f} segments: the input is not periodic.")
-    else:
-        print_text(f"Mean of {fit['n_averages']:.0f} periods of {fit['period_s']:.6g} s.")
+    n = fit["n_averages"]
+    methods = {
+        "segments": f"H1 of {n:.0f} segments: the input is not periodic.",
+        "periods": f"Mean of {n:.0f} periods of {fit['period_s']:.6g} s.",
+        "blows": f"H1 of {fit['note']}",
+        "measured": "Measured response in the units of the file; ",
+    }
+    methods["measured"] += (
+        f"its noise follows from the coherence of {n:.0f} averages."
+        if math.isfinite(fit["chi_square"])
+        else "its noise is unknown and taken from the residual of the fit."
+    )
+    print_text(methods[fit["method"]])
     if fit["distortion"] > 0:
         print_text(
             f"The fit misses {percent(fit['distortion'], 1)} of the response beyond the noise "

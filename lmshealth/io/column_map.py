@@ -6,6 +6,7 @@ A column name of the log contract gives the quantity by its prefix and the unit 
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -56,6 +57,11 @@ _PREFIXES: dict[str, tuple[Role, str]] = {
     "reference_velocity": ("reference_velocity", "velocity"),
     "reference_position": ("reference_position", "length"),
 }
+# Columns of a table of measured frequency responses, which `frf` reads.
+RESPONSE_COLUMN = re.compile(
+    r"frequency_(?P<axis>hz|khz|rad_s)|"
+    r"(?:(?P<name>.+)_)?(?P<part>real|imag|magnitude|db|phase_deg|phase_rad|coherence)"
+)
 _DIMENSIONS: dict[Role, str] = {**dict(_PREFIXES.values()), "time": "time"}
 
 
@@ -221,7 +227,8 @@ def load_columns(path: str | Path) -> ColumnMap:
 
 def _check(columns: ColumnMap) -> None:
     """Check names, units and metadata keys before any log is read."""
-    signals = [columns.signal(target).name for target in columns.columns]
+    names = [name for name in columns.columns if not RESPONSE_COLUMN.fullmatch(name)]
+    signals = [columns.signal(name).name for name in names]
     if twice := repeated(signals):
         raise ValueError(f"[columns] names one signal twice: {listed(twice)}")
     if twice := repeated(columns.columns.values()):

@@ -88,8 +88,9 @@ ANSWERS = 5.0
 # standard deviation.
 EXCITED, CLEARLY_EXCITED = 0.2, 30.0
 # Lines needed with periods and without (the noise has to be estimated, too), and most that are
-# fitted.
+# fitted; and those of a measured response whose noise is unknown, twice the unknowns of one mode.
 FRF_LINES, FRF_LINES_OF_RECORD, FRF_MOST_LINES = 16, 64, 20_000
+FRF_LINES_OF_UNKNOWN_NOISE = 34
 # Probability that the first of several equal periods is taken for a transient.
 TRANSIENT = 1e-3
 # Probability that noise alone makes an outlier, and the largest share of lines that may be ones.
@@ -116,6 +117,24 @@ NO_INPUT, STRAY = 0.01, 0.05
 LINES_OF_MODE, BANDWIDTHS_OF_LINES = 3, 3
 # Least power of a mode over that of the distortion around it.
 OVER_DISTORTION = 16.0
+
+# Impact tests
+
+# Level at which a blow triggers, over the strongest and over the noise of the force.
+TRIGGER, TRIGGER_SIGMAS = 0.02, 6.0
+# A force is recognised as blows if less than this share of its samples exceeds a tenth of the peak
+# (noise of that crest factor does not exist) and its pulses hold this share of its energy (a spike
+# in a random force does not). So many equal intervals are a periodic excitation.
+BLOW_DUTY, BLOW_ENERGY, BLOW_REPEATS = 0.05, 0.2, 3
+# A hammer bounces back within 0.1 s, and nobody strikes twice on purpose in this time in s. The
+# share of the first hit from which a second one counts: below it, it is ringing of the filter.
+DOUBLE_WITHIN, SECOND_HIT = 0.25, 0.05
+# Blows below this share of the strongest are touches.
+WEAK_BLOW = 0.1
+# Most lines of a blow: decays are cut accordingly, which the model includes.
+BLOW_LINES = 3000
+# Variance of unknown noise from which the fit of one blow starts, over the power of the answer.
+BLOW_NOISE = 1e-4
 
 # Free decays
 

@@ -19,6 +19,7 @@ from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.frf.measured import MeasuredResponse
 from lmshealth.modal.identification import AmbientReading
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
@@ -212,13 +213,16 @@ def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refus
 
 
 def response_figure(
-    log: Log, reading: FrfReading, modes: Modes, stage: Stage | None = None
+    log: Log | MeasuredResponse, reading: FrfReading, modes: Modes, stage: Stage | None = None
 ) -> LogFigure:
     """Return a figure of a frequency response with its fit, and the modes with their names."""
     frf, fit = reading.frf, reading.fit
     units = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
-    kinds = {channel.name: channel.kind for channel in log.channels}
-    unit = f"({units[kinds[frf.output]]})/{units[kinds[frf.input]]}"
+    if isinstance(log, Log):
+        kinds = {channel.name: channel.kind for channel in log.channels}
+        unit = f"({units[kinds[frf.output]]})/{units[kinds[frf.input]]}"
+    else:
+        unit = log.unit or "unit of the file"
 
     def draw(figure: Figure) -> None:
         panels = list(figure.subplots(3, sharex=True, height_ratios=[2, 1.2, 0.8]))

@@ -71,7 +71,7 @@ LOG_COLUMNS = {
     "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
     "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
     "smallest_loss_of_one_log smallest_loss",
-    "fit": "log input output period_s n_averages n_lines low_hz high_hz mean_coherence "
+    "fit": "log input output method note period_s n_averages n_lines low_hz high_hz mean_coherence "
     "chi_square distortion colour",
     "harmonics": "log channel frequency_hz amplitude_um phase_rad above_floor",
     "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
@@ -345,9 +345,9 @@ def fit_row(log: str, reading: FrfReading) -> Row:
     """Return how a frequency response was measured, and the quality of its modal fit."""
     frf, fit = reading.frf, reading.fit
     values = (
-        *(log, frf.input, frf.output, frf.period, float(frf.n_averages), frf.frequency.size),
-        *(float(frf.frequency[0]), float(frf.frequency[-1]), float(frf.coherence.mean())),
-        *(fit.chi_square, fit.distortion, fit.colour),
+        *(log, frf.input, frf.output, frf.method, frf.note, frf.period, float(frf.n_averages)),
+        *(frf.frequency.size, float(frf.frequency[0]), float(frf.frequency[-1])),
+        *(float(frf.coherence.mean()), fit.chi_square, fit.distortion, fit.colour),
     )
     return _rows("fit", [values])[0]
 

@@ -27,6 +27,8 @@ from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
 from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
+from studies.impact_tests.hammer import RATE as HAMMER_RATE
+from studies.impact_tests.hammer import Hammer, strike
 from tests.assessments import nothing, worn
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 
@@ -591,6 +593,40 @@ def test_a_single_log_heeds_the_manifest_beside_it(folder: Path, tmp_path: Path)
     result = call("modes", log, "--stage", folder / "stage" / "small.toml")
     assert result.exit_code == 0
     assert result.stderr.startswith("note: manifest.csv: ")
+
+
+def test_frf_reads_measured_responses(tmp_path: Path) -> None:
+    """A table of lines needs no channels; of several responses each is fitted, or one is drawn."""
+    f = np.arange(20.0, 120.0, 0.5)
+    h, noise = Machine().response(f), np.random.default_rng(1).standard_normal((2, f.size))
+    h = h + 0.01 * np.abs(h).max() * (noise[0] + 1j * noise[1])
+    path = tmp_path / "analyser.csv"
+    np.savetxt(path, np.column_stack([f, h.real, h.imag, 2 * h.real, 2 * h.imag]), delimiter=",",
+               header="frequency_hz,a_real,a_imag,b_real,b_imag", comments="")  # fmt: skip
+    content = strict(call("frf", path, "--format", "json").stdout)
+    assert [fit["method"] for fit in content["fit"]] == ["measured"] * 2
+    assert {mode["channel"] for mode in content["modes"]} == {"a", "b"}
+    assert content["frf"][0]["coherence"] is None
+    shown = call("frf", path, "--output", "b", "--plot", tmp_path / "b.svg")
+    assert shown.exit_code == 0
+    assert "taken from the residual of the fit" in " ".join(shown.stdout.split())
+    assert call("frf", path, "--plot", tmp_path / "c.svg").exit_code == 2
+    lost = call("frf", path, "--output", "c")
+    assert (lost.exit_code, "there: a to input, b to input" in lost.stderr) == (1, True)
+
+
+def test_frf_shows_blows_and_refuses_double_hits(tmp_path: Path) -> None:
+    """Recognised without an option; the table states how many are used, and which are not."""
+    hammer = Hammer(((62.0, 0.02, 1.0),), blows=3, seconds=1.0, double=(1,))
+    force, answer, _ = strike(np.random.default_rng(1), hammer)
+    np.savetxt(tmp_path / "blows.csv", np.column_stack([force, answer]), delimiter=",",
+               header=f"# sample_rate_hz: {HAMMER_RATE}\ncurrent_force_a,acc_x_m_s2",
+               comments="")  # fmt: skip
+    names = ("--input", "current_force", "--output", "acc_x", "--band", 20, 150)
+    shown = " ".join(call("frf", tmp_path / "blows.csv", *names).stdout.split())
+    assert "H1 of 2 of 3 blows" in shown
+    assert "double-hit" in shown
+    assert "mode_1" in shown
 
 
 def test_frf_that_cannot_be_read_is_status_1_with_one_line(bench: Path) -> None:

@@ -1,4 +1,4 @@
-"""UFF58: functions at nodal degrees of freedom in ASCII or binary, of which time records are read.
+"""UFF58: time records and frequency responses at nodal degrees of freedom, in ASCII or binary.
 
 pyuff reads the headers. It drops a data set that is cut off, pairs tags wrongly where a line of
 another data set ends like one, and needs 11 times the processor time and 10 times the memory for
@@ -16,7 +16,7 @@ from typing import IO, Any, NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Samples, blocks, spools
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
@@ -36,7 +36,11 @@ _N_BYTES = slice(31, 43)
 # Codes of the headers.
 _TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
-_REAL = (2, 4)
+_RESPONSE, _COHERENCE = 4, 6
+_REAL, _COMPLEX = (2, 4), (5, 6)
+# Names in a header of degrees of freedom by their code; rotations are 4 to 6.
+_DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
+_HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
 _SECONDS = ("", "none", "s", "sec", "second", "seconds")
 _UNEVEN, _EVEN = 0, 1
 _LITTLE = 1
@@ -47,8 +51,12 @@ _WIDTHS = {
     (2, _UNEVEN): (13,) * 6,
     (4, _EVEN): (20,) * 4,
     (4, _UNEVEN): (13, 20, 13, 20),
+    (5, _EVEN): (13,) * 6,
+    (5, _UNEVEN): (13,) * 6,
+    (6, _EVEN): (20,) * 4,
+    (6, _UNEVEN): (13, 20, 20),
 }
-_BINARY = {2: "f4", 4: "f8"}
+_BINARY = {2: "f4", 4: "f8", 5: "f4", 6: "f8"}
 # Bytes of memory for a byte of ASCII: the text, its lines, the fields of a column, the numbers.
 _ASCII_MEMORY = 4
 
@@ -92,6 +100,56 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             raise Unusable("time", detail)
         read["time_s"] = first
     return Content(read, chosen.metadata, present(described), chosen.refused)
+
+
+class Function(NamedTuple):
+    """A frequency response or a coherence, with the degrees of freedom of output and input."""
+
+    output: str
+    input: str
+    frequency: FloatArray  # in Hz, (n_lines,)
+    values: ComplexArray  # (n_lines,)
+    coherence: bool
+    unit: str
+
+
+def load_functions(path: Path, max_memory: float) -> list[Function]:
+    """Read the frequency responses and coherences of a file; the unit is as the file has it."""
+    with path.open("rb") as stream:
+        sets = list(_data_sets(stream))
+        headers = _headers(sets)
+        kinds = (_RESPONSE, _COHERENCE)
+        used = [k for k, header in enumerate(headers) if header["func_type"] in kinds]
+        names = _names([headers[k] for k in used], [sets[k] for k in used])
+        functions = []
+        for k, name in zip(used, names, strict=True):
+            header = headers[k]
+            coherence = header["func_type"] == _COHERENCE
+            if header["ord_data_type"] not in (_REAL if coherence else _COMPLEX):
+                raise not_numeric(name, "no complex numbers: export real and imaginary parts")
+            _check(header, sets[k], name, max_memory, _HERTZ)
+            values = _numbers(stream, sets[k], header, name)
+            n = header["num_pts"]
+            if header["abscissa_spacing"] == _EVEN:
+                axis = header["abscissa_min"] + header["abscissa_inc"] * np.arange(n)
+                values = np.column_stack([axis, values])
+            complete = values[:, 1].astype(np.complex128)
+            if not coherence:
+                complete += 1j * values[:, 2]
+            dof = [_dof(header, role) for role in ("rsp", "ref")]
+            if dof[0] == dof[1] == "0":
+                dof = [name, ""]
+            unit = [header[f"{axis}_axis_units_lab"].strip() for axis in ("ordinate", "orddenom")]
+            text = "/".join(f"({u})" for u in unit if u not in ("", "NONE"))
+            functions.append(Function(dof[0], dof[1], values[:, 0], complete, coherence, text))
+    return functions
+
+
+def _dof(header: Header, role: str) -> str:
+    """Name a degree of freedom by its node and direction, as 12+Z."""
+    code = header[f"{role}_dir"]
+    axis = _DIRECTIONS[abs(code)] if abs(code) < len(_DIRECTIONS) else str(abs(code))
+    return f"{header[f'{role}_node']}" + (f"{'+' if code > 0 else '-'}{axis}" if code else "")
 
 
 def _data_sets(stream: IO[bytes]) -> Iterator[_DataSet]:
@@ -215,9 +273,16 @@ def _check_record(header: Header, found: _DataSet, name: str, max_memory: float)
     """Check that a data set is a time record in s, before it is read."""
     if not _is_time_record(header):
         raise not_numeric(name, f"no time record but the function type {header['func_type']}")
+    _check(header, found, name, max_memory, _SECONDS)
+
+
+def _check(
+    header: Header, found: _DataSet, name: str, max_memory: float, units: Sequence[str]
+) -> None:
+    """Check unit, spacing and size of a data set; the third of the units is quoted."""
     unit = header["abscissa_axis_units_lab"].strip()
-    if unit.lower() not in _SECONDS:
-        raise Unusable("unit", f"the abscissa of {name!r} is in {unit!r}; needed s")
+    if unit.lower() not in units:
+        raise Unusable("unit", f"the abscissa of {name!r} is in {unit!r}; needed {units[2]}")
     if header["abscissa_spacing"] not in (_UNEVEN, _EVEN):
         raise _malformed(found.place)
     needed = (found.stop - found.start) * (1 if found.binary else _ASCII_MEMORY)
@@ -228,6 +293,17 @@ def _record(
     stream: IO[bytes], found: _DataSet, header: Header, name: str
 ) -> tuple[Samples | None, Samples]:
     """Read the abscissa, where it is stored, and the ordinate of a time record, ``(n,)`` each."""
+    values = _numbers(stream, found, header, name)
+    uneven = values.shape[1] == 2
+    with spools("xy", expected=len(values)) as taken:
+        if uneven:
+            taken["x"].append(values[:, 0])
+        taken["y"].append(values[:, -1])
+        return taken["x"].samples() if uneven else None, taken["y"].samples()
+
+
+def _numbers(stream: IO[bytes], found: _DataSet, header: Header, name: str) -> FloatArray:
+    """Read the numbers of a data set, a row per point: abscissa (if uneven), then the ordinate."""
     ordinate, spacing, n = header["ord_data_type"], header["abscissa_spacing"], header["num_pts"]
     stream.seek(found.start)
     body = stream.read(found.stop - found.start)
@@ -241,15 +317,11 @@ def _record(
             values = _fields(body, _WIDTHS[ordinate, spacing])
         except ValueError as error:
             raise _malformed(found.place) from error
-    uneven = spacing == _UNEVEN
-    n_found = values.size // 2 if uneven else values.size
+    width = (spacing == _UNEVEN) + (2 if ordinate in _COMPLEX else 1)
+    n_found = values.size // width
     if n_found != n:
         raise Unusable("corrupt", f"{name!r}: {n_found} of {n} samples are there")
-    with spools("xy", expected=n) as taken:
-        if uneven:
-            taken["x"].append(values[: 2 * n : 2])
-        taken["y"].append(values[1::2] if uneven else values)
-        return taken["x"].samples() if uneven else None, taken["y"].samples()
+    return values[: n * width].reshape(n, width)
 
 
 def _fields(body: bytes, widths: Sequence[int]) -> FloatArray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import fft
@@ -11,8 +11,16 @@ from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
+from lmshealth.modal.frf.blows import find_hits, from_blows
+from lmshealth.modal.frf.measured import MeasuredResponse, from_measured
 from lmshealth.modal.frf.periods import find_period
-from lmshealth.modal.frf.response_fit import FEWEST_POWERS, ResponseFit, fit_response
+from lmshealth.modal.frf.rational import LEAST_DAMPING, Ordinates
+from lmshealth.modal.frf.response_fit import (
+    FEWEST_POWERS,
+    ResponseFit,
+    fit_response,
+    without_window,
+)
 from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
 from lmshealth.signal.segments import find_phases
@@ -40,13 +48,15 @@ def read_frf(
     *,
     band: tuple[float, float] | None = None,
     period: float | None = None,
+    impact: bool | None = None,
 ) -> FrfReading:
     r"""Measure the frequency response between two channels and identify its modes.
 
     The longest segment of constant velocity without gaps is used. A periodic input is cut into
     whole periods; the first is left out where it differs from the others by more than their
     scatter. The response to a disturbance added to the servo's current has the modes of the closed
-    loop, that to the whole current those of the machine without its servo.
+    loop, that to the whole current those of the machine without its servo. Blows of a hammer are
+    averaged; double hits and overloads are refused.
 
     Parameters
     ----------
@@ -60,6 +70,8 @@ def read_frf(
     period : float, optional
         Of the excitation in s; refined within 1 %. By default it is estimated from the input, if
         that is periodic.
+    impact : bool, optional
+        Whether the input is the force of blows; by default where that is certain.
 
     Raises
     ------
@@ -103,6 +115,11 @@ def read_frf(
             f"{log.sample_rate:g} Hz shows nothing above {top:.4g} Hz; the band begins at {low:g}",
         )
     pair = _signals(log, (source, response), start, stop)
+    if impact or (impact is None and period is None):
+        blows = find_hits(pair[0], log.sample_rate, certain=not impact)
+        if blows:
+            measured = Pair(log, (input, output), pair, 0)
+            return _read_blows(*from_blows(measured, blows, (low, min(high, top))), log)
     samples = _period(log, pair[0], period)
     band = _excited_band(pair[0], log.sample_rate, (low, min(high, top)), samples)
     lag = 0
@@ -114,9 +131,62 @@ def read_frf(
         frf, ordinates = from_record(measured, band)
     else:
         frf, ordinates = from_periods(measured, band, samples)
-    _check_coherence(log, frf)
+    _check_coherence(log.name, frf)
     fit = fit_response(ordinates)
-    return FrfReading(frf, fit, _modes(log, frf, response, fit))
+    modes = _modes(log.name, frf, fit, log.refused, _lines(log, response, fit))
+    return FrfReading(frf, fit, modes)
+
+
+def _read_blows(frf: Frf, ordinates: Ordinates, refused: list[Refusal], log: Log) -> FrfReading:
+    """Identify the modes of blows."""
+    if ordinates.scatter:
+        _check_coherence(log.name, frf)
+    fit = fit_response(ordinates)
+    modes = _modes(log.name, frf, fit, (*log.refused, *refused))
+    return FrfReading(_with_noise(frf, fit), fit, modes)
+
+
+def _with_noise(frf: Frf, fit: ResponseFit) -> Frf:
+    """Return a response whose noise, if it was unknown, is that of the residual of the fit."""
+    if fit.ordinates.scatter:
+        return frf
+    std = np.sqrt(fit.ordinates.noise) / np.abs(fit.ordinates.given)
+    return replace(frf, std=np.interp(frf.frequency, fit.ordinates.frequency, std))
+
+
+def read_measured(
+    response: MeasuredResponse,
+    *,
+    band: tuple[float, float] | None = None,
+    averages: int | None = None,
+    window: float | None = None,
+) -> FrfReading:
+    """Identify the modes of a frequency response that was measured before.
+
+    Parameters
+    ----------
+    response : MeasuredResponse
+    band : (float, float), optional
+        In Hz; by default all lines.
+    averages : int, optional
+        Number of independent averages; with the coherence it gives the noise, which otherwise is
+        that of the residual of the fit.
+    window : float, optional
+        Time constant in s of the exponential window that the analyser applied to the response; the
+        damping that it adds, 1/(2πfτ), is removed.
+
+    Raises
+    ------
+    BadLog
+        If there are too few lines, too many, or the output does not respond.
+    """
+    frf, ordinates = from_measured(response, band or (0.0, np.inf), averages)
+    if ordinates.scatter:
+        _check_coherence(response.name, frf)
+    fit = fit_response(ordinates)
+    if window is not None:
+        fit = without_window(fit, window)
+    return FrfReading(_with_noise(frf, fit), fit, _modes(response.name, frf, fit))
 
 
 def _channel(log: Log, name: str) -> Channel:
@@ -211,7 +281,7 @@ def _differenced(
     return np.concatenate([first[missing], first]), np.concatenate([second[missing], second])
 
 
-def _check_coherence(log: Log, frf: Frf) -> None:
+def _check_coherence(name: str, frf: Frf) -> None:
     """Require a coherence above that of noise, 1/n on average."""
     n = frf.n_averages
     mean, least = float(frf.coherence.mean()), 1 / n
@@ -219,64 +289,77 @@ def _check_coherence(log: Log, frf: Frf) -> None:
     chance = np.sqrt((n - 1) / (n + 1) / frf.coherence.size * 2) / n
     if mean < least + constants.ANSWERS * chance:
         raise BadLog(
-            log.name,
+            name,
             "coherence",
             f"{frf.output} does not respond to {frf.input}: mean coherence {mean:.3f}, that "
             f"of noise {least:.3f}; excite more, or record longer",
         )
 
 
-def _modes(log: Log, frf: Frf, output: Channel, fit: ResponseFit) -> Modes:
+def _modes(
+    log: str,
+    frf: Frf,
+    fit: ResponseFit,
+    before: tuple[Refusal, ...] = (),
+    lines: tuple[Line, ...] = (),
+) -> Modes:
     """Return the credible modes; the others are refused."""
     m = fit.estimate.size // 2
     why = {i: reason for i in range(m) if (reason := _incredible(frf, fit, i)) is not None}
     nothing: Rejection | None = None
-    if fit.ordinates.periodic and fit.missed > constants.FRF_MISSED:
+    if fit.ordinates.scatter and fit.missed > constants.FRF_MISSED:
         nothing = _why_missed(frf, fit)
         why = dict.fromkeys(range(m), nothing)
     elif len(why) == m and {one.reason for one in why.values()} <= _NO_RESONANCE:
         nothing = _why_none(frf, fit)
     refused = [
-        Refusal(log.name, *one[:2], output.name, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
+        Refusal(log, *one[:2], frf.output, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
         for i, one in why.items()
     ]
     if nothing is not None:
-        refused.append(Refusal(log.name, *nothing[:2], output.name, source="frf"))
-    found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [output.name] * m)
+        refused.append(Refusal(log, *nothing[:2], frf.output, source="frf"))
+    found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [frf.output] * m)
     kept = found.select([i for i in range(m) if i not in why])
-    return numbered(merge([kept], _lines(log, output, fit), (*log.refused, *refused)))
+    return numbered(merge([kept], lines, (*before, *refused)))
 
 
 def _why_missed(frf: Frf, fit: ResponseFit) -> Rejection:
     """Return why no rational response fits: lines too few for what there is, or no linear one."""
+    misses = (
+        f"the fit misses {100 * fit.missed:.0f} % of the response, allowed are "
+        f"{100 * constants.FRF_MISSED:.0f} %, and periods scatter by "
+        f"{100 * _noise_share(fit):.2g} %: "
+    )
+    few, n, top = _too_few(frf, fit)
+    if few and not frf.stray > constants.STRAY:
+        return Rejection("too-few-lines", misses + few)
+    return Rejection(
+        "nonlinear",
+        f"{misses}a nonlinearity: {n} lines around the peak at {top:.4g} Hz and "
+        f"{100 * frf.stray:.2g} % of the answer at harmonics without input; excite less, and if "
+        f"that changes nothing choose a narrower band (at most {constants.FRF_MOST_MODES} modes "
+        "are fitted)",
+    )
+
+
+def _too_few(frf: Frf, fit: ResponseFit) -> tuple[str, int, float]:
+    """Return why lines are too few, or nothing; and how many show the highest peak, in Hz."""
     gain, frequency = np.abs(frf.response), frf.frequency
     top = int(np.argmax(gain))
     # A resonance falls to 1/√10 over three half-power bandwidths.
     low = np.flatnonzero(gain[:top] ** 2 < gain[top] ** 2 / 10).max(initial=-1)
     high = top + np.flatnonzero(gain[top:] ** 2 < gain[top] ** 2 / 10).min(initial=gain.size - top)
     n = int(high - low - 1)
-    misses = (
-        f"the fit misses {100 * fit.missed:.0f} % of the response, allowed are "
-        f"{100 * constants.FRF_MISSED:.0f} %, and periods scatter by "
-        f"{100 * _noise_share(fit):.2g} %: "
-    )
     needed = 4 * constants.FRF_MOST_MODES + 2 * FEWEST_POWERS + 2
     spacing = fit.ordinates.spacing
-    if not frf.stray > constants.STRAY and (n < constants.LINES_OF_MODE or gain.size < needed):
-        return Rejection(
-            "too-few-lines",
-            f"{misses}{n} excited lines within three half-power bandwidths of the peak at "
-            f"{frequency[top]:.4g} Hz, needed {constants.LINES_OF_MODE}, and {gain.size} in all, "
-            f"needed {needed} for {constants.FRF_MOST_MODES} modes; excite lines closer than "
-            f"the {spacing:.3g} Hz of now, with a period longer than {1 / spacing:.2g} s",
-        )
-    return Rejection(
-        "nonlinear",
-        f"{misses}a nonlinearity: {n} lines around the peak at {frequency[top]:.4g} Hz and "
-        f"{100 * frf.stray:.2g} % of the answer at harmonics without input; excite less, and if "
-        f"that changes nothing choose a narrower band (at most {constants.FRF_MOST_MODES} modes "
-        "are fitted)",
+    few = (
+        f"{n} excited lines within three half-power bandwidths of the peak at "
+        f"{frequency[top]:.4g} Hz, needed {constants.LINES_OF_MODE}, and {gain.size} in all, "
+        f"needed {needed} for {constants.FRF_MOST_MODES} modes; excite lines closer than "
+        f"the {spacing:.3g} Hz of now, with a period longer than {1 / spacing:.2g} s"
     )
+    enough = n >= constants.LINES_OF_MODE and gain.size >= needed
+    return "" if enough else few, n, float(frequency[top])
 
 
 def _why_none(frf: Frf, fit: ResponseFit) -> Rejection:
@@ -286,6 +369,9 @@ def _why_none(frf: Frf, fit: ResponseFit) -> Rejection:
     none = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
     if share <= most:
         return Rejection("not-excited", none)
+    few, n, _ = _too_few(frf, fit)
+    if n < constants.LINES_OF_MODE and not fit.ordinates.scatter:
+        return Rejection("too-few-lines", f"{none}: {few}")
     return Rejection(
         "noise",
         f"{none}: noise is {100 * share:.0f} % of the response and hides modes above "
@@ -306,15 +392,49 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
     f, zeta = float(np.exp(fit.estimate[i])), float(np.exp(fit.estimate[m + i]))
     std_f, std_zeta = np.sqrt(np.diag(fit.cov))[[i, m + i]].tolist()
     low, high = frf.frequency[[0, -1]].tolist()
-    spacing = fit.ordinates.spacing
     if not low <= f <= high:
         return Rejection("outside-band", f"{f:.5g} Hz lies outside {low:.5g} to {high:.5g} Hz")
     if zeta > constants.FRF_MOST_DAMPING:
         most = constants.FRF_MOST_DAMPING
         return Rejection("overdamped", f"damping {zeta:.2g}, at most {most:g}: background, no mode")
-    if fit.ordinates.periodic:
+    if zeta < LEAST_DAMPING:
+        return Rejection(
+            "too-uncertain",
+            "all of its damping is that of the exponential window; choose a longer window",
+        )
+    if unresolved := _unresolved(fit.ordinates, f, zeta):
+        return unresolved
+    if fit.over_distortion[i] < constants.OVER_DISTORTION:
+        return Rejection(
+            "distorted",
+            f"its power is {fit.over_distortion[i]:.2g} times that of the distortion around it, "
+            f"needed {constants.OVER_DISTORTION:g}: a nonlinearity may look the same; excite less",
+        )
+    if std_f > constants.WORST_STD_LN_F or std_zeta > constants.WORST_STD_LN_ZETA:
+        return Rejection(
+            "too-uncertain",
+            f"standard deviation {100 * std_f:.2g} %, damping {100 * std_zeta:.0f} %; record "
+            "longer or excite more",
+        )
+    return None
+
+
+def _unresolved(ordinates: Ordinates, f: float, zeta: float) -> Rejection | None:
+    """Return why lines do not show a mode, or why it may be a line of the spectrum itself."""
+    spacing = ordinates.spacing
+    if np.isfinite(ordinates.span):
+        fades = 1 - float(np.exp(-2 * np.pi * f * zeta * ordinates.span))
+        # Over several blows the phase of a line is random.
+        if ordinates.scatter or fades >= constants.FADED:
+            return None
+        return Rejection(
+            "line-not-mode",
+            f"it fades by {100 * fades:.0f} % in the {ordinates.span:.3g} s after the blow, needed "
+            f"{100 * constants.FADED:.0f} %: strike several times, or record longer",
+        )
+    if ordinates.periodic:
         reach = constants.BANDWIDTHS_OF_LINES * zeta * f
-        n = int(np.count_nonzero(np.abs(fit.ordinates.frequency - f) <= reach))
+        n = int(np.count_nonzero(np.abs(ordinates.frequency - f) <= reach))
         if n < constants.LINES_OF_MODE:
             most = 2 * reach / constants.LINES_OF_MODE
             return Rejection(
@@ -328,18 +448,6 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
         return Rejection(
             "line-not-mode",
             f"{2 * zeta * f:.2g} Hz wide, but lines are {spacing:.2g} Hz apart; record longer",
-        )
-    if fit.over_distortion[i] < constants.OVER_DISTORTION:
-        return Rejection(
-            "distorted",
-            f"its power is {fit.over_distortion[i]:.2g} times that of the distortion around it, "
-            f"needed {constants.OVER_DISTORTION:g}: a nonlinearity may look the same; excite less",
-        )
-    if std_f > constants.WORST_STD_LN_F or std_zeta > constants.WORST_STD_LN_ZETA:
-        return Rejection(
-            "too-uncertain",
-            f"standard deviation {100 * std_f:.2g} %, damping {100 * std_zeta:.0f} %; record "
-            "longer or excite more",
         )
     return None
 

@@ -28,6 +28,8 @@ from lmshealth.modal.frf.responses import smooth_noise
 FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # Lines over which the noise of a record that is not periodic is averaged.
 _NOISE_LINES = 41
+# Least standard deviation of unknown noise over the largest response: six digits.
+_DIGITS = 1e-6
 # Gain in -2 ln L at fixed poles from which on a larger model is fitted.
 _WORTH = 2.0
 # Lines of an end of the band.
@@ -48,7 +50,8 @@ class ResponseFit:
     unknown.
     """
 
-    ordinates: Ordinates  # the lines of the fit, without outliers
+    # Lines of the fit, without outliers. Noise that was unknown before is that of the residual.
+    ordinates: Ordinates
     # Hz and amplitude of lines that are no response to the input, (n_outliers, 2)
     outliers: FloatArray
     estimate: FloatArray  # [ln f, ln ζ], (2 n_modes,)
@@ -103,6 +106,26 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     if ordinates.transient and fit.excess > _CANCELS:
         fit = _fit(replace(ordinates, at_rest=True))
     return fit
+
+
+def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
+    """Remove the damping that an exponential window exp(-t/τ) has added, 1/τ of ζω.
+
+    A mode whose decay is that of the window keeps a damping below `LEAST_DAMPING`.
+    """
+    m = fit.estimate.size // 2
+    w, zeta = 2 * np.pi * np.exp(fit.estimate[:m]), np.exp(fit.estimate[m:])
+    decay = np.maximum(zeta * w - 1 / time_constant, 1e-9 * zeta * w)
+    own = np.hypot(w * np.sqrt(1 - zeta**2), decay)
+    turn = np.eye(2 * m)
+    turn[m:, m:] = np.diag(zeta * w / decay)
+    turn[m:, :m] = turn[m:, m:] - np.eye(m)
+    return replace(
+        fit,
+        estimate=np.log(np.concatenate([own / (2 * np.pi), decay / own])),
+        cov=turn @ fit.cov @ turn.T,
+        noise_cov=turn @ fit.noise_cov @ turn.T,
+    )
 
 
 def _fit(ordinates: Ordinates) -> ResponseFit:
@@ -189,8 +212,10 @@ def _error_variance(
     n = solution.error.size
     # Corrected for the degrees of freedom of the fit.
     power = np.abs(solution.error) ** 2 * (n / (n - order.unknowns(ordinates.transient) / 2))
-    if not ordinates.periodic:
-        return smooth_noise(power, solution.parts, _NOISE_LINES), 0.0
+    if not ordinates.scatter:
+        # Lines that were measured before have as many digits as the file.
+        floor = (_DIGITS * np.abs(ordinates.answer).max()) ** 2 if ordinates.periodic else 0.0
+        return np.maximum(smooth_noise(power, solution.parts, _NOISE_LINES), floor), 0.0
     parts = solution.parts * np.abs(ordinates.given) ** 2
 
     def cost(ln_share: float) -> float:
@@ -212,7 +237,7 @@ def _without_lines(state: _State, keep: BoolArray) -> _State:
 def _inliers(state: _State) -> BoolArray:
     """Return which lines are no outliers; in a record neighbours of an outlier count as ones."""
     # Over a variance from ν degrees of freedom the error has heavier tails: (1 + x/ν)^-ν.
-    freedom = state.ordinates.freedom if state.ordinates.periodic else _NOISE_LINES
+    freedom = state.ordinates.freedom if state.ordinates.scatter else _NOISE_LINES
     rare = (state.white.size / constants.OUTLIER_FALSE_ALARM) ** (1 / freedom)
     odd = np.abs(state.white) ** 2 > freedom * (rare - 1)
     if not state.ordinates.periodic:
@@ -243,15 +268,18 @@ def _grow(state: _State) -> _State:
 
 
 def _restart(state: _State) -> _State:
-    """Start from vector fits where the error exceeds the noise of periods."""
-    if state.distortion == 0:
+    """Start from vector fits where the error exceeds the noise, or this is unknown."""
+    ordinates = state.ordinates
+    if not ordinates.periodic or (ordinates.scatter and state.distortion == 0):
         return state
     best = state
     for n in range(1, constants.FRF_MOST_MODES + 1):
-        order = vector_fit(state.ordinates, state.order, n)
+        if not ordinates.scatter and n > best.order.n_modes + 1:
+            break
+        order = vector_fit(ordinates, state.order, n)
         if order.unknowns(transient=False) >= state.variance.size:
             break
-        trial = _settle(state.ordinates, order, state.ordinates.noise)
+        trial = _settle(ordinates, order, ordinates.noise)
         less = trial.distortion <= constants.LESS_DISTORTED * best.distortion
         if less and _gain(trial, best) > 0 and _is_admissible(trial, best):
             best = trial
@@ -351,6 +379,8 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     error = (everything.answer - everything.given * expected)[outlying]
     excess = np.sum(np.abs(solution.error) ** 2 / ordinates.noise)
     excess /= n - order.unknowns(ordinates.transient) / 2
+    if not (ordinates.scatter or ordinates.transient):
+        ordinates = replace(ordinates, noise=state.variance)
     return ResponseFit(
         ordinates=ordinates,
         outliers=np.column_stack([everything.frequency[outlying], np.abs(error)]),
@@ -360,7 +390,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
         snr=(peak / np.interp(f, ordinates.frequency, level))[rank],
         over_distortion=over[rank],
         response=solution.response,
-        chi_square=float(excess) if ordinates.periodic else float("nan"),
+        chi_square=float(excess) if ordinates.scatter else float("nan"),
         distortion=state.distortion,
         colour=state.colour,
     )
@@ -378,7 +408,7 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
     slope = slopes(ordinates, state.order, state.variance, state.solution)
     prior = np.eye(slope.shape[1]) / _PRIOR_STD**2
     inverse = np.asarray(np.linalg.inv(slope.T @ slope + prior), dtype=np.float64)
-    if not ordinates.periodic:
+    if not ordinates.scatter:
         freedom = min(_NOISE_LINES, state.variance.size)
         by_noise = inverse * (freedom / (freedom - 2))
         return by_noise, by_noise * state.dependent_lines

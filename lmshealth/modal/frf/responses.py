@@ -45,6 +45,19 @@ def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatAr
     return np.asarray(shape * uniform_filter1d(power / shape, width, mode="nearest"))
 
 
+def average_noise(
+    power: FloatArray, response: ComplexArray, freedom: int
+) -> tuple[FloatArray, float]:
+    """Average the power of noise over neighbours as needed; return it and its degrees of freedom.
+
+    It has ``freedom`` complex ones in each line. The inverse of a variance of ν degrees of freedom
+    is too large by ν/(ν - 1) on average, which is corrected.
+    """
+    width = max(1, 2 * int(np.ceil((_FREEDOM / freedom - 1) / 2)) + 1)
+    total = float(width * freedom)
+    return smooth_noise(power, np.abs(response) ** 2, width) * (total / (total - 1)), total
+
+
 # Complex degrees of freedom that a variance needs; few periods are supplemented by neighbours.
 _FREEDOM = 16
 # Blocks of a record, half overlapping, that a coherence is averaged over.
@@ -82,6 +95,10 @@ class Frf:
     # Amplitude of the output beyond noise at harmonics without input over that at excited ones:
     # nonlinear. NaN where the excitation is not periodic or excites all harmonics.
     stray: float = float("nan")
+    # How it was measured: means over "periods" or "blows", over "segments" of a record, or before
+    # ("measured").
+    method: str = "periods"
+    note: str = ""  # what the reader must take into account
 
     def __post_init__(self) -> None:
         for name in ("response", "std", "h1", "h2", "hv", "coherence"):
@@ -139,15 +156,12 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     response = answer / given
     # The scatter of Y - H U includes the noise of both and its correlation.
     noise = np.var(spectra[1] - response * spectra[0], axis=0, ddof=1) / n
-    width = max(1, 2 * int(np.ceil((_FREEDOM / (n - 1) - 1) / 2)) + 1)
-    freedom = float(width * (n - 1))
-    # The inverse of a variance of ν degrees of freedom is too large by ν/(ν - 1) on average.
-    noise = smooth_noise(noise, np.abs(response) ** 2, width) * (freedom / (freedom - 1))
+    noise, freedom = average_noise(noise, response, n - 1)
     # Simulated records may be free of noise but for rounding.
     noise = np.maximum(noise, (_ROUNDING * np.abs(answer).max()) ** 2)
     power = np.mean(np.abs(spectra) ** 2, axis=1)
     cross = np.mean(spectra[1] * spectra[0].conj(), axis=0)
-    h1, h2, hv, coherence = _estimates(power[0], power[1], cross)
+    h1, h2, hv, coherence = estimates(power[0], power[1], cross)
     std = np.sqrt(noise) / np.abs(given)
     frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, period / rate, n, stray)
     return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
@@ -174,7 +188,7 @@ def _excited(
     noise = np.var(given, axis=0, ddof=1) / given.shape[0]
     strong = power >= constants.EXCITED**2 * power.max(initial=0.0)
     strong &= np.abs(given).max(axis=0) > _ROUNDING * strongest
-    _check_lines(pair, int(strong.sum()), band, constants.FRF_LINES)
+    check_lines(pair, int(strong.sum()), band, constants.FRF_LINES)
     excited = np.asarray(strong & (power > constants.CLEARLY_EXCITED * noise))
     if excited.sum() < constants.FRF_LINES:
         raise BadLog(
@@ -213,7 +227,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     size, rate = pair.signals[0].size, pair.log.sample_rate
     step = rate / size
     first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
-    _check_lines(pair, last - first + 1, band, constants.FRF_LINES_OF_RECORD)
+    check_lines(pair, last - first + 1, band, constants.FRF_LINES_OF_RECORD)
     lines: FloatArray = np.arange(first, last + 1, dtype=np.float64) * step
     given, answer = (
         np.asarray(fft.rfft(x - x.mean())[first : last + 1], dtype=np.complex128)
@@ -231,15 +245,16 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     frequency = frequency[inside]
     weight = pair.gain(frequency) ** -2
     power_in, power_out = auto_in.real[inside] * weight, auto_out.real[inside] * weight
-    h1, h2, hv, coherence = _estimates(power_in, power_out, cross[inside] * weight)
+    h1, h2, hv, coherence = estimates(power_in, power_out, cross[inside] * weight)
     unexplained = np.maximum(1 - coherence, _ROUNDING) * power_out * n / (n - 1)
     std = np.sqrt(unexplained / (n * power_in))
-    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, float("nan"), n)
+    nan = float("nan")
+    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, nan, n, method="segments")
     noise = np.interp(lines, frequency, unexplained) * (2 * step)
     return frf, Ordinates(lines, given, answer, noise, n - 1, periodic=False)
 
 
-def _estimates(
+def estimates(
     power_in: FloatArray, power_out: FloatArray, cross: ComplexArray
 ) -> tuple[ComplexArray, ComplexArray, ComplexArray, FloatArray]:
     """Return H1, H2, Hv and the coherence from powers and E[Y U*]."""
@@ -252,7 +267,8 @@ def _estimates(
     return h1, h2, hv, np.minimum(coherence, 1.0)
 
 
-def _check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> None:
+def check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> None:
+    """Refuse a band with too few excited lines, or too many."""
     where = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
     if n < fewest:
         raise BadLog(

@@ -1,0 +1,189 @@
+"""Impact tests: blows of a hammer, found in the force, and the response averaged over them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy import fft
+
+from lmshealth._arrays import FloatArray
+from lmshealth.errors import BadLog
+from lmshealth.io.log import Refusal
+from lmshealth.modal import constants
+from lmshealth.modal.frf.rational import Ordinates
+from lmshealth.modal.frf.responses import Frf, Pair, average_noise, check_lines, estimates
+
+# Pulses that the filter of the force channel makes of one are no further apart, in samples.
+_RINGING = 4
+_LEAST_PRE = 4  # samples before a blow
+# An overload: samples that equal the largest, and their share of those above 0.9 of it. A sine in
+# steps of 1 % of its amplitude spends 0.31 of these in its outermost step.
+_STUCK, _FLAT, _FINE = 3, 0.4, 0.01
+
+
+class Hit(NamedTuple):
+    """A pulse of the force, as half-open range of samples above the trigger level."""
+
+    start: int
+    stop: int
+    peak: float
+
+
+def find_hits(force: FloatArray, rate: float, *, certain: bool) -> list[list[Hit]]:
+    """Find the pulses of a force; those that follow each other as double hits do are one blow.
+
+    With ``certain`` there are none unless the signal is at rest between short pulses that do not
+    repeat exactly: a train of equal pulses is a periodic excitation.
+    """
+    x = force - np.median(force)
+    x *= np.sign(x[np.argmax(np.abs(x))])
+    noise, peak = 1.4826 * float(np.median(np.abs(x))), float(x.max())
+    level = max(constants.TRIGGER * peak, constants.TRIGGER_SIGMAS * noise)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], x > level, [0]])))
+    hits: list[Hit] = []
+    for start, stop in edges.reshape(-1, 2).tolist():
+        last = hits[-1] if hits else None
+        if last is not None and start - last.stop < max(_RINGING, last.stop - last.start):
+            start = hits.pop().start
+        hits.append(Hit(start, stop, float(x[start:stop].max())))
+    if certain:
+        pulses = sum(float(np.sum(x[hit.start : hit.stop] ** 2)) for hit in hits)
+        rests = np.mean(np.abs(x) > 0.1 * peak) < constants.BLOW_DUTY
+        if not rests or pulses < constants.BLOW_ENERGY * float(np.sum(x**2)):
+            return []
+    blows: list[list[Hit]] = []
+    for hit in hits:
+        if blows and hit.start - blows[-1][0].start < constants.DOUBLE_WITHIN * rate:
+            blows[-1].append(hit)
+        else:
+            blows.append([hit])
+    apart = np.diff([blow[0].start for blow in blows])
+    if certain and apart.size >= constants.BLOW_REPEATS and np.ptp(apart) <= 2:
+        return []
+    return blows
+
+
+def from_blows(
+    pair: Pair, blows: Sequence[Sequence[Hit]], band: tuple[float, float]
+) -> tuple[Frf, Ordinates, list[Refusal]]:
+    """Average usable blows; the others are refused by number and time.
+
+    The joint likelihood of blows b with Y_b = H U_b and noise of one power depends on the data by
+    Σ Y_b U_b* / √Σ|U_b|² alone (H1), and by the scatter around it, which is the noise. One blow
+    has the noise of the residual of the fit. Force outside the pulse is set to zero; the output is
+    not windowed: decays that are cut off are part of the model.
+
+    Raises
+    ------
+    BadLog
+        If no blow can be used, or they excite too few lines of the band.
+    """
+    rate = pair.log.sample_rate
+    used, refused = _usable(pair, blows)
+    width = max(hit.stop - hit.start for hit, _ in used)
+    before = min(max(_LEAST_PRE, width), min(hit.start for hit, _ in used))
+    n = min(stop - hit.start for hit, stop in used)
+    high = min(band[1], constants.USABLE * rate)
+    most = int(constants.BLOW_LINES * rate / max(high - band[0], rate / n))
+    size = fft.prev_fast_len(min(n, max(most, constants.FRF_SAMPLES)), real=True)
+    cut = np.array([[x[h.start - before :][:size] for h, _ in used] for x in pair.signals])
+    at = np.arange(size)
+    for force, (hit, _) in zip(cut[0], used, strict=True):
+        force -= np.median(force)
+        force[(at < before - width) | (at >= before + hit.stop - hit.start + width)] = 0.0
+    spectra = fft.rfft(cut, axis=2)[:, :, 1:] / rate
+    frequency = np.arange(1, spectra.shape[2] + 1) * (rate / size)
+    inside = (frequency >= band[0]) & (frequency <= high)
+    given = np.sqrt(np.sum(np.abs(spectra[0]) ** 2, axis=0))
+    inside &= given >= constants.EXCITED * given[inside].max(initial=0.0)
+    n_blows = len(used)
+    known = n_blows > 1
+    fewest = constants.FRF_LINES if known else constants.FRF_LINES_OF_RECORD
+    check_lines(pair, int(inside.sum()), band, fewest)
+    frequency, given, spectra = frequency[inside], given[inside], spectra[:, :, inside]
+    cross = np.sum(spectra[1] * spectra[0].conj(), axis=0)
+    answer, total = cross / given, np.sum(np.abs(spectra[1]) ** 2, axis=0)
+    noise, freedom = constants.BLOW_NOISE * total, 0.0
+    if known:
+        scatter = np.maximum(total - np.abs(answer) ** 2, 0.0) / (n_blows - 1)
+        noise, freedom = average_noise(scatter, answer / given, n_blows - 1)
+    h1, h2, hv, coherence = estimates(given**2 / n_blows, total / n_blows, cross / n_blows)
+    coherence = coherence if known else np.full(frequency.size, np.nan)
+    std, nan = np.sqrt(noise) / given, float("nan")
+    frf = Frf(
+        *pair.names, frequency, h1, std, h1, h2, hv, coherence, nan, n_blows, method="blows",
+        note=f"{n_blows} of {len(blows)} blows, {size / rate:.4g} s of each.",
+    )  # fmt: skip
+    weight = np.abs(cut[0])
+    centre = float(np.sum(weight * at) / np.sum(weight))
+    ordinates = Ordinates(frequency, given + 0j, answer, noise, freedom, periodic=known,
+                          at_rest=True, span=(size - centre) / rate)  # fmt: skip
+    return frf, ordinates, refused
+
+
+def _usable(
+    pair: Pair, blows: Sequence[Sequence[Hit]]
+) -> tuple[list[tuple[Hit, int]], list[Refusal]]:
+    """Return usable blows with the sample at which the next begins, and the others."""
+    log, rate, (force, output) = pair.log, pair.log.sample_rate, pair.signals
+    ends = [blow[0].start for blow in blows[1:]] + [force.size]
+    margin = max(_LEAST_PRE, *(hit.stop - hit.start for blow in blows for hit in blow))
+    strongest = max(hit.peak for blow in blows for hit in blow)
+    length = np.median([end - blow[0].start for blow, end in zip(blows, ends, strict=True)])
+    used: list[tuple[Hit, int]] = []
+    refused: list[Refusal] = []
+    for number, (blow, end) in enumerate(zip(blows, ends, strict=True), start=1):
+        first, stop = blow[0], end - (margin if end < force.size else 0)
+        others = [h for h in blow[1:] if h.peak >= constants.SECOND_HIT * first.peak]
+        why: tuple[str, str] | None = None
+        if others:
+            why = (
+                "double-hit",
+                (
+                    f"a second hit of {100 * others[0].peak / first.peak:.0f} % after "
+                    f"{1e3 * (others[0].start - first.start) / rate:.3g} ms; strike again"
+                ),
+            )
+        elif first.peak < constants.WEAK_BLOW * strongest:
+            why = (
+                "weak-blow",
+                (
+                    f"{100 * first.peak / strongest:.2g} % of the strongest, needed "
+                    f"{100 * constants.WEAK_BLOW:.0f} %; strike harder"
+                ),
+            )
+        elif any(_overloaded(x[first.start : stop]) for x in (force, output, -force, -output)):
+            why = "overload", "force or output stays at its largest value; raise the range"
+        elif stop - first.start < min(length, force.size) / 2:
+            why = (
+                "too-short",
+                (
+                    f"{(stop - first.start) / rate:.3g} s until the next blow or the end, half the "
+                    f"others have {length / rate:.3g} s; wait longer"
+                ),
+            )
+        if why is None:
+            used.append((first, stop))
+        else:
+            detail = f"blow {number} at {first.start / rate:.4g} s: {why[1]}"
+            refused.append(Refusal(log.name, why[0], detail, pair.names[0], source="frf"))
+    if not used:
+        raise BadLog(
+            log.name,
+            refused[0].reason,
+            f"none of {len(blows)} blows can be used: " + "; ".join(r.detail for r in refused),
+        )
+    return used, refused
+
+
+def _overloaded(values: FloatArray) -> bool:
+    """Return whether the top of a signal is flat."""
+    x = values - np.median(values)
+    top = float(x.max())
+    near = np.unique(x[x >= 0.9 * top])
+    if near.size > 1 and np.diff(near).min() > _FINE * top:
+        return False
+    n_stuck = np.count_nonzero(x == top)
+    return bool(n_stuck >= _STUCK and n_stuck > _FLAT * np.count_nonzero(x >= 0.9 * top))

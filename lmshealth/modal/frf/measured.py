@@ -1,0 +1,221 @@
+"""Frequency responses that an analyser has measured: UFF58 of function type 4, tables of lines.
+
+A table has the column ``frequency_hz`` (or ``_khz``, ``_rad_s``) and for each response ``real`` and
+``imag``, or ``magnitude`` (``db``) and ``phase_deg`` (``phase_rad``), and perhaps ``coherence``.
+Where there are several, or with a name, they are ``<name>_real`` and so on; the name may end in
+units as ``acc_x_g_per_n``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from lmshealth._arrays import ComplexArray, FloatArray, freeze
+from lmshealth.errors import BadLog
+from lmshealth.io import constants as limits
+from lmshealth.io.column_map import RESPONSE_COLUMN, ColumnMap, parse_column, role_of
+from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.csv import CSV, CSV_GZ
+from lmshealth.io.formats.registry import format_name, load
+from lmshealth.io.formats.uff import UFF, Function, load_functions
+from lmshealth.io.log import Metadata
+from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.reading import content_digest
+from lmshealth.io.refusal import Unusable, listed, shown
+from lmshealth.modal import constants
+from lmshealth.modal.frf.rational import Ordinates
+from lmshealth.modal.frf.responses import Frf, average_noise
+
+FORMATS = (CSV.name, CSV_GZ.name, UFF.name)
+_HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
+_PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
+_ROUNDING = 1e-9
+# Variance of unknown noise from which a fit starts, over the power of the response.
+_START = 1e-4
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class MeasuredResponse:
+    """A frequency response from a file, arrays ``(n_lines,)``."""
+
+    name: str  # of the file, with that of the output where the file holds several
+    digest: str  # SHA-256 of the file
+    metadata: Metadata
+    input: str
+    output: str
+    frequency: FloatArray  # in Hz, ascending
+    values: ComplexArray  # output per input
+    coherence: FloatArray | None
+    unit: str  # of the values; empty where it is unknown
+
+    def __post_init__(self) -> None:
+        freeze(self)
+
+
+class _ResponseColumns(ColumnMap, frozen=True, dict=True):
+    """Column map of a table of responses."""
+
+    def target(self, source: str) -> str | None:
+        """Return the name of a column of a response; None for any other."""
+        name = self._targets.get(source, source)
+        return name if RESPONSE_COLUMN.fullmatch(name) else None
+
+
+def read_responses(
+    path: Path,
+    *,
+    columns: ColumnMap | None = None,
+    overrides: Mapping[str, str] | None = None,
+    max_memory: float = limits.MAX_MEMORY,
+) -> tuple[MeasuredResponse, ...]:
+    """Read the frequency responses of a file; none from a log, which holds time records.
+
+    Raises
+    ------
+    BadLog
+        If a response lacks a part, or its lines are not finite and ascending.
+    """
+    given = columns or ColumnMap()
+    label, digest = shown(path), content_digest(path)
+    try:
+        content = Content({}, {}, ())
+        functions: list[Function] = []
+        if format_name(path) == UFF.name:
+            functions = load_functions(path, max_memory)
+        elif format_name(path) in FORMATS:
+            own = _ResponseColumns(columns=given.columns, csv=given.csv)
+            content = load(path, own, max_memory)
+            functions = _tabulated(content, own)
+        metadata, _ = parse_metadata(content.metadata | given.constants() | dict(overrides or {}))
+        coherences = {f[:2]: f for f in functions if f.coherence}
+        responses = [f for f in functions if not f.coherence]
+        return tuple(
+            _checked(
+                MeasuredResponse(
+                    f"{label}:{f.output}" if len(responses) > 1 else label,
+                    *(digest, metadata, f.input or "input", f.output, f.frequency, f.values),
+                    coherences[f[:2]].values.real if f[:2] in coherences else None,
+                    f.unit,
+                )
+            )
+            for f in responses
+        )
+    except Unusable as error:
+        raise BadLog(label, error.reason, error.detail) from error
+
+
+def _tabulated(content: Content, columns: _ResponseColumns) -> list[Function]:
+    """Collect the responses of a table; none where it has no column of frequencies."""
+    frequency: FloatArray | None = None
+    parts: dict[str, dict[str, FloatArray]] = {}
+    for source, samples in content.columns.items():
+        values = np.asarray(samples[:])
+        if (match := RESPONSE_COLUMN.fullmatch(str(columns.target(source)))) is None:
+            continue
+        if match["axis"]:
+            frequency = values * _HERTZ[match["axis"]]
+        else:
+            parts.setdefault(match["name"] or "", {})[match["part"]] = values
+    if frequency is None:
+        return []
+    functions = []
+    for column, part in parts.items():
+        name, factor, unit = _unit(column)
+        if {"real", "imag"} <= set(part):
+            values = part["real"] + 1j * part["imag"]
+        else:
+            gain = 10 ** (part["db"] / 20) if "db" in part else part.get("magnitude")
+            phase = np.radians(part["phase_deg"]) if "phase_deg" in part else part.get("phase_rad")
+            if gain is None or phase is None:
+                needed = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
+                there = f"response {name!r} has {listed(part)}"
+                raise Unusable("columns", f"{there}; {needed}; there: {listed(content.present)}")
+            values = gain * np.exp(1j * phase)
+        whole = np.asarray(factor * values, dtype=np.complex128)
+        functions.append(Function(name, "", frequency, whole, False, unit))
+        if "coherence" in part:
+            whole = part["coherence"].astype(np.complex128)
+            functions.append(Function(name, "", frequency, whole, True, ""))
+    if not functions:
+        needed = "needed real and imag, or magnitude and phase_deg, of a response"
+        raise Unusable("columns", f"frequencies and no response; {needed}; there: "
+                       f"{listed(content.present)}")  # fmt: skip
+    return functions
+
+
+def _unit(column: str) -> tuple[str, float, str]:
+    """Split a name into that of the output, the SI value of one, and the unit of the values."""
+    of, per, by = column.partition("_per_")
+    if per and by not in _PER:
+        raise Unusable("unit", f"{column!r} is per {by!r}; needed one of {listed(_PER)}")
+    name, factor, unit = of or "response", 1.0, ""
+    if role_of(of) is not None:
+        try:
+            signal = parse_column(of)
+        except Unusable:
+            if per:
+                raise
+        else:
+            units = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
+            name, factor, unit = signal.name, signal.factor, units.get(signal.role, "")
+    return name, factor / _PER.get(by, 1.0), f"({unit})/{by[-1].upper()}" if per else unit
+
+
+def _checked(response: MeasuredResponse) -> MeasuredResponse:
+    """Require ascending frequencies; leave out the static value and lines that are not finite."""
+    f = response.frequency
+    if response.coherence is not None and response.coherence.shape != f.shape:
+        found = f"{response.output}: {f.size} lines, but {response.coherence.size} of coherence"
+        raise Unusable("columns", f"{found}; needed the same")
+    use = np.isfinite(f) & np.isfinite(response.values) & (f > 0)
+    if not (np.diff(f[use]) > 0).all():
+        at = int(np.argmin(np.diff(f[use]) > 0))
+        found = f"frequencies do not ascend: {f[use][at + 1]:g} Hz follows {f[use][at]:g} Hz"
+        raise Unusable("columns", f"{found}; needed one row per line, in ascending order")
+    coherence = None if response.coherence is None else response.coherence[use]
+    return replace(response, frequency=f[use], values=response.values[use], coherence=coherence)
+
+
+def from_measured(
+    response: MeasuredResponse, band: tuple[float, float], averages: int | None
+) -> tuple[Frf, Ordinates]:
+    """Return the lines of a band; their noise follows from coherence and number of averages.
+
+    From n averages the variance of H is |H|² (1 - γ²) / ((n - 1) γ²) [Pintelon2012]. Without them
+    it is unknown (zero degrees of freedom), and is that of the residual of the fit.
+
+    Raises
+    ------
+    BadLog
+        If the band holds too few lines, or too many.
+    """
+    use = (response.frequency >= band[0]) & (response.frequency <= band[1])
+    f, h = response.frequency[use], response.values[use]
+    known = response.coherence is not None and averages is not None
+    fewest = constants.FRF_LINES if known else constants.FRF_LINES_OF_UNKNOWN_NOISE
+    if not fewest <= f.size <= constants.FRF_MOST_LINES:
+        there = response.frequency
+        span = f"{there[0]:.4g} to {there[-1]:.4g} Hz" if there.size else "none"
+        need = f"needed {fewest} to {constants.FRF_MOST_LINES}"
+        hint = "" if known else f" ({constants.FRF_LINES} suffice with coherence and --averages)"
+        raise BadLog(
+            response.name,
+            "band-too-narrow" if f.size < fewest else "band-too-wide",
+            f"{response.output} has {f.size} lines in the band, of {use.size} in all ({span}); "
+            f"{need}{hint}: choose another band, or measure more lines",
+        )
+    coherence = np.full(f.size, np.nan) if response.coherence is None else response.coherence[use]
+    noise, freedom = np.full(f.size, _START * np.mean(np.abs(h) ** 2)), 0.0
+    if known and averages is not None:
+        at = np.clip(coherence, _ROUNDING, 1 - _ROUNDING)
+        noise = np.abs(h) ** 2 * (1 - at) / (at * (averages - 1))
+        noise, freedom = average_noise(noise, h, averages - 1)
+    n = float("nan") if averages is None else float(averages)
+    names = response.input, response.output
+    frf = Frf(*names, f, h, np.sqrt(noise), h, h, h, coherence, float("nan"), n, method="measured")
+    one = np.ones(f.size, dtype=complex)
+    return frf, Ordinates(f, one, h, noise, freedom, periodic=True)

@@ -1,0 +1,128 @@
+"""Impact tests: blows found in the force, double hits and overloads refused, modes with σ."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from lmshealth.errors import BadLog
+from lmshealth.modal.frf.blows import find_hits
+from lmshealth.modal.frf.identification import FrfReading, read_frf
+from lmshealth.modal.frf.rational import Order, Ordinates, slopes, solve
+from studies.common.logs import make_log
+from studies.impact_tests.hammer import RATE, Hammer, strike
+
+MODES = ((62.0, 0.015, 1.0), (130.0, 0.01, -0.6))
+BAND = (30.0, 200.0)
+
+
+def read(hammer: Hammer, seed: int = 1) -> FrfReading:
+    """Read a simulated impact test."""
+    force, answer, _ = strike(np.random.default_rng(seed), hammer)
+    log = make_log({"current_force": force, "acc": answer}, RATE)
+    return read_frf(log, "current_force", "acc", band=BAND)
+
+
+def assert_found(reading: FrfReading) -> None:
+    """Expect the modes and no other, within four standard deviations."""
+    modes = reading.modes
+    truth = np.log([*(f for f, _, _ in MODES), *(zeta for _, zeta, _ in MODES)])
+    error = np.concatenate([modes.ln_frequency, modes.ln_damping]) - truth
+    assert np.abs(error / np.sqrt(np.diag(modes.cov))).max() < 4
+
+
+@pytest.mark.parametrize("blows", [1, 4])
+def test_blows_are_recognised_and_averaged(blows: int) -> None:
+    """One blow has no coherence, and the noise of the residual; several have that of scatter."""
+    reading = read(Hammer(MODES, blows=blows))
+    assert_found(reading)
+    assert (reading.frf.method, reading.frf.n_averages) == ("blows", blows)
+    assert np.isnan(reading.frf.coherence).all() == (blows == 1)
+    assert np.abs(reading.fit.response).max() < 1.2 * np.abs(reading.frf.response).max()
+    assert (reading.frf.std > 0).all()
+
+
+def test_a_decay_that_the_next_blow_cuts_off_has_no_added_damping() -> None:
+    """A third of 0.3 % is left after 1 s: cut off, its damping is right without a window."""
+    modes = ((62.0, 0.003, 1.0),)
+    found = read(Hammer(modes, blows=5, seconds=1.0, gap=3.0, white=0.003)).modes
+    assert found.damping_ratio == pytest.approx([0.003], abs=4 * found.damping_ratio_std[0])
+    assert found.damping_ratio_std[0] < 3e-4
+
+
+def test_a_cut_is_differentiated_like_the_rest() -> None:
+    """Slopes of a model with cut decays are the derivatives of its error."""
+    f = np.arange(40.0, 120.0, 0.5)
+    given = np.exp(-2j * np.pi * f * 0.01)
+    answer = given / (90.0**2 - f**2 + 1j * f)
+    ordinates = Ordinates(f, given, answer, np.full(f.size, 1e-9), 9.0, True, span=0.7)
+    theta, variance, step = np.log([62.0, 90.0, 0.004, 0.01]), np.full(f.size, 1e-9), 1e-6
+    order = Order(theta, -2, 2)
+
+    def error(theta: np.ndarray) -> np.ndarray:
+        solution = solve(ordinates, Order(theta, -2, 2), variance)
+        whitened = solution.error * np.sqrt(2 / variance)
+        return np.concatenate([whitened.real, whitened.imag])
+
+    found = slopes(ordinates, order, variance, solve(ordinates, order, variance))
+    for k, column in enumerate(found.T):
+        move = step * np.eye(4)[k]
+        difference = (error(theta + move) - error(theta - move)) / (2 * step)
+        # Kaufman's slope leaves out a part that is orthogonal to the error's own model.
+        basis = solve(ordinates, order, variance).basis
+        difference -= basis @ (basis.T @ difference)
+        assert np.linalg.norm(column - difference) < 0.02 * np.linalg.norm(difference)
+
+
+def test_double_hits_are_refused_by_number_and_time() -> None:
+    """Two of five: the others are used, and the modes are those of the machine."""
+    reading = read(Hammer(MODES, blows=5, double=(1, 3)))
+    assert_found(reading)
+    assert reading.frf.n_averages == 3
+    refused = [r for r in reading.modes.refused if r.reason == "double-hit"]
+    assert [r.detail[:6] for r in refused] == ["blow 2", "blow 4"]
+    assert "a second hit of" in refused[0].detail
+    assert "strike again" in refused[0].detail
+    with pytest.raises(BadLog, match=r"double-hit: none of 1 blows can be used: blow 1 at"):
+        read(Hammer(MODES, blows=1, double=(0,)))
+
+
+@pytest.mark.parametrize("channel", [0, 1])
+def test_overloaded_blows_are_refused(channel: int) -> None:
+    """The strongest of four exceed the range of the force or of the sensor."""
+    signals = list(strike(np.random.default_rng(2), Hammer(MODES, blows=4, tip=0.006))[:2])
+    tops = [np.abs(part).max() for part in np.array_split(signals[channel], 4)]
+    limit = 0.8 * max(tops)
+    signals[channel] = np.clip(signals[channel], -limit, limit)
+    log = make_log({"current_force": signals[0], "acc": signals[1]}, RATE)
+    reading = read_frf(log, "current_force", "acc", band=BAND)
+    assert_found(reading)
+    assert [r.reason for r in reading.modes.refused if "blow" in r.detail] == ["overload"] * sum(
+        top > limit for top in tops
+    )
+
+
+def test_only_what_is_certain_is_taken_for_blows() -> None:
+    """Noise, noise with a spike, a sweep and a train of equal pulses are none unless stated."""
+    rng = np.random.default_rng(3)
+    noise = rng.standard_normal(20_000)
+    spike = noise + 60 * (np.arange(noise.size) == 7000)
+    t = np.arange(noise.size) / RATE
+    train = 1.0 * (np.arange(noise.size) % 2000 == 500)
+    for values in (noise, spike, np.sin(2 * np.pi * 50 * t**2), train):
+        assert find_hits(values, RATE, certain=True) == []
+    assert len(find_hits(train, RATE, certain=False)) == 10
+    # The same force, a push, and negative.
+    force = strike(rng, Hammer(MODES, blows=3))[0]
+    for values in (force, force + 5, -force):
+        assert len(find_hits(values, RATE, certain=True)) == 3
+
+
+def test_a_line_is_not_a_mode_after_one_blow() -> None:
+    """Mains in the record of one blow do not fade; over several their phase is random."""
+    for blows in (1, 4):
+        force, answer, _ = strike(np.random.default_rng(4), Hammer(MODES, blows=blows))
+        t = np.arange(answer.size) / RATE
+        answer = answer + 0.02 * answer.max() * np.sin(2 * np.pi * 50 * t + 1)
+        log = make_log({"current_force": force, "acc": answer}, RATE)
+        assert_found(read_frf(log, "current_force", "acc", band=BAND))
