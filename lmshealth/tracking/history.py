@@ -72,7 +72,7 @@ class History:
 
     stage: str  # identity of the machine
     logs: tuple[str, ...]  # their names
-    recorded_at: tuple[datetime, ...]  # ascending
+    recorded_at: tuple[datetime, ...]  # never decreasing
     travel: FloatArray  # odometer in m, ``(n_logs,)``; NaN throughout where there is none
     covariates: dict[str, FloatArray]  # by column name, ``(n_logs,)`` each, NaN where unknown
     modes: tuple[str, ...]  # their names
@@ -102,7 +102,7 @@ class History:
         freeze(self)
 
     def _expect_order(self) -> None:
-        """Require ascending moments and, where there is one, an ascending odometer."""
+        """Require moments, and the odometer where there is one, that never decrease."""
         for name, ticks in (
             ("recorded_at", [moment.timestamp() for moment in self.recorded_at]),
             ("travel", self.travel if self.has_odometer else []),

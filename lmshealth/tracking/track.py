@@ -111,7 +111,7 @@ class Track:
 
     stage: str  # identity of the machine
     logs: tuple[str, ...]  # their names, an epoch each
-    recorded_at: tuple[datetime, ...]  # ascending
+    recorded_at: tuple[datetime, ...]  # never decreasing
     travel: FloatArray  # odometer in m, ``(n_epochs,)``; NaN throughout where there is none
     modes: tuple[str, ...]
     sources: tuple[str, ...]  # of the estimates
