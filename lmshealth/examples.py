@@ -17,9 +17,9 @@ TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "exam
 """The estimates, in the columns of ``modes.csv``."""
 
 
-def readings() -> tuple[LogEstimates, ...]:
+def readings() -> list[LogEstimates]:
     """Return the estimates of every log of the example."""
-    return read_estimates(TABLE, stage=load_stage("lms-y")).entries
+    return read_estimates(TABLE, stage=load_stage("lms-y"))[0]
 
 
 def history() -> History:

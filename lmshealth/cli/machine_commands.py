@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from lmshealth.report.tables import Row
     from lmshealth.stage.description import Decision
     from lmshealth.tracking.history import History
-    from lmshealth.tracking.read_tables import Drifts, Table
+    from lmshealth.tracking.read_tables import Drifts
 
 
 Progress = Callable[[str, int, int], None]
@@ -67,10 +67,9 @@ def track(table: Path, **given: Any) -> None:
     from lmshealth.tracking.track import track as track_modes
 
     stage, targets = given["stage"], given | {"track": given["out"]}
-    read = _read_machines(table, given)
+    machines, notes = _read_machines(table, given)
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
-    notes = list(read.notes)
-    for history, refused in read.entries:
+    for history, refused in machines:
         found = track_modes(history, stage)
         refused += outlier_refusals(history, found)
         smoothed = None
@@ -199,16 +198,16 @@ def _counting_map(name: str, progress: Progress) -> Callable[..., Iterator[Any]]
     return mapper
 
 
-def _read_drifts(table: Path, cov: Path | None) -> tuple[Drifts, ...]:
+def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
     from lmshealth.tracking.read_tables import read_drifts
 
     default = table.with_name("track_cov.csv")
-    read = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
-    print_notes(f"{table}: {note}" for note in read.notes)
-    return read.entries
+    found, notes = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
+    print_notes(f"{table}: {note}" for note in notes)
+    return found
 
 
-def _single(table: Path, machines: tuple[Drifts, ...]) -> Drifts:
+def _single(table: Path, machines: list[Drifts]) -> Drifts:
     if len(machines) > 1:
         raise BadTable(
             f"{table}: {len(machines)} machines ({', '.join(m.stage for m in machines)}); needed "
@@ -258,12 +257,12 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
 
     stage, by = given["stage"], given["by"] and given["by"].date()
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
-    read = _read_machines(table, given)
-    print_notes(read.notes)
-    for history, refused in read.entries:
+    machines, notes = _read_machines(table, given)
+    print_notes(notes)
+    for history, refused in machines:
         print_notes(f"{history.stage}: {note}" for note in missing_mode_notes(history, refused))
     with progress_bars() as progress:
-        histories = [history for history, _ in read.entries]
+        histories = [history for history, _ in machines]
         found, lost = _prognose_machines(histories, given, progress)
     rows = []
     for prognosis, _ in found:
@@ -317,7 +316,9 @@ def _prognose_machines(
     return found, lost
 
 
-def _read_machines(table: Path, given: dict[str, Any]) -> Table[tuple[History, list[Refusal]]]:
+def _read_machines(
+    table: Path, given: dict[str, Any]
+) -> tuple[list[tuple[History, list[Refusal]]], list[str]]:
     from lmshealth.tracking.read_tables import read_machines
 
     cov, maintenance = given["cov"], given["maintenance"]

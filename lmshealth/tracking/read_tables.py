@@ -11,7 +11,6 @@ from dataclasses import dataclass
 from datetime import datetime
 from itertools import pairwise
 from pathlib import Path
-from typing import Generic, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -39,16 +38,6 @@ _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "basel
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
 _SHAPE = "shape_"
 
-Entry = TypeVar("Entry")
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Table(Generic[Entry]):
-    """Content of a table."""
-
-    entries: tuple[Entry, ...]  # in the order of the table
-    notes: tuple[str, ...]  # what the table lacks, and what is assumed instead
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drifts:
@@ -71,8 +60,8 @@ class Drifts:
 
 def read_estimates(
     path: Path, *, cross_terms: Path | None = None, stage: Stage | None = None
-) -> Table[LogEstimates]:
-    """Read a table in the columns of ``modes.csv``: one entry per log.
+) -> tuple[list[LogEstimates], list[str]]:
+    """Read the estimates of each log from a table in the columns of ``modes.csv``.
 
     Needed are ``recorded_at``, ``frequency_hz`` and ``frequency_std_hz``; a row is one estimate.
     Without ``log`` the rows of one moment are one log, without ``stage`` all are of one machine.
@@ -80,7 +69,8 @@ def read_estimates(
     `cross_terms` are covariances between estimates of one log, in the columns of ``modes_cov.csv``.
     The covariates of the stage are read too, and other mode names than its own are refused.
     `BadTable` if a table cannot be read, a column is missing, a value is not valid, an estimate
-    exists twice, or rows of one log contradict each other.
+    exists twice, or rows of one log contradict each other. The notes returned state what the table
+    lacks, and what is assumed instead.
     """
     table = _read(path, _NEEDED, "estimate")
     covariates = [*COVARIATES]
@@ -103,11 +93,11 @@ def read_estimates(
         if (empty := terms["cov_ln_f"].isna()).any():
             raise BadTable(f"{cross_terms}, {lines(terms, empty)}: cov_ln_f is empty")
     known = [c for c in covariates if c in table.columns]
-    logs = tuple(
+    logs = [
         _log(path, str(log), rows, known, shapes, terms)
         for (_, log), rows in table.groupby(["stage", "log"], sort=False)
-    )
-    return Table(logs, (*notes, *_order_notes(logs), *_term_notes(table, terms)))
+    ]
+    return logs, [*notes, *_order_notes(logs), *_term_notes(table, terms)]
 
 
 def read_machines(
@@ -116,7 +106,7 @@ def read_machines(
     *,
     cross_terms: Path | None = None,
     maintenance: Path | None = None,
-) -> Table[tuple[History, list[Refusal]]]:
+) -> tuple[list[tuple[History, list[Refusal]]], list[str]]:
     """Read a table in the columns of ``modes.csv``: a history per machine, with its refusals.
 
     Parameters are those of `read_estimates`, and a table of `maintenance`; a ``modes_cov.csv`` in
@@ -124,24 +114,24 @@ def read_machines(
     """
     default = path.with_name("modes_cov.csv")
     terms = cross_terms or (default if default.exists() else None)
-    read = read_estimates(path, cross_terms=terms, stage=stage)
+    logs, notes = read_estimates(path, cross_terms=terms, stage=stage)
     actions = read_actions(maintenance) if maintenance else ()
     own: dict[str, list[LogEstimates]] = {}
-    for one in read.entries:
+    for one in logs:
         own.setdefault(str(one.metadata.stage), []).append(one)
-    notes = [
+    notes += [
         f"maintenance of {name} is not used: the table has {', '.join(own)}"
         for name in dict.fromkeys(action.stage for action in actions if action.stage not in own)
     ]
-    machines = tuple(
-        build_history(logs, stage, [action for action in actions if action.stage == name])
-        for name, logs in own.items()
-    )
-    return Table(machines, (*read.notes, *notes))
+    machines = [
+        build_history(estimates, stage, [action for action in actions if action.stage == name])
+        for name, estimates in own.items()
+    ]
+    return machines, notes
 
 
-def read_drifts(path: Path, *, cross_terms: Path | None = None) -> Table[Drifts]:
-    """Read a table in the columns of ``track.csv``: the drifts per machine.
+def read_drifts(path: Path, *, cross_terms: Path | None = None) -> tuple[list[Drifts], list[str]]:
+    """Read the drifts of each machine, and notes, from a table in the columns of ``track.csv``.
 
     Needed are ``recorded_at``, ``mode``, ``drift`` (of ln frequency against baseline) and
     ``drift_std``. Without ``stage`` all rows are of one machine. `cross_terms` are covariances
@@ -171,11 +161,11 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> Table[Drifts]
             "no covariances between the drifts of modes: they are assumed independent, though "
             "baseline and temperature are common to them; add track_cov.csv"
         )
-    machines = tuple(
+    machines = [
         _drifts(path, str(stage), rows, None if terms is None else terms[terms["stage"] == stage])
         for stage, rows in table.groupby("stage", sort=False)
-    )
-    return Table(machines, tuple(notes))
+    ]
+    return machines, notes
 
 
 def _read(path: Path, needed: Sequence[str], content: str) -> pd.DataFrame:

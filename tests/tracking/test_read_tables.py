@@ -48,13 +48,13 @@ def read(
 ) -> list[LogEstimates]:
     """Write tables and read them."""
     path, cross = _write(tmp_path, text, terms)
-    return list(read_estimates(path, cross_terms=cross, stage=stage).entries)
+    return read_estimates(path, cross_terms=cross, stage=stage)[0]
 
 
 def notes(tmp_path: Path, text: str, terms: str = "") -> str:
     """Read tables and return its notes."""
     path, cross = _write(tmp_path, text, terms)
-    return "\n".join(read_estimates(path, cross_terms=cross).notes)
+    return "\n".join(read_estimates(path, cross_terms=cross)[1])
 
 
 def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
@@ -186,9 +186,8 @@ def test_what_a_track_writes_is_read_again(tmp_path: Path) -> None:
     known = make_track(drift, cov)
     for name, rows in (("track", track_rows(known)), ("track_cov", track_cov_rows(known))):
         frame(COLUMNS[name], rows).to_csv(tmp_path / f"{name}.csv", index=False)
-    read = read_drifts(tmp_path / "track.csv", cross_terms=tmp_path / "track_cov.csv")
-    (found,) = read.entries
-    assert read.notes == ()
+    (found,), notes = read_drifts(tmp_path / "track.csv", cross_terms=tmp_path / "track_cov.csv")
+    assert notes == []
     assert (found.stage, found.modes) == (known.stage, known.modes)
     assert found.recorded_at == known.recorded_at
     np.testing.assert_allclose(found.travel, known.travel)
@@ -204,7 +203,7 @@ def test_logs_of_one_moment_are_epochs_of_their_own(tmp_path: Path) -> None:
     path, terms = write_drifts(
         tmp_path, text, DRIFT_TERM.format(day=1, cov=1e-7) + DRIFT_TERM.format(day=1, cov=2e-7)
     )
-    (found,) = read_drifts(path, cross_terms=terms).entries
+    (found,), _ = read_drifts(path, cross_terms=terms)
     np.testing.assert_array_equal(found.drift, [[-0.01, -0.01], [-0.02, -0.02]])
     np.testing.assert_array_equal(found.drift_cov[:, 0, 1], [1e-7, 2e-7])
 
@@ -214,7 +213,7 @@ def test_rows_are_put_in_the_order_of_time(tmp_path: Path) -> None:
     path, _ = write_drifts(
         tmp_path, DRIFT_HEAD + drift_row(3, drift=-0.03) + drift_row(1) + drift_row(2, drift=-0.02)
     )
-    (found,) = read_drifts(path).entries
+    (found,), _ = read_drifts(path)
     np.testing.assert_array_equal(found.drift[:, 0], [-0.01, -0.02, -0.03])
     np.testing.assert_array_equal(found.travel, [1e4, 2e4, 3e4])
 
@@ -231,13 +230,12 @@ def test_what_is_missing_is_assumed_and_said(tmp_path: Path) -> None:
     )
     path = tmp_path / "mine.csv"
     table.to_csv(path, index=False)
-    read = read_drifts(path)
-    (found,) = read.entries
+    (found,), notes = read_drifts(path)
     assert found.stage == "mine"
     assert np.isnan(found.travel).all()
     np.testing.assert_allclose(found.drift_cov[0], np.diag([1e-6, 4e-6]))
-    assert "one machine, mine" in read.notes[0]
-    assert "independent" in read.notes[1]
+    assert "one machine, mine" in notes[0]
+    assert "independent" in notes[1]
 
 
 def test_several_machines_stay_apart(tmp_path: Path) -> None:
@@ -245,7 +243,7 @@ def test_several_machines_stay_apart(tmp_path: Path) -> None:
     other = (drift_row(1, "yaw") + drift_row(2, "yaw")).replace("AX-1", "AX-2")
     text = DRIFT_HEAD + drift_row(1) + drift_row(1, "pitch") + other
     path, terms = write_drifts(tmp_path, text, DRIFT_TERM.format(day=1, cov=5e-7))
-    one, two = read_drifts(path, cross_terms=terms).entries
+    (one, two), _ = read_drifts(path, cross_terms=terms)
     assert (one.modes, two.modes) == (("roll", "pitch"), ("yaw",))
     assert one.drift_cov[0, 0, 1] == 5e-7
     assert two.drift.shape == (2, 1)
