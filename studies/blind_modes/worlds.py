@@ -128,10 +128,23 @@ def eight_modes(rng: np.random.Generator) -> World:
     )
 
 
+def turbine(rng: np.random.Generator) -> World:
+    """Draw the first mode of a tower at low frequency, and a rotor harmonic that wanders."""
+    shapes = _shapes(rng, 8, 1)
+    shapes[6:] *= 0.03
+    machine = _Machine(
+        np.array([rng.uniform(0.35, 0.4)]), rng.uniform(0.008, 0.02, 1),
+        10 ** rng.uniform(2.3, 2.6, 1), shapes, floor_slope=1.0, band=(0.2, 1.5),
+        wandering=(float(rng.uniform(0.75, 0.85)),), harmonic_level=float(rng.uniform(0.3, 3.0)),
+    )  # fmt: skip
+    return _record(rng, "turbine", machine, 30.0, 600.0)
+
+
 FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
     "four modes": four_modes,
     "varied": varied,
     "eight modes": eight_modes,
+    "turbine": turbine,
 }
 
 
