@@ -15,7 +15,13 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_cluster, fit_found, locate
+from lmshealth.modal.ambient.cluster_fit import (
+    bin_cluster,
+    fit_cluster,
+    fit_found,
+    locate,
+    needed_ordinates,
+)
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     FittedSpectrum,
@@ -45,6 +51,10 @@ _CEILING = 4.0
 # Without a description fits reach so many damping ratios from the outer modes: floors of real
 # machines are not simple.
 _REACH = 6.0
+_UNLIKE = (
+    "no modes in common with the other channels explain it, which are used without it: check "
+    "whether it was recorded at the same time, or identify it by itself"
+)
 # A cluster is fitted below this share of the sample rate.
 _TOP = 0.49
 
@@ -129,10 +139,11 @@ def read_ambient(
     stretches, spectra = _transform(log, used, targets, band)
     tested: list[tuple[str, float, float]] = []
     harmonics: tuple[Harmonic, ...] = ()
+    unlike: tuple[str, ...] = ()
     top = _TOP * log.sample_rate
     if stage is None:
         sought, tested = _search(log, used, stretches, spectra, band)
-        harmonics, spectra = sought.harmonics, sought.spectra
+        harmonics, spectra, unlike = sought.harmonics, sought.spectra, sought.left_out
         groups = split_groups(sought.modes)
         fits = [
             fit
@@ -142,6 +153,7 @@ def read_ambient(
     else:
         fits = [_fit_described(spectra, c, targets, top) for c in clusters(targets)]
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
+    left_out = [Refusal(log.name, "unlike-others", _UNLIKE, channel=c) for c in unlike]
     rejected, found = refused, [fit.modes for fit in fits if fit.modes is not None]
     fitted = tuple(one.fitted for one in found)
     masked = [line for one in found for line in one.lines]
@@ -154,7 +166,7 @@ def read_ambient(
     if stage is None:
         found = drop_duplicates(found)
         anything = any(one.names for one in found)
-        refused = [] if anything else [_nothing_found(log, lines, refused)]
+        refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
     modes = numbered(modes) if stage is None else modes
     return AmbientReading(modes, spectra, fitted, tuple(rejected))
@@ -274,8 +286,11 @@ def _fit_group(
         low = (targets[first - 1].frequency * near[0].frequency) ** 0.5
     if last + 1 < len(targets):
         high = (targets[last + 1].frequency * near[-1].frequency) ** 0.5
-    low = max(low, min(target.band(_REACH)[0] for target in near))
-    high = min(high, max(target.band(_REACH)[1] for target in near))
+    # At least twice the ordinates that the fit needs.
+    least = needed_ordinates(len(near)) / found.spectra.duration
+    reach = [max(_REACH * t.damping_ratio * t.frequency, least) for t in near]
+    low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
+    high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
     fit = fit_found(found.around(near, low, high), binned, near, (low, high))
     if fit.modes is None and len(near) > 1:

@@ -167,6 +167,21 @@ class LogSpectra:
         spectra = tuple(s.with_foreign(expected(s.frequency)) for s in self.spectra)
         return replace(self, spectra=spectra)
 
+    def select(self, kept: Sequence[int]) -> LogSpectra:
+        """Return some of the channels."""
+        rows, columns = np.ix_(kept, kept)
+        spectra = tuple(
+            replace(
+                s,
+                matrix=s.matrix[:, rows, columns],
+                lines=tuple((kept.index(c), f, a) for c, f, a in s.lines if c in kept),
+                foreign=None if s.foreign is None else s.foreign[:, rows, columns],
+            )
+            for s in self.spectra
+        )
+        channels = tuple(self.channels[c] for c in kept)
+        return LogSpectra(channels, tuple(self.sources[c] for c in kept), spectra)
+
     def without_band(self, low: float, high: float) -> LogSpectra:
         """Exclude the ordinates from low to high Hz."""
         return replace(

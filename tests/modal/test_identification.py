@@ -527,6 +527,18 @@ def test_neighbours_of_a_group_are_fitted_with_it_but_published_once(
         assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
+@pytest.mark.parametrize("late", [1, 0])
+def test_a_channel_that_is_late_is_left_out_by_name(late: int) -> None:
+    """Its phase is that of no mode: others give the modes as without it; the control keeps it."""
+    modes = [Mode(80.0, 0.006, 1.0, (1.0, 0.6, -0.7)), Mode(92.0, 0.008, 1.0, (0.6, -1.0, 0.5))]
+    log = acceleration_log(rng(3), modes, 60.0, 400.0, 1e-2)
+    rows = dict(zip("abc", (channel.values[:] for channel in log.channels), strict=True))
+    rows["c"] = np.roll(rows["c"], late)
+    found = identify(make_log(rows, 400.0), band=(60.0, 120.0))
+    assert [r.channel for r in found.refused] == (["c"] if late else [])
+    np.testing.assert_allclose(found.frequency, [80.0, 92.0], rtol=3e-3)
+
+
 def test_spectra_reach_as_far_as_modes_are_looked_for(
     fitted: list[tuple[LogSpectra, tuple[Target, ...]]],
 ) -> None:

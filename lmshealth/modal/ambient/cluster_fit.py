@@ -228,7 +228,7 @@ def fit_cluster(
     low = min(target.band(BAND_HALF_WIDTH)[0] for target in present)
     high = max(target.band(BAND_HALF_WIDTH)[1] for target in present)
     data = prepare(spectra, binned, present, (low, high))
-    n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(present)
+    n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(present))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
         short = {t.name: Rejection("too-short", detail, t.frequency) for t in present}
@@ -248,6 +248,11 @@ def fit_cluster(
     return ClusterFit(fit.modes, rejected | fit.rejected)
 
 
+def needed_ordinates(n_modes: int) -> int:
+    """Return the least number of Fourier frequencies of a fit."""
+    return 10 + 6 * n_modes
+
+
 def fit_found(
     spectra: LogSpectra,
     binned: BinnedSpectra,
@@ -256,7 +261,7 @@ def fit_found(
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz, and drop those without evidence."""
     data = prepare(spectra, binned, targets, band)
-    n, needed = sum(int(mask.sum()) for mask in data.masks), 10 + 6 * len(targets)
+    n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
         short = {t.name: Rejection("too-short", detail, t.frequency) for t in targets}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -12,6 +12,8 @@ from lmshealth.modal.ambient.whittle import receptance, response
 
 # Gain in log likelihood below which a mode is left as it is, and most shorter steps.
 _LEAST_GAIN, _HALVINGS = 0.3, 5
+# Median of the square of a normal variable.
+_MEDIAN_SQUARE = 0.455
 # Of silent channels, in units of the median density of a channel.
 LEAST_FLOOR = 1e-12
 
@@ -63,6 +65,24 @@ class JointModel:
         return JointModel(
             self.data, self.floor.copy(), *poles, self.phi[:, kept], r, self.rho[:, kept]
         )
+
+    def of_channels(self, kept: list[int]) -> JointModel:
+        """Return the model of some of the channels."""
+        d, block = self.data, np.ix_(range(len(self.data.count)), kept, kept)
+        foreign = None if d.foreign is None else d.foreign[block]
+        data = replace(d, matrix=d.matrix[block], foreign=foreign, scale=d.scale[kept])
+        poles, rows = (self.f.copy(), self.zeta.copy()), (self.phi[kept], self.r, self.rho[kept])
+        return JointModel(data, self.floor[kept], *poles, *rows)
+
+    def dispersions(self) -> FloatArray:
+        """Return, for each channel given the others, the dispersion of its residual; 1 for noise.
+
+        The median square of the residual is resistant to lines.
+        """
+        g = np.linalg.inv(self.expected())
+        ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / np.einsum("kaa->ka", g).real
+        squares = self.data.count[:, None] * (ratio - 1) ** 2
+        return np.asarray(np.median(squares, axis=0) / _MEDIAN_SQUARE)
 
     def with_mode(self, f: float, zeta: float, phi: FloatArray) -> JointModel:
         """Return the model with one mode more, the last one."""

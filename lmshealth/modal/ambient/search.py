@@ -51,6 +51,7 @@ class Found:
     spectra: LogSpectra  # without the directions of the harmonics
     model: JointModel
     band: tuple[float, float]
+    left_out: tuple[str, ...]  # channels that the modes do not explain
 
     def within(self, frequency: float) -> bool:
         """Return whether a frequency in Hz lies in the band."""
@@ -75,24 +76,17 @@ def search(
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    ``recording`` is the longest segment, to recognise harmonics; ``lines`` are masked.
+    ``recording`` is the longest segment, to recognise harmonics; ``lines`` are masked. Channels
+    that no common modes explain are left out.
     """
-    harmonics: list[Harmonic] = []
+    every = spectra.channels
     while True:
-        candidates = [
-            c
-            for c in find_candidates(spectra, low, high)
-            if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
-        ]
-        model = _select(spectra, candidates, low, high)
-        harmonic = find_harmonic(model, recording, harmonics)
-        if harmonic is None or len(harmonics) == _MOST_HARMONICS:
+        model, harmonics, after = _explain(spectra, recording, low, high)
+        kept = _consistent(model)
+        if len(kept) == len(spectra.channels):
             break
-        harmonics.append(harmonic)
-        if len(spectra.channels) == 1:
-            spectra = spectra.without_band(harmonic.low, harmonic.high)
-        else:
-            spectra = spectra.with_foreign(harmonic.expected)
+        recording = replace(recording, transforms=recording.transforms[:, kept])
+        spectra = spectra.select(kept)
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
     wide = (width > LINE_WIDTH) & (width * model.f * spectra.duration > 1)
@@ -109,7 +103,45 @@ def search(
         )
         for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
     )
-    return Found(modes, tuple(harmonics), spectra, model, (low, high))
+    left_out = tuple(name for name in every if name not in after.channels)
+    return Found(modes, harmonics, after, model, (low, high), left_out)
+
+
+def _explain(
+    spectra: LogSpectra, recording: Recording, low: float, high: float
+) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra]:
+    """Select modes and harmonics; return the spectra without the directions of these, too."""
+    harmonics: list[Harmonic] = []
+    while True:
+        candidates = [
+            c
+            for c in find_candidates(spectra, low, high)
+            if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
+        ]
+        model = _select(spectra, candidates, low, high)
+        harmonic = find_harmonic(model, recording, harmonics)
+        if harmonic is None or len(harmonics) == _MOST_HARMONICS:
+            return model, tuple(harmonics), spectra
+        harmonics.append(harmonic)
+        if len(spectra.channels) == 1:
+            spectra = spectra.without_band(harmonic.low, harmonic.high)
+        else:
+            spectra = spectra.with_foreign(harmonic.expected)
+
+
+def _consistent(model: JointModel) -> list[int]:
+    """Return the channels that the modes explain; the others are left out one by one."""
+    kept = list(range(model.data.scale.size))
+    while len(kept) > 1 and model.dispersions().max() > constants.POOR_FIT:
+        fewer = [
+            model.of_channels([k for k in range(len(kept)) if k != c]) for c in range(len(kept))
+        ]
+        for one in fewer:
+            one.refine(2)
+        best = int(np.argmin([np.log(one.dispersions()).mean() for one in fewer]))
+        model = fewer[best]
+        del kept[best]
+    return kept
 
 
 def _select(
