@@ -148,6 +148,12 @@ def test_readings(root: Path) -> None:
     assert failed == set(answer["not_met"])
 
 
+def test_mislabelled_modes(root: Path) -> None:
+    """No wrong name is published without a warning; the control publishes some."""
+    answer = json.loads(run_study(root, "mislabelled_modes"))
+    assert all(answer["passed"].values())
+
+
 def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
     answer = json.loads(run_study(root, "line_test"))

@@ -18,7 +18,7 @@ from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import judge
+from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
     MachineEvidence,
@@ -96,11 +96,11 @@ def assess(
     notes += missing_mode_notes(history, refused)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     own_seed = seed_of(seed, history.stage, stage.digest)
-    found = _results(history, stage, epochs, own_seed, executor)
-    if found.track is not None:
-        refused += outlier_refusals(history, found.track)
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
+    found = _results(history, stage, used, epochs, own_seed, executor)
+    if found.track is not None:
+        refused += outlier_refusals(history, found.track)
     return Assessment(
         stage=stage,
         history=history,
@@ -108,13 +108,14 @@ def assess(
         track=found.track,
         health=found.health,
         prognosis=found.prognosis,
-        judgement=judge(stage, history, found.health, found.track),
+        judgement=judge(stage, history, found.health, found.track, doubt=found.doubt),
         refused=(*not_excited, *refused),
         notes=(*notes, *found.notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
         evidence=found.evidence,
+        doubt=found.doubt,
     )
 
 
@@ -127,15 +128,24 @@ class _Results:
     prognosis: Prognosis | None = None
     evidence: MachineEvidence | None = None
     notes: tuple[str, ...] = ()
+    doubt: str = ""
 
 
 def _results(
-    history: History, stage: Stage, epochs: int, seed: tuple[int, int], executor: Executor | None
+    history: History,
+    stage: Stage,
+    readings: Sequence[LogEstimates],
+    epochs: int,
+    seed: tuple[int, int],
+    executor: Executor | None,
 ) -> _Results:
     found = _Results()
     try:
         tracked = track(history, stage)
-        found = replace(found, track=tracked)
+        doubt = doubt_of_names(stage, history, tracked, readings)
+        found = replace(found, track=tracked, doubt=doubt)
+        if doubt:
+            return found
         history = accepted_estimates(history, tracked)
         if not stage.parameters:
             return found

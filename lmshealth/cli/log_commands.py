@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from lmshealth.modal.frf.measured import MeasuredResponse
     from lmshealth.modal.identification import AmbientReading
     from lmshealth.report.tables import Row
+    from lmshealth.stage.description import Stage
     from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
@@ -98,10 +99,13 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     rows = [row for one in found for row in modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
+    off = _off_description(found, stage)
+    if off:
+        content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
         if found:
-            views.print_modes(rows, rejected)
+            views.print_modes(rows, rejected, off)
             if given["shapes"]:
                 views.print_shapes(content["shapes"], content["mac"])
             if rows and stage is None and band is None:
@@ -124,6 +128,15 @@ def _read_modes(log: Log, given: dict[str, Any], names: list[str] | None) -> Amb
         return read_ambient(log, given["stage"], **chosen)
     found = identify_decays(log, given["stage"], **chosen)
     return AmbientReading(found, settling_spectra(log, names))
+
+
+def _off_description(found: Sequence[LogEstimates], stage: Stage | None) -> list[Row]:
+    """Return rows of declared and found values of logs that differ from their description."""
+    from lmshealth.modal.naming import compare
+
+    if stage is None:
+        return []
+    return [{"log": r.log, **one._asdict()} for r in found for one in compare(r.modes, stage)]
 
 
 def _check_save(path: Path, stage: object, logs: Sequence[Path]) -> None:

@@ -297,6 +297,7 @@ def _prognose_machines(
 ) -> tuple[list[tuple[Prognosis, LifePosterior | None]], list[str]]:
     """Prognose all machines of a table; return results, and reasons of those that have none."""
     from lmshealth.health.ensemble_sampling import seed_of
+    from lmshealth.health.verdict import doubt_of_names
     from lmshealth.prognosis.remaining_life import prognose_with_posterior
     from lmshealth.tracking.track import accepted_estimates
     from lmshealth.tracking.track import track as track_modes
@@ -304,7 +305,10 @@ def _prognose_machines(
     found, lost, stage = [], [], given["stage"]
     for k, history in enumerate(histories):
         try:
-            accepted = accepted_estimates(history, track_modes(history, stage))
+            tracked = track_modes(history, stage)
+            if doubt := doubt_of_names(stage, history, tracked):
+                raise NotEnoughData(f"{history.stage}: {doubt}")
+            accepted = accepted_estimates(history, tracked)
             seed = seed_of(given["seed"], history.stage, stage.digest)
             prognosis, posterior = prognose_with_posterior(accepted, stage, seed)
             found.append((prognosis, posterior if given["posterior"] else None))

@@ -24,6 +24,7 @@ from lmshealth.report.text import (
     percent,
     probability,
     probability_range,
+    signed,
     spell,
 )
 
@@ -47,6 +48,7 @@ _FLAGS = {
     "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
     "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
     "cluster": "one estimate for two modes that the data do not separate.",
+    "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }
 _VERDICTS = {
     "told": "identifiable",
@@ -59,8 +61,12 @@ _VERDICTS = {
 # --- Single logs ---
 
 
-def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
-    """Print modes with their standard deviations."""
+def print_modes(
+    rows: Sequence[Row],
+    refused: Sequence[Row],
+    off: Sequence[Row] = (),
+) -> None:
+    """Print modes with their standard deviations, and logs that differ from the description."""
     logs = short_names([row["log"] for row in rows])
     cells = []
     for row in rows:
@@ -85,6 +91,24 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row]) -> None:
             print_text(f"{flag}: {_FLAGS[flag]}")
     else:
         print_text("No modes found.")
+    cells = [
+        {
+            "log": logs[row["log"]],
+            "mode": row["mode"],
+            "declared Hz": fixed(row["declared_hz"], 3),
+            "found Hz": fixed(row["found_hz"], 3),
+            "off %": signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1),
+            "declared damping %": fixed(100 * row["declared_damping_ratio"], 2),
+            "found damping %": fixed(100 * row["found_damping_ratio"], 2),
+        }
+        for row in off
+    ]
+    if cells:
+        print_table("Warning: the description differs; a mode may have a wrong name", cells, 2)
+        print_text(
+            "A new machine agrees with its description: correct it, or describe the modes that it "
+            "lacks. Compare a worn machine with its baseline."
+        )
     print_refused(refused)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import compress
 from typing import Literal
@@ -15,8 +15,10 @@ from scipy.special import expit
 from lmshealth._arrays import BoolArray
 from lmshealth.health import constants
 from lmshealth.health.results import Health
+from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
+from lmshealth.modal.naming import off_description
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.history import History
+from lmshealth.tracking.history import History, LogEstimates
 from lmshealth.tracking.track import Event, Track
 
 _WITHOUT_LOSS = ("healthy", "step", "not-enough-data")
@@ -62,7 +64,12 @@ def degraded_below(parameter: ParameterSpec) -> float:
 
 
 def judge(
-    stage: Stage, history: History, health: Health | None, track: Track | None = None
+    stage: Stage,
+    history: History,
+    health: Health | None,
+    track: Track | None = None,
+    *,
+    doubt: str = "",
 ) -> Verdict:
     """Return the most probable state of the stage at the last epoch, with its probability.
 
@@ -72,6 +79,8 @@ def judge(
         Parameters with their limits and words, and all logs.
     health, track : Health or None, Track, optional
         Posterior of the parameters, None if they could not be inferred; steps and alarms.
+    doubt : str
+        Why the names of the modes are in doubt, from `doubt_of_names`; then there is no health.
 
     Returns
     -------
@@ -98,8 +107,9 @@ def judge(
     """
     jumps = undeclared_events(track, history.baseline, "step")
     if jumps:
-        return _judge_step(stage, history, health, jumps)
-    reason = _reason_for_no_verdict(stage, history, health)
+        found = _judge_step(stage, history, health, jumps)
+        return replace(found, why=f"{found.why} {doubt}".rstrip())
+    reason = doubt or _reason_for_no_verdict(stage, history, health)
     if reason or health is None:
         why = " ".join((*_alarm_sentences(track, history.baseline), reason))
         return Verdict(history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why)
@@ -124,6 +134,52 @@ def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None
     if not health.publishable_parameters().any():
         return "The data do not constrain any health parameter."
     return ""
+
+
+def doubt_of_names(
+    stage: Stage, history: History, track: Track, readings: Sequence[LogEstimates] = ()
+) -> str:
+    """Return why health that depends on the names of modes is not published; empty if it may be.
+
+    Modes move with wear, so that only those of the baseline are compared with the description.
+    ``readings`` are the estimates of the logs of the history, in its order, for their flags.
+    """
+    specs = {mode.name: mode for mode in stage.modes}
+    n_needed, first = stage.description.baseline.logs, history.baseline
+    early = min(first + n_needed, len(history.logs)) - 1
+    ln_f = track.ln_frequency[-1] - track.drift[-1]
+    estimate = np.array([ln_f, track.ln_damping[early]])
+    std = np.array([track.ln_frequency_std[-1], track.ln_damping_std[early]])
+    known = [k for k, m in enumerate(track.modes) if m in specs and np.isfinite(ln_f[k])]
+    names = [track.modes[k] for k in known]
+    off = off_description(stage, names, estimate[:, known], std[:, known])
+    if off:
+        values = "; ".join(
+            f"{one.mode} {one.declared_hz:.5g} Hz and {one.found_hz:.5g} Hz, damping "
+            f"{100 * one.declared_damping_ratio:.2g} % and {100 * one.found_damping_ratio:.2g} %"
+            for one in off
+        )
+        return (
+            "The names of the modes are in doubt, so that no health is published. Declared and "
+            f"found at the baseline: {values}. Plausible are differences up to "
+            f"{100 * OFF_FREQUENCY:.0f} % (damping: a factor of {OFF_DAMPING:g}): correct the "
+            "description, or describe the modes that it lacks."
+        )
+    flags = Counter(
+        name
+        for reading in readings[first:]
+        for name, own in zip(reading.modes.names, reading.modes.flags, strict=True)
+        if "doubtful-name" in own.split()
+    )
+    n_logs = len(readings) - first
+    often = [f"{name} in {k} of {n_logs} logs" for name, k in flags.items() if 2 * k > n_logs]
+    if not often:
+        return ""
+    return (
+        "The names of the modes are in doubt, so that no health is published: another mode may "
+        f"have the name {', '.join(often)} since the baseline (flag doubtful-name). Describe the "
+        "modes that refused.csv lists as undescribed."
+    )
 
 
 def undeclared_events(

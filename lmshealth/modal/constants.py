@@ -21,6 +21,17 @@ MOST_TOGETHER = 4
 # Probability of an assignment from which on a resonance gets the name; pairings below the second
 # are not quoted in a refusal.
 CLEAR_NAME, UNLIKELY_NAME = 0.8, 0.01
+# Probability below which a name beside resonances that no description has is flagged as doubtful:
+# of those without the flag one in twenty is wrong at most.
+SURE_NAME = 0.95
+# Then, of a machine that stands at its description, standard deviation of the common shift as a
+# share of the search; and scales of ln ζ and of 1 - MAC about the described values.
+NO_SHIFT, DAMPING_PRIOR, SHAPE_PRIOR = 1 / 10, 0.5, 0.1
+# Ratio by which a peak that the described modes do not explain exceeds both sides.
+PEAK_RATIO = 1.2
+# Differences from the description that search and map do not explain: of frequency, factor of
+# damping (beyond two standard deviations), and modal assurance criterion.
+OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8
 # Log likelihood that a named mode gains over a missed mode and an unknown resonance.
 MATCH = 3.5
 # Largest factor between the damping ratio found and the one described.

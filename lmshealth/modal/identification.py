@@ -8,7 +8,7 @@ where the start values come from, how modes are named and what happens to modes 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,6 +21,7 @@ from lmshealth.modal.ambient.cluster_fit import (
     fit_found,
     locate,
     needed_ordinates,
+    shows_more,
 )
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
@@ -32,7 +33,7 @@ from lmshealth.modal.ambient.cluster_modes import (
 from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search, split_groups
 from lmshealth.modal.ambient.wandering import Harmonic, Recording
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
-from lmshealth.modal.naming import assign
+from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
 from lmshealth.signal.segments import Segment, find_phases, stationary
 from lmshealth.signal.spectra import (
@@ -151,7 +152,7 @@ def read_ambient(
             for fit in _fit_group(sought, group, neighbourhood(group, sought.modes), top)
         ]
     else:
-        fits = [_fit_described(spectra, c, targets, top) for c in clusters(targets)]
+        fits, known, more = _fit_described(spectra, targets, top)
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     left_out = [Refusal(log.name, "unlike-others", _UNLIKE, channel=c) for c in unlike]
     rejected, found = refused, [fit.modes for fit in fits if fit.modes is not None]
@@ -169,7 +170,31 @@ def read_ambient(
         refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
     modes = numbered(modes) if stage is None else modes
-    return AmbientReading(modes, spectra, fitted, tuple(rejected))
+    reading = AmbientReading(modes, spectra, fitted, tuple(rejected))
+    if stage is None or not more:
+        return reading
+    return _with_undescribed(log, reading, known, targets, channels)
+
+
+def _with_undescribed(
+    log: Log,
+    described: AmbientReading,
+    known: Sequence[Target],
+    targets: tuple[Target, ...],
+    channels: Sequence[str] | None,
+) -> AmbientReading:
+    """Search for all resonances near described modes, and name them together."""
+    bands = [(*target.band(BAND_HALF_WIDTH), target.search) for target in targets]
+    low = min(low * (1 - search) for low, _, search in bands)
+    high = max(high * (1 + search) for _, high, search in bands)
+    try:
+        found = read_ambient(log, channels=channels, band=(low, min(high, _TOP * log.sample_rate)))
+    except BadLog:  # too short for a search
+        return described
+    named = name_together(found.modes, described.modes, known, targets, log.name)
+    if named is described.modes:
+        return described
+    return replace(found, modes=named, rejected=named.refused)
 
 
 def _transform(
@@ -253,18 +278,36 @@ def _search(
 
 
 def _fit_described(
-    spectra: LogSpectra, cluster: tuple[Target, ...], targets: tuple[Target, ...], top: float
-) -> ClusterFit:
-    """Fit a described cluster: locate it, fit it, name what was found, reject close modes."""
-    binned = bin_cluster(spectra, cluster, targets, top, searched=True)
-    binned, located = locate(binned, cluster)
-    fit = fit_cluster(spectra, binned, located)
+    spectra: LogSpectra, targets: tuple[Target, ...], top: float
+) -> tuple[list[ClusterFit], list[Target], bool]:
+    """Locate, fit and name described modes.
+
+    Returns the fits, their resonances, and whether the spectra show more near the targets.
+    """
+    searched, fits, known = [], [], []
+    for cluster in clusters(targets):
+        binned = bin_cluster(spectra, cluster, targets, top, searched=True)
+        around, located = locate(binned, cluster)
+        fit = fit_cluster(spectra, around, located)
+        searched.append(binned)
+        fits.append(_named(fit, cluster))
+        if fit.modes is not None:
+            modes = fit.modes.modes
+            values = np.stack([modes.frequency, modes.damping_ratio], axis=1).tolist()
+            known += [Target("", f, zeta, 0.0) for f, zeta in values]
+    return fits, known, any(shows_more(binned, known, targets) for binned in searched)
+
+
+def _named(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
+    """Name the resonances of a cluster, and reject close modes."""
     found = fit.modes
     if found is not None and found.names:
         # A mode may have started at the frequency of another.
         ln_f = found.modes.ln_frequency
         order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], found.names[i]))
-        assigned, ambiguous = assign(np.exp(ln_f[order]).tolist(), cluster, complete=True)
+        shapes = likeness(found.modes.select(order), cluster)
+        in_order = np.exp(ln_f[order]).tolist()
+        assigned, ambiguous = assign(in_order, cluster, shapes=shapes, complete=True)
         names = {found.names[i]: name for i, name in zip(order, assigned, strict=True) if name}
         # Without either no assignment keeps the order within the searches.
         if names or ambiguous:

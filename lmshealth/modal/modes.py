@@ -56,7 +56,8 @@ class Modes:
     flags : tuple of str
         Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
         half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
-        ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes).
+        ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes),
+        ``doubtful-name`` (may be another mode).
     shape_channels : tuple of str
         Channels of the shapes; empty where shapes were not identified.
     shapes : ndarray

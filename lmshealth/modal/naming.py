@@ -9,15 +9,20 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from itertools import combinations
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import softmax
+from scipy.stats import norm
 
 from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.modes import Modes, Rejection
+from lmshealth.modal.modes import Modes, Rejection, merge
 from lmshealth.modal.targets import Target
+from lmshealth.stage.constants import BAND_HALF_WIDTH
 from lmshealth.stage.description import Stage
 
 
@@ -26,13 +31,19 @@ def assign(
     targets: Sequence[Target],
     *,
     damping: Sequence[float] | None = None,
+    shapes: FloatArray | None = None,
     complete: bool = False,
+    undescribed: bool = False,
+    clear: float = constants.CLEAR_NAME,
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances to targets by the posterior of all order-preserving assignments.
 
     The prior of an assignment is that of its shifts of ln f (`shift_cost`) and a gain for every
     pair. Pairs outside the search, or with another damping where it is given, are excluded.
-    Resonances, in Hz, and targets ascend; ``complete`` states that every resonance is a target.
+    Resonances, in Hz, and targets ascend; ``shapes`` holds the modal assurance criterion of each
+    pair, NaN where it is unknown. ``complete`` states that every resonance is a target,
+    ``undescribed`` that some are none: then dampings count, and the machine is as likely at its
+    description as worn. A name needs the probability ``clear``.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
     and the targets that are not assigned but may be one of the resonances.
@@ -48,22 +59,30 @@ def assign(
     if damping is not None:
         ratio = np.array(damping)[:, None] / [target.damping_ratio for target in targets]
         admissible &= np.abs(np.log(ratio)) < np.log(constants.DAMPING_SPAN)
+    unlike = np.zeros((n, m))
+    if undescribed and damping is not None:
+        unlike += np.log1p(0.5 * (np.log(ratio) / constants.DAMPING_PRIOR) ** 2)
+    if shapes is not None:
+        unlike += np.log1p(0.5 * np.nan_to_num((1 - shapes) / constants.SHAPE_PRIOR) ** 2)
     pairings = [
-        (list(some), list(sought))
+        (list(one), list(other))
         for k in range(n if complete else 0, min(n, m) + 1)
-        for some in combinations(range(n), k)
-        for sought in combinations(range(m), k)
-        if admissible[some, sought].all()
+        for one in combinations(range(n), k)
+        for other in combinations(range(m), k)
+        if admissible[one, other].all()
     ]
     probability = np.zeros((n, m))
-    weights = [
-        len(i) * constants.MATCH - (shift_cost(shift[i, j][None], search[j], len(i))[0] if i else 0)
-        for i, j in pairings
-    ]
+    weights = []
+    for some, sought in pairings:
+        weight = len(some) * constants.MATCH - unlike[some, sought].sum()
+        if some:
+            weight -= shift_cost(shift[some, sought][None], search[sought], len(some))[0]
+            weight += undescribed * _standing_gain(shift[some, sought], search[sought])
+        weights.append(weight)
     for pairing, weight in zip(pairings, softmax(weights) if weights else (), strict=True):
         probability[pairing] += weight
     names = tuple(
-        targets[int(np.argmax(row))].name if row.size and row.max() >= constants.CLEAR_NAME else ""
+        targets[int(np.argmax(row))].name if row.size and row.max() >= clear else ""
         for row in probability
     )
     # With complete assignments a named resonance cannot be another target as well.
@@ -76,6 +95,13 @@ def assign(
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
             ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
     return names, ambiguous
+
+
+def _standing_gain(shift: FloatArray, search: FloatArray) -> float:
+    """Return the gain in log prior where the machine may stand at its description, not be worn."""
+    scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
+    worn, new = norm.logpdf(shift.mean(), scale=scales)
+    return float(np.logaddexp(0.0, new - worn) - np.log(2))
 
 
 def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) -> str:
@@ -102,6 +128,155 @@ def shift_cost(shifts: FloatArray, search: FloatArray, own: int) -> FloatArray:
 def is_near(target: Target, frequency: float, *, slack: float = 1.0) -> bool:
     """Return whether a frequency in Hz is within so many times the search of a target."""
     return bool(abs(np.log(frequency / target.frequency)) <= slack * np.log1p(target.search))
+
+
+def likeness(modes: Modes, targets: Sequence[Target]) -> FloatArray:
+    """Return the modal assurance criterion of found and described shapes, ``(n_modes, n_targets)``.
+
+    NaN where fewer than two channels are in both.
+    """
+    described = [[target.shape.get(c, np.nan) for c in modes.shape_channels] for target in targets]
+    both = modes.shapes, np.array(described).reshape(len(targets), len(modes.shape_channels))
+    (a, b), (in_a, in_b) = map(np.nan_to_num, both), (np.isfinite(x) + 0.0 for x in both)
+    power = np.where(in_a @ in_b.T > 1, (a**2 @ in_b.T) * (in_a @ (b**2).T), np.nan)
+    return np.asarray((a @ b.T) ** 2 / np.where(power > 0, power, np.nan))
+
+
+def name_together(
+    found: Modes, described: Modes, known: Sequence[Target], targets: Sequence[Target], log: str
+) -> Modes:
+    """Name all resonances of a log, of which some may be no described mode.
+
+    Estimates of described modes remain where nothing more was found in their band; the others are
+    biased by what their fit lacks, and replaced by those of the search.
+
+    Parameters
+    ----------
+    found : Modes
+        By a search without a description.
+    described : Modes
+        By the fit of described modes only; returned if the search found no more.
+    known : sequence of Target
+        The resonances of that fit, published or not.
+    targets : sequence of Target
+        The described modes, ascending in frequency.
+    log : str
+        Name of the log.
+    """
+    near = [any(is_near(target, f) for target in targets) for f in found.frequency.tolist()]
+    found = found.select(np.flatnonzero(near).tolist())
+    places = np.array([[k.frequency, k.damping_ratio] for k in known]).reshape(-1, 2).T
+    more = _apart(found, np.log(places[0]), places[1])
+    if not more:
+        return described
+    reach = BAND_HALF_WIDTH * np.maximum(
+        described.damping_ratio[:, None], found.damping_ratio[more]
+    )
+    off = np.abs(described.ln_frequency[:, None] - found.ln_frequency[more])
+    alone = (off > reach).all(axis=1)
+    kept = described.select(np.flatnonzero(alone).tolist())
+    rest = described.select(np.flatnonzero(~alone).tolist())
+    rest = rest.select(_apart(rest, found.ln_frequency, found.damping_ratio))
+    found = found.select(_apart(found, kept.ln_frequency, kept.damping_ratio))
+    parts = [replace(one, names=("",) * len(one.names)) for one in (kept, found, rest)]
+    both = merge(parts, described.lines, (), described.shape_channels)
+    values: Any = {"damping": both.damping_ratio.tolist(), "shapes": likeness(both, targets)}
+    assigned = partial(assign, both.frequency.tolist(), targets, **values, undescribed=True)
+    names, ambiguous = assigned()
+    sure, _ = assigned(clear=constants.SURE_NAME)
+    flags = tuple(
+        f"{own} doubtful-name".strip() if name and not certain else own
+        for own, name, certain in zip(both.flags, names, sure, strict=True)
+    )
+    index = [i for i, name in enumerate(names) if name]
+    unnamed = both.select([i for i, name in enumerate(names) if not name])
+    missing = [target for target in targets if target.name not in names]
+    refused = _refuse_unnamed(described, unnamed, missing, ambiguous, log)
+    return replace(both, names=names, flags=flags, refused=refused).select(index)
+
+
+def _apart(modes: Modes, ln_f: FloatArray, damping: FloatArray) -> list[int]:
+    """Return the modes that are further than a half-power bandwidth from all of others."""
+    off = np.abs(modes.ln_frequency[:, None] - ln_f)
+    return np.flatnonzero((off > modes.damping_ratio[:, None] + damping).all(axis=1)).tolist()
+
+
+def _refuse_unnamed(
+    described: Modes,
+    unnamed: Modes,
+    missing: Sequence[Target],
+    ambiguous: dict[str, Rejection],
+    log: str,
+) -> tuple[Refusal, ...]:
+    """Return refusals of channels, of described modes without a resonance, and the reverse."""
+    before = {one.mode: one for one in described.refused}
+    refused = [one for one in described.refused if not one.mode]
+    for target in missing:
+        f = target.frequency
+        detail = (
+            f"every resonance near {f:.4g} Hz is more likely another mode; correct the "
+            "description, or excite this mode"
+        )
+        why = ambiguous.get(target.name, Rejection("not-excited", detail, f))
+        own = Refusal(log, why.reason, why.detail, mode=target.name, frequency=why.frequency)
+        refused.append(own if target.name in ambiguous else before.get(target.name, own))
+    for f, zeta in zip(unnamed.frequency.tolist(), unnamed.damping_ratio.tolist(), strict=True):
+        detail = (
+            f"a resonance at {f:.5g} Hz, damping {100 * zeta:.2g} %, is not clearly any described "
+            "mode: describe it, or correct the description"
+        )
+        refused.append(Refusal(log, "undescribed", detail, frequency=f))
+    return tuple(refused)
+
+
+class Difference(NamedTuple):
+    """Declared and found values of one mode."""
+
+    mode: str
+    declared_hz: float
+    found_hz: float
+    declared_damping_ratio: float
+    found_damping_ratio: float
+
+
+def compare(modes: Modes, stage: Stage) -> tuple[Difference, ...]:
+    """Compare the named modes of one log with their description as `off_description` does."""
+    specs = {mode.name: mode for mode in stage.modes}
+    index = [i for i, name in enumerate(modes.names) if name in specs]
+    named = modes.select(index)
+    own = [specs[name] for name in named.names]
+    targets = [
+        Target(m.name, m.frequency_hz, m.damping_ratio, m.search, shape=m.shape) for m in own
+    ]
+    estimate, std = named.estimate.reshape(2, -1), np.sqrt(np.diag(named.cov)).reshape(2, -1)
+    shapes = np.diagonal(likeness(named, targets))
+    return off_description(stage, named.names, estimate, std, shapes)
+
+
+def off_description(
+    stage: Stage,
+    names: Sequence[str],
+    estimate: FloatArray,
+    std: FloatArray,
+    shapes: FloatArray | None = None,
+) -> tuple[Difference, ...]:
+    """Compare modes with their description, all if one differs beyond what is plausible, else none.
+
+    A mode that is not where it is described may be another one, and so may its neighbours.
+    ``estimate`` holds ln f and ln ζ, ``std`` their standard deviations, ``(2, n_modes)``;
+    ``shapes`` the modal assurance criterion with the described shapes, NaN where unknown.
+    """
+    specs = {mode.name: mode for mode in stage.modes}
+    own = [specs[name] for name in names]
+    declared = np.array([[mode.frequency_hz, mode.damping_ratio] for mode in own]).reshape(-1, 2).T
+    limit = np.log([[1 + constants.OFF_FREQUENCY], [constants.OFF_DAMPING]])
+    off = (np.abs(estimate - np.log(declared)) > limit + 2 * std).any()
+    if shapes is not None:
+        off |= (shapes < constants.OFF_SHAPE).any()
+    if not off:
+        return ()
+    rows = zip(names, *declared.tolist(), *np.exp(estimate).tolist(), strict=True)
+    return tuple(Difference(name, f, g, zeta, eta) for name, f, zeta, g, eta in rows)
 
 
 def name_response(modes: Modes, stage: Stage) -> Modes:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -24,6 +24,8 @@ class Target:
     damping_ratio: float  # start value
     search: float  # half width of the search, as a fraction of the frequency
     nominal: float | None = None  # described frequency in Hz, once the start value is another
+    # Described acceleration of channels by name, in any unit; empty where it is not described.
+    shape: Mapping[str, float] = field(default_factory=dict, compare=False)
     # Root of the PSD of the modal force in each channel of the log, with the signs of the shape.
     amplitude: ComplexArray | None = field(default=None, compare=False)
 
@@ -65,7 +67,7 @@ def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tup
     """
     low, high = band or (0.0, np.inf)
     targets = tuple(
-        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search)
+        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search, shape=mode.shape)
         for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
         if low <= mode.frequency_hz <= high
     )

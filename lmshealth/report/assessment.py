@@ -46,6 +46,7 @@ class Assessment:
     evidence: MachineEvidence | None = None
     # Fleet prior of the prognosis; None when it rests on the prior of the description.
     fleet: FleetPrior | None = None
+    doubt: str = ""  # why the names of the modes are in doubt; then there is no health
 
     def service(self) -> Service:
         """Choose the day of the service by the rule of the description."""

@@ -154,6 +154,7 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
         if one.values.size:
             corrected.setdefault(one.covariate, []).append(one)
     return content | {
+        "declared": {mode.name: mode.frequency_hz for mode in stage.modes},
         "seen": _seen(history),
         "influences": influences,
         "corrected": corrected,

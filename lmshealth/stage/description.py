@@ -44,7 +44,10 @@ class Match(_Part, frozen=True):
 
 
 class ModeSpec(_Part, frozen=True):
-    """A mode to identify; ``direction`` is accepted, not used."""
+    """A mode to identify; ``direction`` is accepted, not used.
+
+    ``shape`` holds the acceleration of channels by name, in any unit.
+    """
 
     name: Name
     frequency_hz: Positive
@@ -53,6 +56,10 @@ class ModeSpec(_Part, frozen=True):
     snr: Positive = 100.0
     search: Share = 0.15
     tracked: bool = True
+    shape: dict[str, float] = {}
+
+    def __hash__(self) -> int:
+        return hash((self.name, self.frequency_hz))
 
 
 class WatchedBand(_Part, frozen=True):

@@ -23,6 +23,7 @@ from lmshealth.cli.views import (
     print_track,
     service_text,
 )
+from lmshealth.modal.naming import Difference
 from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report.assessment import Assessment, summarise, summarise_life
@@ -128,6 +129,20 @@ def test_an_error_without_harmonics_above_the_floor_shows_a_dash(
     out = capsys.readouterr().out
     assert "delta_e_2" in out
     assert "corrupt" in out
+
+
+def test_declared_and_found_stand_side_by_side(capsys: pytest.CaptureFixture[str]) -> None:
+    """A mode off its description is shown with both values and a next step; others are not."""
+    row = {"log": "a.h5", "mode": "roll", "channel": "acc", "frequency_hz": 136.4, "snr": 100.0}
+    row |= {"frequency_std_hz": 0.1, "damping_ratio": 0.015, "damping_ratio_std": 0.001}
+    row |= {"flags": "at-bound"}
+    off = {"log": "a.h5", **Difference("roll", 126.5, 136.4, 0.0147, 0.015)._asdict()}
+    print_modes([row], [], [off])
+    words = " ".join(capsys.readouterr().out.split())
+    assert "roll 126.500 136.400 +7.8 1.47 1.50" in words
+    assert "correct it, or describe the modes that it lacks" in words
+    print_modes([row], [])
+    assert "declared" not in capsys.readouterr().out
 
 
 def test_refusals_alone_are_shown(capsys: pytest.CaptureFixture[str]) -> None:

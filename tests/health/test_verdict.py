@@ -10,7 +10,13 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
-from lmshealth.health.verdict import degraded_below, degraded_words, judge, verdict_of
+from lmshealth.health.verdict import (
+    degraded_below,
+    degraded_words,
+    doubt_of_names,
+    judge,
+    verdict_of,
+)
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Event, Track
@@ -21,6 +27,7 @@ from tests.lives import (
     PRELOAD,
     make_health,
     make_history,
+    make_reading,
     make_stage,
     make_track,
 )
@@ -200,3 +207,34 @@ def test_a_parameter_with_a_unit_is_reported_in_it(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (PRELOAD.replace("limit", 'unit = "kN"\nlimit'), MOUNT))
     found = judge(stage, logs(8), make_health(around(0.8, 0.99)))
     assert re.search(r"Guide preload is 0\.(79|80)\d* kN \(90 %: 0\.79", found.why)
+
+
+def test_names_are_compared_with_the_description_at_the_baseline_only(stage: Stage) -> None:
+    """Modes may drift by 10 %; a baseline 5 % off is in doubt, with both values."""
+    drift = np.outer(np.linspace(0.0, -0.1, 8), np.ones(2))
+    track = make_track(drift, np.tile(1e-8 * np.eye(2), (8, 1, 1)))
+    names = dict(zip(track.modes, track.ln_frequency[0].tolist(), strict=True))
+    readings = [make_reading(log, float(k), 0.0, names) for k, log in enumerate(logs(8).logs)]
+    assert doubt_of_names(stage, logs(8), track, readings) == ""
+    off = replace(track, ln_frequency=track.ln_frequency + np.array([0.05, 0.0]))
+    doubt = doubt_of_names(stage, logs(8), off, readings)
+    declared, found = FREQUENCY[0], FREQUENCY[0] * np.exp(0.05)
+    assert f"{track.modes[0]} {declared:.5g} Hz and {found:.5g} Hz" in doubt
+    assert "correct the description" in doubt
+    verdict = judge(stage, logs(8), None, track, doubt=doubt)
+    assert verdict.verdict == "not-enough-data"
+    assert doubt in verdict.why
+
+
+def test_a_name_that_most_logs_doubt_withholds_health(stage: Stage) -> None:
+    """Half of the logs are not enough."""
+    track = make_track(np.zeros((8, 2)), np.tile(1e-8 * np.eye(2), (8, 1, 1)))
+    names = dict(zip(track.modes, track.ln_frequency[0].tolist(), strict=True))
+    sure = [make_reading(log, float(k), 0.0, names) for k, log in enumerate(logs(8).logs)]
+    unsure = [
+        replace(one, modes=replace(one.modes, flags=("", "loose-fit doubtful-name")))
+        for one in sure
+    ]
+    assert doubt_of_names(stage, logs(8), track, unsure[:4] + sure[4:]) == ""
+    doubt = doubt_of_names(stage, logs(8), track, unsure[:5] + sure[5:])
+    assert f"{track.modes[1]} in 5 of 8 logs" in doubt

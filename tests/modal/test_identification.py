@@ -136,6 +136,26 @@ def test_worn_modes_keep_their_identity(shift: float) -> None:
         assert np.abs(deviations(found, name, f * shift, zeta)).max() < 4
 
 
+def test_an_undescribed_mode_takes_no_name() -> None:
+    """Yaw is not described and stronger: roll and pitch stay, yaw is reported without a name."""
+    modes = lms_y_modes()
+    modes[2] = replace(modes[2], psd=30.0)
+    log = acceleration_log(rng(7), modes, 60, RATE, 0.5)
+    for shift in (1.0, 1.02):
+        stage = make_stage([(name, f * shift, zeta) for name, f, zeta in LMS_Y[:2]])
+        found = identify(log, stage)
+        assert found.names == ("roll", "pitch")
+        for name, f, zeta in LMS_Y[:2]:
+            assert np.abs(deviations(found, name, f, zeta)).max() < 4
+        (undescribed,) = [r for r in found.refused if r.reason == "undescribed"]
+        assert "155" in undescribed.detail
+    # Negative control: without the further resonance both names are wrong.
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(modal, "shows_more", lambda *_: False)
+        wrong = identify(log, stage)
+    assert abs(deviations(wrong, "pitch", *LMS_Y[1][1:])[0]) > 10
+
+
 def test_following_error_shows_a_mode_as_an_accelerometer_does() -> None:
     """From Δe alone, with its floor of white displacement noise, f and ζ are within 4σ."""
     quiet = 1.0 / (2 * np.pi * 105.0) ** 4

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-import numpy as np
+from dataclasses import replace
 
-from lmshealth.modal.modes import Rejection, estimates_only
-from lmshealth.modal.naming import assign, name_response, why_unnamed
+import numpy as np
+import pytest
+
+from lmshealth.modal.modes import Modes, Rejection, estimates_only
+from lmshealth.modal.naming import assign, compare, likeness, name_response, why_unnamed
 from lmshealth.modal.targets import Target
+from lmshealth.stage.description import Description, ModeSpec, Stage
 from tests.signals import make_stage
 
 TARGETS = (
@@ -40,7 +44,7 @@ def test_one_of_two_equal_candidates_is_not_guessed() -> None:
     """Of two resonances as far from one target neither gets its name, and both are quoted."""
     names, ambiguous = named(98.0, 112.5, targets=TARGETS[:1])
     assert names == ("", "")
-    reason, detail = ambiguous["roll"]
+    reason, detail, _ = ambiguous["roll"]
     assert reason == "ambiguous"
     assert "98 Hz may be roll" in detail
     assert "112.5 Hz may be roll" in detail
@@ -65,6 +69,53 @@ def test_a_damping_far_off_belongs_to_something_else() -> None:
     """Of two resonances near one target, one ten times as damped, the other has the name."""
     result = assign([98.0, 112.5], TARGETS[:1], damping=[0.2, 0.02])
     assert result == (("", "roll"), {})
+
+
+def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() -> None:
+    """With 126.5, 136.4 and 155.1 Hz the described 126.5 and 136.5 Hz keep their places."""
+    described = (Target("roll", 126.5, 0.015, 0.15), Target("pitch", 136.5, 0.015, 0.15))
+    found, damping = [126.5, 136.4, 155.1], [0.015, 0.015, 0.017]
+    assert assign(found, described, damping=damping, undescribed=True)[0] == ("roll", "pitch", "")
+    # A regular row of modes shifted by its spacing is never certain.
+    described = tuple(
+        Target(name, f, 0.015, 0.15) for name, f in zip("abc", (126, 137, 148), strict=True)
+    )
+    row = [117.0, 126.0, 137.0, 148.0]
+    sure = assign(row, described, damping=[0.015] * 4, undescribed=True, clear=0.95)
+    assert set(sure[0]) == {""}
+
+
+def shaped(name: str, frequency: float, shape: list[float], damping: float = 0.015) -> Modes:
+    """Make one mode with its shape in two channels."""
+    cov = np.diag([1e-3, 0.1]) ** 2
+    one = estimates_only(np.log([frequency, damping]), cov, np.ones(1), "acc", ["a"])
+    return replace(one, names=(name,), shape_channels=("a", "b"), shapes=np.array([shape]))
+
+
+def test_described_shapes_name_what_frequencies_leave_open() -> None:
+    """One resonance half way between two modes has the name whose shape it has."""
+    shapes = ({"a": 2.0, "b": 2.0}, {"a": 1.0, "b": -1.0}, {"c": 1.0})
+    described = tuple(replace(t, shape=s) for t, s in zip(TARGETS, shapes, strict=True))
+    alike = likeness(shaped("", 112.0, [0.6, -0.8]), described)
+    np.testing.assert_allclose(alike, [[0.02, 0.98, np.nan]])
+    assert assign([112.0], described, shapes=alike, complete=True)[0] == ("pitch",)
+    assert assign([112.0], described, complete=True)[0] == ("",)
+
+
+def test_a_mode_off_its_description_is_compared_with_it() -> None:
+    """So is one by 4 %, a factor of 4 of damping, or another shape; not one by 2 %."""
+    mode = ModeSpec("roll", 126.0, 0.015, shape={"a": 1.0, "b": 1.0})
+    stage = Stage(Description(name="test", mode=(mode,)), None, "0" * 64)
+    right = [0.8, 0.6]
+    assert compare(shaped("roll", 123.5, right, 0.02), stage) == ()
+    for off in (
+        shaped("roll", 121.0, right),
+        shaped("roll", 126.0, right, 0.06),
+        shaped("roll", 126.0, [0.8, -0.6]),
+    ):
+        (one,) = compare(off, stage)
+        assert one[:2] == ("roll", 126.0)
+        assert one.found_hz == pytest.approx(off.frequency[0])
 
 
 def test_the_reason_for_no_name_lists_which_modes_are_searched_for_there() -> None:

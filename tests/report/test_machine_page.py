@@ -13,7 +13,9 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from lmshealth import examples
 from lmshealth._arrays import FloatArray
+from lmshealth.batch.assess import assess
 from lmshealth.io.log import Refusal
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.spectra_summary import summarise
@@ -130,6 +132,23 @@ def test_a_page_without_results_gives_the_reasons(make: Maker, tmp_path: Path) -
     assert not re.search(r"\bnan\b", text.lower())
     untracked = replace(make(), track=None)
     assert "could not be tracked" in words(one(tmp_path, untracked))
+
+
+@pytest.mark.usefixtures("blank")
+def test_health_of_a_machine_that_is_not_the_described_one_is_withheld(tmp_path: Path) -> None:
+    """Declared and found frequencies stand side by side, with a warning in place of health."""
+    stage = load_stage("lms-y")
+    roll, *others = stage.modes
+    moved = structs.replace(roll, frequency_hz=1.05 * roll.frequency_hz)
+    description = structs.replace(stage.description, mode=(moved, *others))
+    found = assess(examples.readings(), replace(stage, description=description))
+    assert found.track is not None
+    assert found.health is None and found.prognosis is None
+    text = words(one(tmp_path, found))
+    assert "Warning: The names of the modes are in doubt" in text
+    assert f"roll {moved.frequency_hz:.5g} Hz and 126." in text
+    assert "Withheld, because the names of the modes are in doubt" in text
+    assert f"roll {moved.frequency_hz:.2f} Hz 126." in text
 
 
 def test_no_log_at_all(make: Maker, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, median_filter
+from scipy.ndimage import binary_dilation, median_filter, uniform_filter1d
 from scipy.stats import gamma
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
@@ -25,7 +25,7 @@ from lmshealth.modal.ambient.cluster_modes import (
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
 from lmshealth.modal.modes import Modes, Rejection, paired
-from lmshealth.modal.naming import shift_cost
+from lmshealth.modal.naming import is_near, shift_cost
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum, median_ordinate
@@ -43,6 +43,9 @@ _MOST_LINE_ROUNDS = 4
 _SIGN_BAND = 1.5
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
 _NARROWER = 0.7
+# Bins over which the gain of a peak is added up, about a half-power bandwidth, and from its centre
+# to its sides.
+_PEAK_BINS, _SIDE_BINS = 5, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -148,9 +151,7 @@ def incoherent_fit(
     ...)``.
     """
     frequency, count = binned.frequency, binned.count
-    beta = f[..., None, :] / frequency[:, None]
-    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
-    design = np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
+    design = _design(frequency, f, zeta)
     unit = design.mean(axis=-2)
     design = design / unit[..., None, :]
     levels = binned.level.reshape(-1, *[1] * (f.ndim - 1), count.size)
@@ -167,6 +168,34 @@ def incoherent_fit(
     model = (design @ weight[..., None])[..., 0]
     misfit = np.sum(count * (np.log(model) + levels / model), axis=-1)
     return weight / unit, np.asarray(misfit)
+
+
+def _design(frequency: FloatArray, f: FloatArray, zeta: FloatArray) -> FloatArray:
+    """Return the PSD per unit of modes and white noise, ``(..., n_bins, n_modes + 1)``."""
+    beta = f[..., None, :] / frequency[:, None]
+    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
+    return np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
+
+
+def shows_more(binned: BinnedSpectra, known: Sequence[Target], targets: Sequence[Target]) -> bool:
+    """Return whether the spectra show a peak near a target that known modes do not explain.
+
+    A peak exceeds both its sides, which the misfit of a flank does not.
+    """
+    frequency = binned.frequency
+    near = [k for k in known if frequency[0] / 1.3 < k.frequency < 1.3 * frequency[-1]]
+    f = np.array([mode.frequency for mode in near])
+    zeta = np.array([mode.damping_ratio for mode in near])
+    model = incoherent_fit(binned, f, zeta)[0] @ _design(frequency, f, zeta).T
+    ratio = (binned.level / model).clip(1.0)
+    gain = np.sum(binned.count * (ratio - 1 - np.log(ratio)), axis=0)
+    mean, far = uniform_filter1d(binned.level, 3, axis=1), _SIDE_BINS
+    sides = np.maximum(mean[:, : -2 * far], mean[:, 2 * far :])
+    peak = (mean[:, far:-far] > constants.PEAK_RATIO * sides).any(axis=0)
+    peak &= _PEAK_BINS * uniform_filter1d(gain, _PEAK_BINS)[far:-far] > constants.PRESENT
+    peaks = frequency[far:-far][peak]
+    peaks = peaks[(np.abs(peaks[:, None] - f) > 2 * zeta * f).all(axis=1)]
+    return any(is_near(target, x) for target in targets for x in peaks.tolist())
 
 
 def locate(
