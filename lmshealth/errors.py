@@ -20,14 +20,8 @@ class LmshealthError(Exception):
 class BadLog(LmshealthError):
     """A log that cannot be used.
 
-    Parameters
-    ----------
-    log : str
-        Name of the log.
-    reason : str
-        Code of the refusal, the ``reason`` column of ``refused.csv``.
-    detail : str
-        What was found, what is needed, and the next step.
+    The reason is the code in the ``reason`` column of ``refused.csv``; the detail states what was
+    found, what is needed, and the next step.
     """
 
     def __init__(self, log: str, reason: str, detail: str) -> None:
@@ -64,13 +58,8 @@ class NotEnoughData(LmshealthError):
 class NotConverged(LmshealthError):
     """A sampler that did not reach its convergence target.
 
-    Parameters
-    ----------
-    message : str
-        What was reached, what was needed.
-    chains : ndarray
-        The draws so far, shape ``(n_ensembles, n_steps, n_walkers, n_parameters)``; where no
-        start was found, the points that were tried, ``(n_points, n_parameters)``.
+    Its chains are the draws so far, ``(n_ensembles, n_steps, n_walkers, n_parameters)``; where no
+    start was found, the points that were tried, ``(n_points, n_parameters)``.
     """
 
     def __init__(self, message: str, chains: object) -> None:

@@ -215,10 +215,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     rows = [error_row(*pair) for pair in pairs]
     harmonics = [row for pair in pairs for row in harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
-
-    def show(rejected: list[Row]) -> None:
-        views.print_error(rows, harmonics, rejected)
-
+    show = partial(views.print_error, rows, harmonics)
     _publish(given["style"], {"error": rows, "harmonics": harmonics}, refused, lost, show)
     _exit(ctx, found, lost)
 
@@ -257,11 +254,8 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     rows = magnitudes_rows(magnitudes, growth, of_logs)
     lines = _line_rows((own.log, own.lines) for own in found)
     refused = [refusal for own in found for refusal in own.refused]
-
-    def show(rejected: list[Row]) -> None:
-        views.print_magnitudes(rows, lines, rejected)
-
     content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
+    show = partial(views.print_magnitudes, rows, lines)
     _publish(given["style"], content, refused, lost, show)
     _exit(ctx, found, lost)
 
