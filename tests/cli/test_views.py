@@ -168,7 +168,7 @@ def fitted(**other: object) -> dict[str, object]:
     """Make a row of a fit."""
     row: dict[str, object] = {
         "log": "log", "input": "current", "output": "acc_x", "period_s": 5.0, "n_averages": 4.0,
-        "chi_square": 1.02, "distortion": 0.0, "colour": 0.0,
+        "chi_square": 1.02, "distortion": 0.0, "colour": 0.0, "method": "periods", "note": "",
     }  # fmt: skip
     return row | other
 
@@ -198,7 +198,7 @@ def test_several_responses_are_separate(capsys: pytest.CaptureFixture[str]) -> N
 
 def test_a_response_reports_what_its_fit_misses(capsys: pytest.CaptureFixture[str]) -> None:
     """Distortion, errors that neighbours share, and an input that does not repeat."""
-    fit = fitted(period_s=NAN, chi_square=300.0, distortion=0.061, colour=0.35)
+    fit = fitted(method="segments", period_s=NAN, chi_square=300.0, distortion=0.061, colour=0.35)
     print_frf([fit], [response_line(10.0)], [], [])
     out = capsys.readouterr().out
     assert "not periodic" in out
