@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lmshealth.cli import options, terminal, views
+from lmshealth.cli.progress import progress_bars
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 
@@ -27,6 +28,7 @@ _NO_BAND = (
     "Without a band or a description close modes may be merged or missed; select them with --band "
     "LOW HIGH. The mode names are valid for this call only."
 )
+_PATIENCE = 3.0  # seconds without a progress bar
 _FORMAT = options.format_option("table", "csv", "json")
 _PLOT = click.option(
     "--plot",
@@ -85,7 +87,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
     def estimate(log: Log) -> LogEstimates:
-        reading = _read_modes(log, given, names)
+        with progress_bars(_PATIENCE) as report:
+            reading = _read_modes(log, given, names, report)
         shapes, mac = shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes
         content["mac"] += mac
@@ -117,7 +120,9 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     _exit(ctx, found, lost)
 
 
-def _read_modes(log: Log, given: dict[str, Any], names: list[str] | None) -> AmbientReading:
+def _read_modes(
+    log: Log, given: dict[str, Any], names: list[str] | None, report: Callable[..., None]
+) -> AmbientReading:
     """Identify the modes of a log by the chosen part of it."""
     from lmshealth.modal.free_decay.identification import identify_decays
     from lmshealth.modal.identification import AmbientReading, read_ambient
@@ -125,7 +130,7 @@ def _read_modes(log: Log, given: dict[str, Any], names: list[str] | None) -> Amb
 
     chosen: Any = {"channels": names, "band": given["band"] or None}
     if given["part"] == "constant":
-        return read_ambient(log, given["stage"], **chosen)
+        return read_ambient(log, given["stage"], **chosen, progress=report)
     found = identify_decays(log, given["stage"], **chosen)
     return AmbientReading(found, settling_spectra(log, names))
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Any
@@ -24,8 +25,12 @@ class _Rate(progress.ProgressColumn):
 
 
 @contextmanager
-def progress_bars() -> Iterator[Any]:
-    """Show progress bars on standard error if it is a terminal; yield their callback."""
+def progress_bars(delay: float = 0.0) -> Iterator[Any]:
+    """Show progress bars on standard error if it is a terminal; yield their callback.
+
+    Nothing is shown in the first ``delay`` seconds.
+    """
+    shown_from = time.monotonic() + delay
     with progress.Progress(
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(),
@@ -38,6 +43,8 @@ def progress_bars() -> Iterator[Any]:
         tasks: dict[str, Any] = {}
 
         def report(what: str, done: int, total: int) -> None:
+            if time.monotonic() < shown_from:
+                return
             if what not in tasks:
                 # Work that is done at the start was cached and does not count for the rate.
                 tasks[what] = bars.add_task(what, total=total, completed=done)

@@ -7,7 +7,7 @@ where the start values come from, how modes are named and what happens to modes 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,6 +69,7 @@ class AmbientReading:
     fitted: tuple[FittedSpectrum, ...] = ()  # of each cluster, ascending in frequency
     # Everything that was rejected; without a description modes.refused does not list it.
     rejected: tuple[Refusal, ...] = ()
+    sought: Found | None = None  # of the search without a description
 
 
 def identify(
@@ -133,24 +134,29 @@ def read_ambient(
     *,
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
+    progress: Callable[[str, int, int], None] = lambda step, done, total: None,
 ) -> AmbientReading:
     """Identify modes as `identify` does; return them with the spectra and their fit."""
     used = choose_channels(log, channels)
     targets = () if stage is None else choose_targets(stage, band)
-    stretches, spectra = _transform(log, used, targets, band)
+    stretches, whole = _transform(log, used, targets, band)
+    spectra = whole
     tested: list[tuple[str, float, float]] = []
     harmonics: tuple[Harmonic, ...] = ()
     unlike: tuple[str, ...] = ()
+    sought: Found | None = None
     top = _TOP * log.sample_rate
+    fits: list[ClusterFit] = []
     if stage is None:
+        progress("searching", 0, 1)
         sought, tested = _search(log, used, stretches, spectra, band)
+        progress("searching", 1, 1)
         harmonics, spectra, unlike = sought.harmonics, sought.spectra, sought.left_out
         groups = split_groups(sought.modes)
-        fits = [
-            fit
-            for group in groups
-            for fit in _fit_group(sought, group, neighbourhood(group, sought.modes), top)
-        ]
+        for k, group in enumerate(groups):
+            progress("fitting", k, len(groups))
+            fits += _fit_group(sought, group, neighbourhood(group, sought.modes), top)
+        progress("fitting", len(groups), len(groups))
     else:
         fits, known, more = _fit_described(spectra, targets, top)
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
@@ -170,7 +176,7 @@ def read_ambient(
         refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
     modes = numbered(modes) if stage is None else modes
-    reading = AmbientReading(modes, spectra, fitted, tuple(rejected))
+    reading = AmbientReading(modes, whole, fitted, tuple(rejected), sought)
     if stage is None or not more:
         return reading
     return _with_undescribed(log, reading, known, targets, channels)

@@ -99,6 +99,8 @@ def _direction(fit: FittedSpectrum, modes: Modes, i: int, shapes: ComplexArray) 
     reach = max(zeta[i] * f[i], np.sort(off)[:_LEAST_ORDINATES][-1])
     near = known[off <= reach]
     rest = near.size * np.eye(len(fit.channels), dtype=complex)
+    if fit.spectrum.foreign is not None:
+        rest += fit.spectrum.foreign[near].sum(axis=0)
     for j in np.flatnonzero(np.isfinite(shapes).all(axis=1)):
         if j != i:
             psi = shapes[j] / fit.unit

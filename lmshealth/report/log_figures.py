@@ -18,6 +18,8 @@ from lmshealth._arrays import FloatArray
 from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
+from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
+from lmshealth.modal.ambient.search import Found
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.frf.measured import MeasuredResponse
 from lmshealth.modal.identification import AmbientReading
@@ -69,21 +71,20 @@ def modes_figure(
     modes = replace(reading.modes, refused=_join(reading.modes.refused, reading.rejected))
     low, high = band or _band(log, modes, stage)
     high = min(high, 0.49 * log.sample_rate)
-    summary = summarise(
-        reading.spectra, reading.fitted, modes, (low, high), _BINS, n_singular=_SINGULAR
-    )
+    fitted = [_without_harmonics(fit, reading) for fit in reading.fitted]
+    summary = summarise(reading.spectra, fitted, modes, (low, high), _BINS, n_singular=_SINGULAR)
     shapes = mode_shapes(modes, reading.fitted)
     sensors = {one.name: one for one in stage.description.channel} if stage else {}
     places = [sensors[name] for name in shapes.channels if name in sensors]
-    width, height = spectra_size(summary, modes)
+    width, height = spectra_size(summary, modes, reading.sought)
     n_rows = -(-len(modes.names) // _DRAWN_BESIDE) if places else 0
 
     def draw(figure: Figure) -> None:
         if not n_rows:
-            plot_spectra(figure, summary, modes, stage)
+            plot_spectra(figure, summary, modes, stage, reading.sought)
             return
         parts: Any = figure.subfigures(2, height_ratios=[height, n_rows * _DRAWING])
-        plot_spectra(parts[0], summary, modes, stage)
+        plot_spectra(parts[0], summary, modes, stage, reading.sought)
         axes = parts[1].subplots(n_rows, _DRAWN_BESIDE, squeeze=False).ravel()
         for ax in axes[len(modes.names) :]:
             ax.set_axis_off()
@@ -92,6 +93,18 @@ def modes_figure(
 
     size = width, height + n_rows * _DRAWING
     return LogFigure(f"Modes of {log.name}", size, draw, modes)
+
+
+def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSpectrum:
+    """Subtract what stands for harmonics that wander: the expectation of modes and floors."""
+    if reading.sought is None or len(reading.sought.spectra.channels) == 1:
+        return fit  # in a single channel their bands are left out
+    expected, names = fit.expected, reading.sought.spectra.channels
+    rows = [names.index(name) for name in fit.channels]
+    for one in reading.sought.harmonics:
+        there = one.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
+        expected = expected - there / np.outer(fit.unit, fit.unit)
+    return replace(fit, expected=expected)
 
 
 def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpec]) -> Axes:
@@ -136,22 +149,33 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     return ax
 
 
-def spectra_size(summary: SpectraSummary, modes: Modes) -> tuple[float, float]:
+def spectra_size(
+    summary: SpectraSummary, modes: Modes, sought: Found | None = None
+) -> tuple[float, float]:
     """Return the size of `plot_spectra` in inches."""
-    return _size(len(summary.channels) + bool(len(summary.singular)), modes)
+    return _size(_n_panels(summary, sought), modes)
+
+
+def _n_panels(summary: SpectraSummary, sought: Found | None) -> int:
+    return len(summary.channels) + bool(len(summary.singular)) + (sought is not None)
 
 
 def plot_spectra(
-    figure: Figure, summary: SpectraSummary, modes: Modes, stage: Stage | None
+    figure: Figure,
+    summary: SpectraSummary,
+    modes: Modes,
+    stage: Stage | None,
+    sought: Found | None = None,
 ) -> Figure:
     """Plot the spectrum of each channel with its fit, lines, modes and what was refused."""
     middle = (summary.edges[1:] + summary.edges[:-1]) / 2
-    n = len(summary.channels) + bool(len(summary.singular))
+    n = _n_panels(summary, sought)
     panels = list(figure.subplots(n, sharex=True, squeeze=False)[:, 0])
     level, fitted, singular = (
         10 ** (np.asarray(part, dtype=float) / 10)
         for part in (summary.level, summary.fitted, summary.singular)
     )
+    refused = {one.channel: one.reason for one in modes.refused if not one.mode}
     count = summary.count.astype(float)
     range_ = gamma.ppf([[0.025], [0.975]], count) / count
     for ax, name, derived, density, fit in zip(
@@ -165,20 +189,41 @@ def plot_spectra(
                 middle, *(fit * range_), **style, label="95 % range of the data, by the fit"
             )
         label = figures.plain_label(name) + ("\n(2nd derivative)" if derived else "")
-        ax.text(1.01, 0.5, label, transform=ax.transAxes, va="center", size=8.5)
+        label += f"\n({refused[name]})" if name in refused else ""
+        _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, density)
     for k, values in enumerate(singular):
         style = {"lw": 0.9 if k == 0 else 0.6, "color": figures.MUTED if k else figures.INK}
-        panels[-1].plot(middle, values, **style)
+        panels[len(level)].plot(middle, values, **style)
     if singular.size:
-        label = "singular values\nof all channels"
-        panels[-1].text(1.01, 0.5, label, transform=panels[-1].transAxes, va="center", size=8.5)
-    for ax in panels:
+        _name_panel(panels[len(level)], "singular values\nof all channels")
+    for ax in panels[: len(level) + bool(singular.size)]:
         ax.set_yscale("log")
         ax.margins(y=0.08)  # room for markers
+    if sought is not None:
+        _plot_search(panels, sought)
     figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
     _annotate(figure, panels, (summary.low, summary.high), modes, stage)
     return figure
+
+
+def _name_panel(ax: Axes, name: str) -> None:
+    ax.text(1.01, 0.5, name, transform=ax.transAxes, va="center", size=8.5)
+
+
+def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
+    """Plot the poles of all orders of the subspace model in the last panel, and wandering lines."""
+    poles, ax = sought.poles, panels[-1]
+    for stable, style in ((False, {"mfc": "none", "mew": 0.4}), (True, {"mew": 0})):
+        own = poles.stable == stable
+        label = f"{'stable' if stable else 'other'} pole of the search"
+        place = poles.frequency[own], poles.order[own]
+        ax.plot(*place, "o", ms=2.5, color=figures.INK, label=label, **style)
+    _name_panel(ax, "order of the\nsubspace model")
+    for line in sought.harmonics:
+        for panel in panels:
+            span: Any = {"color": figures.RED, "alpha": 0.15, "lw": 0}
+            panel.axvspan(line.low, line.high, **span, label="band of a line that wanders")
 
 
 def settling_spectra(log: Log, channels: Sequence[str] | None) -> LogSpectra:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 import json
 import math
+import sys
 
 import pytest
 
@@ -28,6 +30,19 @@ def test_there_is_no_bar_where_there_is_no_terminal(capsys: pytest.CaptureFixtur
         report("logs", 2, 2)
     captured = capsys.readouterr()
     assert captured.err == captured.out == ""
+
+
+@pytest.mark.parametrize(("delay", "shown"), [(0.0, True), (60.0, False)])
+def test_a_bar_appears_on_a_terminal_after_its_delay(
+    monkeypatch: pytest.MonkeyPatch, delay: float, shown: bool
+) -> None:
+    """Short work shows none."""
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress_bars(delay) as report:
+        report("fitting", 1, 3)
+    assert ("fitting" in terminal.getvalue()) == shown
 
 
 def test_prose_is_wrapped_between_words(capsys: pytest.CaptureFixture[str]) -> None:

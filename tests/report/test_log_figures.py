@@ -14,7 +14,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Annotation, Text
 
 from lmshealth.io.log import Log, Refusal
-from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.ambient.wandering import Harmonic
+from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
 from lmshealth.report.log_figures import LogFigure, modes_figure, plot_shape, write_figure
@@ -145,3 +146,29 @@ def test_shapes_are_drawn_where_the_description_places_the_sensors() -> None:
     isometric = np.array([[0.866, -0.5], [0.866, 0.5], [0.0, 1.0]])
     assert np.array(tips) == pytest.approx((rest + motions) @ isometric)
     assert ax.get_title() == "roll, MPC 1.00"
+
+
+def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -> None:
+    """Stable poles stand at the mode; the fit is that of the modes in the band of such a line."""
+    reading = read_ambient(log, band=(40.0, 90.0))
+    assert reading.sought is not None
+    whole = draw(modes_figure(log, reading, band=(40.0, 90.0)))
+    marks = {str(line.get_label()): line for line in whole.axes[-1].lines}
+    stable: Any = marks["stable pole of the search"].get_xydata()
+    assert np.median(stable[:, 0]) == pytest.approx(62.0, abs=1.0)
+    line = Harmonic(60.0, 59.0, 61.0, 1.0, 0, np.full((2, 2), 1e6, dtype=complex))
+    fitted = []
+    for fit in reading.fitted:
+        rows = [reading.spectra.channels.index(name) for name in fit.channels]
+        added = line.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
+        fitted.append(replace(fit, expected=fit.expected + added / np.outer(fit.unit, fit.unit)))
+    sought = replace(reading.sought, harmonics=(line,))
+    other = replace(reading, fitted=tuple(fitted), sought=sought)
+    again = draw(modes_figure(log, other, band=(40.0, 90.0)))
+    (first,), (second,) = (
+        [one.get_ydata() for one in figure.axes[0].lines if one.get_label() == "fit"]
+        for figure in (whole, again)
+    )
+    assert np.isfinite(np.asarray(first, dtype=float)).any()
+    np.testing.assert_allclose(first, second, rtol=0.05)
+    assert any("wanders" in str(patch.get_label()) for patch in again.axes[0].patches)

@@ -19,7 +19,7 @@ from scipy.special import comb
 from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import LEAST_FLOOR, BandData, JointModel
-from lmshealth.modal.ambient.subspace import Candidate, find_candidates
+from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
 from lmshealth.modal.ambient.wandering import Harmonic, Recording, find_harmonic
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
@@ -52,6 +52,7 @@ class Found:
     model: JointModel
     band: tuple[float, float]
     left_out: tuple[str, ...]  # channels that the modes do not explain
+    poles: Poles  # of all orders, without the harmonics
 
     def within(self, frequency: float) -> bool:
         """Return whether a frequency in Hz lies in the band."""
@@ -81,7 +82,7 @@ def search(
     """
     every = spectra.channels
     while True:
-        model, harmonics, after = _explain(spectra, recording, low, high)
+        model, harmonics, after, poles = _explain(spectra, recording, low, high)
         kept = _consistent(model)
         if len(kept) == len(spectra.channels):
             break
@@ -104,24 +105,23 @@ def search(
         for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
     )
     left_out = tuple(name for name in every if name not in after.channels)
-    return Found(modes, harmonics, after, model, (low, high), left_out)
+    return Found(modes, harmonics, after, model, (low, high), left_out, poles)
 
 
 def _explain(
     spectra: LogSpectra, recording: Recording, low: float, high: float
-) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra]:
-    """Select modes and harmonics; return the spectra without the directions of these, too."""
+) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
+    """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
     while True:
+        stable, poles = find_candidates(spectra, low, high)
         candidates = [
-            c
-            for c in find_candidates(spectra, low, high)
-            if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
+            c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
         model = _select(spectra, candidates, low, high)
         harmonic = find_harmonic(model, recording, harmonics)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
-            return model, tuple(harmonics), spectra
+            return model, tuple(harmonics), spectra, poles
         harmonics.append(harmonic)
         if len(spectra.channels) == 1:
             spectra = spectra.without_band(harmonic.low, harmonic.high)

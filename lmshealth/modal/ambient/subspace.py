@@ -10,7 +10,7 @@ from scipy.signal import czt
 from scipy.signal.windows import tukey
 from scipy.spatial.distance import squareform
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 
@@ -39,17 +39,18 @@ class Candidate:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Poles:
-    """Poles of all orders."""
+class Poles:
+    """Poles of all orders, shape ``(n_poles,)`` each."""
 
     order: FloatArray
     frequency: FloatArray
     damping_ratio: FloatArray
     shape: ComplexArray  # of unit norm in whitened channels, (n_poles, n_channels)
+    stable: BoolArray  # whether many orders have it
 
 
-def find_candidates(spectra: LogSpectra, low: float, high: float) -> list[Candidate]:
-    """Return the stable poles of a band in Hz, ascending in frequency.
+def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[Candidate], Poles]:
+    """Return the stable poles of a band in Hz, ascending in frequency, and the poles of all orders.
 
     Correlations at the rate of the band come from the cross spectra, so that lines are masked and
     other bands cost nothing; they are complex. Channels are scaled by their smooth level, as a
@@ -66,8 +67,9 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> list[Candid
         place = min(int(np.searchsorted(longest.frequency, one.frequency)), len(level) - 1)
         return np.asarray(one.shape * level[place])
 
-    stable = [one for one in _merge(_cluster(poles)) if low <= one.frequency <= high]
-    return [replace(one, shape=physical(one)) for one in stable]
+    candidates, poles = _cluster(poles)
+    stable = [one for one in _merge(candidates) if low <= one.frequency <= high]
+    return [replace(one, shape=physical(one)) for one in stable], poles
 
 
 def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
@@ -127,7 +129,7 @@ def _level(matrix: ComplexArray) -> FloatArray:
     return np.asarray(np.exp(np.polynomial.polynomial.polyval(u, fit) / 2).T)
 
 
-def _solve(lags: ComplexArray, low: float, rate: float) -> _Poles:
+def _solve(lags: ComplexArray, low: float, rate: float) -> Poles:
     """Realise models of all orders from one decomposition of the Hankel matrix."""
     n, rows = lags.shape[1], len(lags) // 2 - 1
     blocks = np.stack([lags[1 + i : 2 + i + rows] for i in range(rows)])  # (rows, rows + 1, n, n)
@@ -135,7 +137,8 @@ def _solve(lags: ComplexArray, low: float, rate: float) -> _Poles:
     u, s, vh = np.linalg.svd(hankel[:, :-n], full_matrices=False)
     most = min(_ORDERS.stop - 1, int((s > 1e-12 * s[0]).sum()))
     if most < _ORDERS.start:  # silent channels
-        return _Poles(np.empty(0), np.empty(0), np.empty(0), np.empty((0, n), dtype=complex))
+        nothing = np.empty(0)
+        return Poles(nothing, nothing, nothing, np.empty((0, n), dtype=complex), nothing > 0)
     u, s, vh = u[:, :most], s[:most], vh[:most]
     transition = (u.conj().T @ hankel[:, n:] @ vh.conj().T) / np.sqrt(s[:, None] * s)
     output = u[:n] * np.sqrt(s)
@@ -152,30 +155,32 @@ def _solve(lags: ComplexArray, low: float, rate: float) -> _Poles:
     kept = (zeta > _LEAST_DAMPING) & (zeta < constants.MOST_DAMPING)
     shape = shape / np.linalg.norm(shape, axis=1, keepdims=True)
     frequency = np.abs(pole) / (2 * np.pi)
-    return _Poles(np.concatenate(orders)[kept], frequency[kept], zeta[kept], shape[kept])
+    order, stable = np.concatenate(orders)[kept], np.zeros(int(kept.sum()), dtype=bool)
+    return Poles(order, frequency[kept], zeta[kept], shape[kept], stable)
 
 
-def _cluster(poles: _Poles) -> list[Candidate]:
-    """Cluster the poles of all orders; keep clusters that many orders have."""
+def _cluster(poles: Poles) -> tuple[list[Candidate], Poles]:
+    """Cluster the poles of all orders; keep clusters that many orders have, mark their poles."""
     f, zeta, shape = poles.frequency, poles.damping_ratio, poles.shape
     if f.size < 2:
-        return []
+        return [], poles
     distance = np.abs(np.log(f[:, None] / f)) / (zeta[:, None] + zeta)
     distance += 1 - np.abs(shape @ shape.conj().T) ** 2
     distance += np.abs(np.log(zeta[:, None] / zeta)) / 2
     np.fill_diagonal(distance, 0)
     label = fcluster(linkage(squareform(distance, checks=False), "average"), _APART, "distance")
     n_orders = np.unique(poles.order).size
-    found = []
+    found, stable = [], poles.stable.copy()
     for number in np.unique(label):
         members = np.flatnonzero(label == number)
         stability = np.unique(poles.order[members]).size / n_orders
         if stability < constants.STABLE:
             continue
+        stable[members] = True
         centre = members[distance[np.ix_(members, members)].sum(axis=1).argmin()]
         pole = float(np.median(f[members])), float(np.median(zeta[members]))
         found.append(Candidate(*pole, shape[centre], stability))
-    return found
+    return found, replace(poles, stable=stable)
 
 
 def _merge(candidates: list[Candidate]) -> list[Candidate]:
