@@ -33,7 +33,7 @@ PEAK_RATIO = 1.2
 # damping (beyond two standard deviations), and modal assurance criterion.
 OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8
 # Log likelihood that a named mode gains over a missed mode and an unknown resonance.
-MATCH = 3.5
+NAME_GAIN = 3.5
 # Largest factor between the damping ratio found and the one described.
 DAMPING_SPAN = 6.0
 # Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
@@ -93,7 +93,7 @@ WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), 
 # Least samples of a stretch, and of a period.
 FRF_SAMPLES, FRF_PERIOD_SAMPLES = 256, 32
 # Standard deviations by which the mean coherence must exceed that of noise.
-ANSWERS = 5.0
+COHERENT_SIGMAS = 5.0
 # A line counts as excited from this share of the strongest amplitude of the input, and from this
 # ratio of its power to its noise: noise of a weaker input biases the damping by more than half its
 # standard deviation.
@@ -122,7 +122,7 @@ DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
 FRF_MISSED = 1 / 3
 # Harmonics below this share of the strongest amplitude of the input have none; an output above the
 # second share there shows that a response is missed because it is nonlinear.
-NO_INPUT, STRAY = 0.01, 0.05
+NO_INPUT, NONLINEAR_OUTPUT = 0.01, 0.05
 # Lines of a periodic excitation within this many half-power bandwidths that a mode needs: with two
 # complex values the four real unknowns of a mode are solved for, with a third they are checked.
 LINES_OF_MODE, BANDWIDTHS_OF_LINES = 3, 3
@@ -160,7 +160,7 @@ NOT_STATIONARY = 1e-3
 DECAY_MOST_POLES, DECAY_EVIDENCE_MARGIN = 6, 5.0
 # A damping less than this many standard deviations from zero is too uncertain; where the mode
 # fades by less than this share over the record it may be a line.
-DECAY_DAMPING_SIGMAS, FADED = 3.0, 0.6
+DECAY_DAMPING_SIGMAS, LEAST_FADING = 3.0, 0.6
 # Largest damping ratio, and least mean square of a vibration after the stops over that of the
 # ambient response.
 DECAY_MOST_DAMPING, DECAY_EXCITATION = 0.1, 16.0

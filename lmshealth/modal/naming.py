@@ -74,7 +74,7 @@ def assign(
     probability = np.zeros((n, m))
     weights = []
     for some, sought in pairings:
-        weight = len(some) * constants.MATCH - unlike[some, sought].sum()
+        weight = len(some) * constants.NAME_GAIN - unlike[some, sought].sum()
         if some:
             weight -= shift_cost(shift[some, sought][None], search[sought], len(some))[0]
             weight += undescribed * _standing_gain(shift[some, sought], search[sought])

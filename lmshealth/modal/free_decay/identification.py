@@ -359,7 +359,7 @@ def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejecti
     duration = fit.likelihood.blocks[0].duration
     faded = 1 - np.exp(-2 * np.pi * f * zeta * duration)
     worst_zeta = 1 / constants.DECAY_DAMPING_SIGMAS
-    if std_zeta > worst_zeta and faded < constants.FADED:
+    if std_zeta > worst_zeta and faded < constants.LEAST_FADING:
         return Rejection(
             "line-not-mode",
             f"{f:.5g} Hz decays by {100 * faded:.2g} % in {duration:.3g} s, its damping has a "

@@ -287,7 +287,7 @@ def _check_coherence(name: str, frf: Frf) -> None:
     mean, least = float(frf.coherence.mean()), 1 / n
     # Neighbouring lines of a Hann window share half of their information.
     chance = np.sqrt((n - 1) / (n + 1) / frf.coherence.size * 2) / n
-    if mean < least + constants.ANSWERS * chance:
+    if mean < least + constants.COHERENT_SIGMAS * chance:
         raise BadLog(
             name,
             "coherence",
@@ -331,7 +331,7 @@ def _why_missed(frf: Frf, fit: ResponseFit) -> Rejection:
         f"{100 * _noise_share(fit):.2g} %: "
     )
     few, n, top = _too_few(frf, fit)
-    if few and not frf.stray > constants.STRAY:
+    if few and not frf.stray > constants.NONLINEAR_OUTPUT:
         return Rejection("too-few-lines", misses + few)
     return Rejection(
         "nonlinear",
@@ -425,12 +425,12 @@ def _unresolved(ordinates: Ordinates, f: float, zeta: float) -> Rejection | None
     if np.isfinite(ordinates.span):
         fades = 1 - float(np.exp(-2 * np.pi * f * zeta * ordinates.span))
         # Over several blows the phase of a line is random.
-        if ordinates.scatter or fades >= constants.FADED:
+        if ordinates.scatter or fades >= constants.LEAST_FADING:
             return None
         return Rejection(
             "line-not-mode",
             f"it fades by {100 * fades:.0f} % in the {ordinates.span:.3g} s after the blow, needed "
-            f"{100 * constants.FADED:.0f} %: strike several times, or record longer",
+            f"{100 * constants.LEAST_FADING:.0f} %: strike several times, or record longer",
         )
     if ordinates.periodic:
         reach = constants.BANDWIDTHS_OF_LINES * zeta * f
