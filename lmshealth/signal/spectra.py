@@ -184,13 +184,9 @@ class LogSpectra:
 
     def without_band(self, low: float, high: float) -> LogSpectra:
         """Exclude the ordinates from low to high Hz."""
-        return replace(
-            self,
-            spectra=tuple(
-                replace(s, free=s.free & ((s.frequency < low) | (s.frequency > high)))
-                for s in self.spectra
-            ),
-        )
+        outside = [(s.frequency < low) | (s.frequency > high) for s in self.spectra]
+        pairs = zip(self.spectra, outside, strict=True)
+        return replace(self, spectra=tuple(replace(s, free=s.free & own) for s, own in pairs))
 
     def without(self, frequencies: Sequence[float]) -> LogSpectra:
         """Exclude the ordinates that lines at these frequencies in Hz may reach."""
@@ -246,38 +242,19 @@ def cross_spectra(
     """
 
     def transformed(part: Segment) -> CrossSpectrum:
-        return _cross_spectrum(channels, part, sample_rate, top, ceiling, resonances)
+        own = transform_segment(
+            channels, part, sample_rate, top, ceiling=ceiling, resonances=resonances
+        )
+        step = sample_rate / round(own.duration * sample_rate)
+        lines = tuple(
+            # Σ I = A² T / 2 over the ordinates of a sine.
+            (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
+            for one in own.sinusoids
+        )
+        matrix = own.transforms[:, :, None] * own.transforms[:, None].conj()
+        return CrossSpectrum(own.frequency, matrix, own.duration, part.velocity, own.free, lines)
 
     return tuple(_mean(map(transformed, group)) for group in _exchangeable(segments))
-
-
-def _cross_spectrum(
-    channels: Sequence[Channel],
-    segment: Segment,
-    sample_rate: float,
-    top: float,
-    ceiling: float,
-    resonances: Sequence[ResonanceRange],
-) -> CrossSpectrum:
-    segment_transforms = transform_segment(
-        channels, segment, sample_rate, top, ceiling=ceiling, resonances=resonances
-    )
-    transforms = segment_transforms.transforms
-    step = sample_rate / round(segment_transforms.duration * sample_rate)
-    lines = tuple(
-        # Σ I = A² T / 2 over the ordinates of a sine.
-        (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
-        for one in segment_transforms.sinusoids
-    )
-    matrix = transforms[:, :, None] * transforms[:, None].conj()
-    return CrossSpectrum(
-        segment_transforms.frequency,
-        matrix,
-        segment_transforms.duration,
-        segment.velocity,
-        segment_transforms.free,
-        lines,
-    )
 
 
 class SegmentTransforms(NamedTuple):
