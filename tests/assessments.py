@@ -414,7 +414,7 @@ def write_report(
         identity = one.judgement.stage
         before = (earlier or {}).get(identity)
         page = make_page(one, names[identity], before=before, generated=generated)
-        write_text(folder / page.file, page.text)
+        write_text(folder / page.summary.file, page.text)
         summaries.append(page.summary)
     index = write_index(folder, summaries, refused, generated=generated)
     return [*(folder / one.file for one in by_urgency(summaries)), index]

@@ -89,8 +89,8 @@ class ParameterHealth:
     low: float  # low, median, high: 5, 50 and 95 % quantiles, as fractions of the baseline
     median: float
     high: float
-    limit: float | None = None  # as a fraction of the baseline
-    below_limit: float = np.nan  # probability of being below the limit; NaN without one
+    limit: float | None  # as a fraction of the baseline
+    below_limit: float  # probability of being below the limit; NaN without one
     baseline: float = 1.0  # baseline, unit: baseline value with its unit; "" for a pure fraction
     unit: str = ""
 
@@ -186,9 +186,9 @@ def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
     )
 
 
-def limit_of(spec: ParameterSpec | None) -> float | None:
+def limit_of(spec: ParameterSpec) -> float | None:
     """Return the limit of a parameter as a fraction of its baseline; None without one."""
-    return None if spec is None or spec.limit is None else spec.limit.below / spec.baseline
+    return None if spec.limit is None else spec.limit.below / spec.baseline
 
 
 def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
@@ -220,10 +220,10 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         return
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     levels = health.latest(np.array(constants.LEVELS)).T.tolist()
-    for k, (name, (low, median, high)) in enumerate(zip(health.parameters, levels, strict=True)):
-        spec = specs.get(name)
-        limit = limit_of(spec)
+    for k, name in enumerate(health.parameters):
+        limit = limit_of(specs[name])
         below = np.nan if limit is None else float(np.mean(health.samples[-1, :, k] < limit))
+        low, median, high = levels[k]
         yield ParameterHealth(
             name=name,
             determined=bool(health.publishable_parameters()[k]),
@@ -234,8 +234,8 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             high=high,
             limit=limit,
             below_limit=below,
-            baseline=spec.baseline if spec else 1.0,
-            unit=spec.unit if spec else "",
+            baseline=specs[name].baseline,
+            unit=specs[name].unit,
         )
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Any
@@ -9,20 +10,10 @@ from typing import Any
 import numpy as np
 
 from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.report import text
 from lmshealth.report.assessment import Assessment, verdict_text
 from lmshealth.report.constants import LEVELS
-from lmshealth.report.text import (
-    GAP,
-    day,
-    in_brackets,
-    interval,
-    km,
-    percent,
-    probability,
-    quantiles,
-    spell,
-    travel_left,
-)
+from lmshealth.report.text import GAP, percent, probability, travel_left
 from lmshealth.stage.description import ParameterSpec
 
 Interval = tuple[float, float, float]
@@ -57,7 +48,7 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
         levels = health.latest(np.array(LEVELS)).T.tolist()
         for k in np.flatnonzero(health.publishable_parameters()):
             determined[health.parameters[k]] = tuple(levels[k])
-    remaining: Any = None if prognosis is None else quantiles(prognosis.censored()[:, -1])
+    remaining: Any = None if prognosis is None else text.quantiles(prognosis.censored()[:, -1])
     return Reported(
         recorded_at=judgement.recorded_at,
         baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
@@ -75,85 +66,69 @@ def reported(assessment: Assessment, service: Service | None = None) -> Reported
 
 def changes(
     before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]
-) -> tuple[str, ...]:
+) -> Iterator[str]:
     """Describe in sentences what changed since an earlier report on a machine.
 
     Reasons why the reports cannot be compared come first.
     """
-    return (
-        *_caveats(before, now),
-        _verdict(before, now, parameters),
-        *_health(before, now),
-        *_life(before, now),
-        *_service(before, now),
-        _logs(before, now),
-    )
-
-
-def _caveats(before: Reported, now: Reported) -> list[str]:
-    found = []
     if before.description != now.description:
-        found.append("The stage description has changed: not all differences are wear.")
+        yield "The stage description has changed: not all differences are wear."
     if before.baseline_at != now.baseline_at:
-        found.append(
-            f"The baseline has changed from {day(before.baseline_at)} to "
-            f"{day(now.baseline_at)}: percentages of the two reports cannot be compared."
+        yield (
+            f"The baseline has changed from {text.day(before.baseline_at)} to "
+            f"{text.day(now.baseline_at)}: percentages of the two reports cannot be compared."
         )
-    return found
-
-
-def _verdict(before: Reported, now: Reported, parameters: tuple[ParameterSpec, ...]) -> str:
-    def text(report: Reported) -> str:
-        return verdict_text(report.verdict, parameters) + in_brackets(report.probability)
-
+    was, present = (
+        verdict_text(one.verdict, parameters) + text.in_brackets(one.probability)
+        for one in (before, now)
+    )
     if before.verdict != now.verdict:
-        return f"Verdict: {text(before)} → {text(now)}."
-    earlier = f", before {probability(before.probability)}"
-    return f"Verdict: still {text(now)}{'' if text(before) == text(now) else earlier}."
+        yield f"Verdict: {was} → {present}."
+    elif was == present:
+        yield f"Verdict: still {present}."
+    else:
+        yield f"Verdict: still {present}, before {probability(before.probability)}."
+    yield from _health(before, now)
+    if before.remaining is not None or now.remaining is not None:
+        yield _life(before, now)
+    if before.service_by is not None or now.service_by is not None:
+        yield _service(before.service_by, now.service_by)
+    more, travel = now.n_logs - before.n_logs, now.travel - before.travel
+    logs = f"{abs(more)} log{_s(more)} {'more' if more > 0 else 'fewer'}" if more else ""
+    further = f", {text.km(travel)} further." if travel > 0 else "."
+    yield (logs or "Same number of logs") + further
 
 
-def _health(before: Reported, now: Reported) -> list[str]:
-    found = []
+def _health(before: Reported, now: Reported) -> Iterator[str]:
     for name in dict.fromkeys((*now.health, *before.health)):
-        texts = [
-            percent(report.health[name][1], 0) if name in report.health else "not determined"
-            for report in (before, now)
+        medians = [
+            percent(one.health[name][1], 0) if name in one.health else "not determined"
+            for one in (before, now)
         ]
         own = now.health.get(name)
-        spread = f" (90{GAP}%: {interval(own[0], own[2])})" if own else ""
-        found.append(f"{spell(name).capitalize()}: {' → '.join(texts)}{spread}.")
-    return found
+        spread = f" (90{GAP}%: {text.interval(own[0], own[2])})" if own else ""
+        yield f"{text.spell(name).capitalize()}: {' → '.join(medians)}{spread}."
 
 
-def _life(before: Reported, now: Reported) -> list[str]:
-    if before.remaining is None and now.remaining is None:
-        return []
+def _life(before: Reported, now: Reported) -> str:
     low, middle, high = (
         [
-            travel_left(report.remaining[k], report.horizon) if report.remaining else "not known"
-            for report in (before, now)
+            travel_left(one.remaining[k], one.horizon) if one.remaining else "not known"
+            for one in (before, now)
         ]
         for k in range(3)
     )
     spread = f" (90{GAP}%: {low[1]} to {high[1]})" if now.remaining else ""
-    return [f"Remaining life, median: {_from_to(*middle)}{spread}."]
+    return f"Remaining life, median: {_from_to(*middle)}{spread}."
 
 
-def _service(before: Reported, now: Reported) -> list[str]:
-    if before.service_by is None and now.service_by is None:
-        return []
-    days = [one.isoformat() if one else "none" for one in (before.service_by, now.service_by)]
+def _service(before: date | None, now: date | None) -> str:
     shift = ""
-    if before.service_by and now.service_by and before.service_by != now.service_by:
-        later = (now.service_by - before.service_by).days
+    if before and now and before != now:
+        later = (now - before).days
         shift = f", {abs(later)} day{_s(later)} {'later' if later > 0 else 'earlier'}"
-    return [f"Service date: {_from_to(*days)}{shift}."]
-
-
-def _logs(before: Reported, now: Reported) -> str:
-    more, travel = now.n_logs - before.n_logs, now.travel - before.travel
-    logs = f"{abs(more)} log{_s(more)} {'more' if more > 0 else 'fewer'}" if more else ""
-    return (logs or "Same number of logs") + (f", {km(travel)} further." if travel > 0 else ".")
+    days = [one.isoformat() if one else "none" for one in (before, now)]
+    return f"Service date: {_from_to(*days)}{shift}."
 
 
 def _from_to(before: str, now: str) -> str:

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
 from itertools import combinations
-from typing import Any
+from operator import attrgetter
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,16 +35,17 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Effect, Event, Track
+from lmshealth.tracking.track import Effect, Track
+
+Item = TypeVar("Item")
 
 _SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
 @dataclass(frozen=True, slots=True)
 class Page:
-    """Page of a machine: its file name, HTML, and the machine as the fleet page shows it."""
+    """Page of a machine: its HTML, and the machine as the fleet page shows it."""
 
-    file: str
     text: str
     summary: Summary
 
@@ -62,16 +64,13 @@ def make_page(
     service, parameters = assessment.service(), assessment.stage.parameters
     summary = summarise(assessment, service, file)
     highest = max((one.high for one in summary.health), default=1.0)
-    news: tuple[str, ...] = ()
-    if before is not None:
-        news = changes(before, reported(assessment, service), parameters)
     content = {
         "assessment": assessment,
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": _first_limit(assessment.prognosis),
         "before": before,
-        "news": news,
+        "news": before and [*changes(before, reported(assessment, service), parameters)],
         **_track_content(assessment),
         **_health_content(assessment),
     }
@@ -91,7 +90,7 @@ def make_page(
         key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
     }
     content["letters"], content["picture"] = share_letters(pictures)
-    return Page(file, render("stage.html.j2", generated, **content), summary)
+    return Page(render("stage.html.j2", generated, **content), summary)
 
 
 def latest_modes(track: Track) -> list[dict[str, Any]]:
@@ -141,7 +140,7 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
         influences = covariate_effects.find_covariate_effects(history, track, stage)
         content |= {
             "modes": latest_modes(track),
-            "events": list(_events(track)),
+            "events": _grouped(track.events, attrgetter("kind", "epoch", "source")).values(),
             "effects": list(_other_effects(track)),
             "consistency": track.consistency(),
             "nis": _nis(track),
@@ -149,15 +148,12 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
             "widening": float(track.widening[-1]),
             "largest_drift": float(np.nanmax(np.abs(np.expm1(track.drift[-1])), initial=0.0)),
         }
-    corrected: dict[str, list[CovariateEffect]] = {}
-    for one in influences:
-        if one.values.size:
-            corrected.setdefault(one.covariate, []).append(one)
+    corrected = [one for one in influences if one.values.size]
     return content | {
         "declared": {mode.name: mode.frequency_hz for mode in stage.modes},
         "seen": _seen(history),
         "influences": influences,
-        "corrected": corrected,
+        "corrected": _grouped(corrected, attrgetter("covariate")),
         "uncorrected": list(_uncorrected(history, stage)),
         "mode_use": list(_mode_use(history, track, stage, assessment.refused)),
         "reasons": Counter(item.reason for item in assessment.refused).most_common(),
@@ -184,12 +180,11 @@ def _health_content(assessment: Assessment) -> dict[str, Any]:
     }
 
 
-def _events(track: Track) -> Iterator[list[Event]]:
-    """Group the events of all modes that are one event of the machine."""
-    groups: dict[tuple[str, int, str], list[Event]] = {}
-    for event in track.events:
-        groups.setdefault((event.kind, event.epoch, event.source), []).append(event)
-    yield from groups.values()
+def _grouped(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, list[Item]]:
+    groups: dict[Any, list[Item]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return groups
 
 
 def _other_effects(track: Track) -> Iterator[Effect]:
@@ -293,18 +288,17 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
     own: dict[str, Any]
     if health is not None:
         for names, key, _ in _pairs(health):
-            draw["posterior", key] = partial(
-                figures.plot_posterior, health=health, parameters=names
-            )
+            own = {"health": health, "parameters": names}
+            draw["posterior", key] = partial(figures.plot_posterior, **own)
         for name in health.parameters:
-            own = {"health": health, "parameter": name, "limit": limit_of(specs.get(name))}
+            own = {"health": health, "parameter": name, "limit": limit_of(specs[name])}
             draw["health", name] = partial(figures.plot_health, **own)
     if prognosis is not None:
         for name in prognosis.parameters[:-1]:
             own = {"parameter": name, "health": health, "baseline": specs[name].baseline}
             draw["life", name] = partial(figures.plot_life, prognosis=prognosis, **own)
-        survival = partial(figures.plot_survival, prognosis=prognosis, service=service)
-        draw["survival", "any"] = survival
+        own = {"prognosis": prognosis, "service": service}
+        draw["survival", "any"] = partial(figures.plot_survival, **own)
     return draw
 
 

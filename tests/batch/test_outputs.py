@@ -97,7 +97,8 @@ def test_a_page_needs_no_logs(tmp_path: Path) -> None:
     made = pack_assessment(worn(tmp_path))
     output = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
     assert output is not None
-    assert (output.page.file, output.page.summary.identity) == ("M7-Y.html", "M7-Y")
+    summary = output.page.summary
+    assert (summary.file, summary.identity) == ("M7-Y.html", "M7-Y")
     assert output.tables == {}
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", None, (), None)) is None
