@@ -13,9 +13,9 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 import sqlalchemy as sql
@@ -198,18 +198,15 @@ class Store:
 
     def assessment(self, machine: str, key: str) -> bytes | None:
         """Fetch a packed assessment; None where it is not stored."""
-        content: bytes | None = self._of_assessment(_ASSESSED.c.content, machine, key)
-        return content
+        return cast(bytes | None, self._of_assessment(_ASSESSED.c.content, machine, key))
 
     def evidence(self, machine: str, key: str) -> bytes | None:
         """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
-        content: bytes | None = self._of_assessment(_ASSESSED.c.evidence, machine, key)
-        return content
+        return cast(bytes | None, self._of_assessment(_ASSESSED.c.evidence, machine, key))
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine."""
-        row = {"machine": _id(machine), "key": key, "content": made.content}
-        self._put(_ASSESSED, row | {"evidence": made.evidence, "summary": made.summary})
+        self._put(_ASSESSED, {"machine": _id(machine), "key": key, **asdict(made)})
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
@@ -317,8 +314,7 @@ def _connect(url: str | URL, *, create: bool) -> tuple[Engine, str]:
         raise StoreError(f"cannot open the store: the given address is no URL; {needed}")
     engine: Engine | None = None
     try:
-        parsed = _parsed(url)
-        engine = _engine(parsed, create=create)
+        engine = _engine(make_url(url), create=create)
         if create:
             _create_tables(engine)
         with engine.connect():
@@ -331,19 +327,14 @@ def _connect(url: str | URL, *, create: bool) -> tuple[Engine, str]:
         raise StoreError(f"cannot open the store {shown_address(address)}: {reason}") from None
 
 
-def _parsed(url: str | URL) -> URL:
-    """Parse a URL; PostgreSQL uses the driver that the extra installs."""
-    parsed = make_url(url)
-    kind = parsed.get_backend_name()
-    if kind not in _INSERT:
-        raise ValueError(f"{kind} is not supported: use {' or '.join(_INSERT)}")
-    plain = parsed.drivername == "postgresql"
-    return parsed.set(drivername="postgresql+psycopg") if plain else parsed
-
-
 def _engine(url: URL, *, create: bool) -> Engine:
     """Make the engine of a database; without ``create`` SQLite must not create the file."""
-    if url.get_backend_name() != "sqlite":
+    kind = url.get_backend_name()
+    if kind not in _INSERT:
+        raise ValueError(f"{kind} is not supported: use {' or '.join(_INSERT)}")
+    if kind != "sqlite":
+        if url.drivername == kind:
+            url = url.set(drivername="postgresql+psycopg")  # the driver that the extra installs
         timeout = constants.SERVER_TIMEOUT_S
         wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
         return sql.create_engine(url, pool_pre_ping=True, connect_args=wait)

@@ -64,7 +64,7 @@ def test_a_description_without_parameters_has_no_verdict(make: Maker) -> None:
     description = structs.replace(assessment.stage.description, parameter=())
     stage = replace(assessment.stage, description=description)
     judgement = replace(assessment.judgement, verdict="not-enough-data")
-    found = summary(replace(assessment, stage=stage, judgement=judgement))
+    found = summary(replace(assessment, stage=stage, health=None, judgement=judgement))
     assert (found.headline, found.state) == (
         "Modes tracked; no health parameter described",
         "open",
