@@ -17,7 +17,6 @@ from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or
 from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer
-from lmshealth.health.results import Health
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
@@ -33,7 +32,7 @@ from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notes
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notes
-from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
+from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -95,75 +94,59 @@ def assess(
     notes = maintenance_notes(work, [reading.metadata.recorded_at for reading in readings])
     notes += missing_mode_notes(history, refused)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
-    own_seed = seed_of(seed, history.stage, stage.digest)
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
-    found = _results(history, stage, used, epochs, own_seed, executor)
-    if found.track is not None:
-        refused += outlier_refusals(history, found.track)
-    return Assessment(
+    made = Assessment(
         stage=stage,
         history=history,
         digests=tuple(reading.digest for reading in used),
-        track=found.track,
-        health=found.health,
-        prognosis=found.prognosis,
-        judgement=judge(stage, history, found.health, found.track, doubt=found.doubt),
+        track=None,
+        health=None,
+        prognosis=None,
+        judgement=judge(stage, history, None),
         refused=(*not_excited, *refused),
-        notes=(*notes, *found.notes),
+        notes=tuple(notes),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
-        evidence=found.evidence,
-        doubt=found.doubt,
     )
+    made = _with_results(made, used, epochs, executor)
+    judgement = judge(stage, history, made.health, made.track, doubt=made.doubt)
+    return replace(made, judgement=judgement)
 
 
-@dataclass(frozen=True, slots=True)
-class _Results:
-    """Results of one machine up to the first that fails; the notes state why it does."""
-
-    track: Track | None = None
-    health: Health | None = None
-    prognosis: Prognosis | None = None
-    evidence: MachineEvidence | None = None
-    notes: tuple[str, ...] = ()
-    doubt: str = ""
-
-
-def _results(
-    history: History,
-    stage: Stage,
-    readings: Sequence[LogEstimates],
-    epochs: int,
-    seed: tuple[int, int],
-    executor: Executor | None,
-) -> _Results:
-    found = _Results()
+def _with_results(
+    made: Assessment, readings: Sequence[LogEstimates], epochs: int, executor: Executor | None
+) -> Assessment:
+    """Add the results up to the first that fails, and a note why it does."""
+    history, stage = made.history, made.stage
+    seed = seed_of(made.seed, history.stage, stage.digest)
     try:
         tracked = track(history, stage)
         doubt = doubt_of_names(stage, history, tracked, readings)
-        found = replace(found, track=tracked, doubt=doubt)
-        if doubt:
-            return found
+        refused = (*made.refused, *outlier_refusals(history, tracked))
+        made = replace(made, track=tracked, refused=refused, doubt=doubt)
+        if doubt or not stage.parameters:
+            return made
         history = accepted_estimates(history, tracked)
-        if not stage.parameters:
-            return found
         # The prognosis takes longest: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
         mapper = map if executor is None else partial(map_in_order, executor)
         life = mapper(_prognose, [history], [stage], [seed]) if has_limit else None
         chosen = epochs_to_infer(tracked, stage, epochs)
-        found = replace(found, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
+        made = replace(made, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
         if life is None:
-            return found
+            return made
         prognosis, evidence = next(iter(life))
-        return replace(found, prognosis=prognosis, evidence=evidence)
+        return replace(made, prognosis=prognosis, evidence=evidence)
     except LmshealthError as error:
-        return replace(found, notes=(str(error),))
+        why = str(error)
     except LinAlgError as error:  # one machine must not end the run
-        why = f"its logs lead to a singular matrix ({error}); please report this with modes.csv"
-        return replace(found, notes=(f"{history.stage}: {why}",))
+        why = (
+            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
+            "with modes.csv"
+        )
+    return replace(made, notes=(*made.notes, why))
 
 
 def map_in_order(
@@ -321,8 +304,7 @@ def _machines_to_update(
         evidence = {}
         for name, machine in fleet.items():
             content = store.evidence(name, machine.key)
-            own = unpack_or_none(content, MachineEvidence | None)
-            if own is not None:
+            if (own := unpack_or_none(content, MachineEvidence | None)) is not None:
                 evidence[name] = own
         if evidence:
             stage = next(iter(fleet.values())).stage
@@ -331,19 +313,18 @@ def _machines_to_update(
 
 
 def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment | str | None:
-    """Recompute the prognosis of a machine; return why it fails."""
-    name, _, content, prior = job
-    return reason_if_failed(lambda: with_fleet_prior(content, prior), name)
+    """Recompute a prognosis; None where it cannot be decoded, else why that fails."""
+    machine, _, content, prior = job
 
+    def work() -> PackedAssessment | None:
+        found: Assessment | None = unpack_or_none(content, Assessment)
+        if found is None or found.track is None:
+            return None
+        history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
+        prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
+        return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))
 
-def with_fleet_prior(content: bytes | None, prior: FleetPrior) -> PackedAssessment | None:
-    """Recompute the prognosis of a packed assessment; None where it cannot be decoded."""
-    found: Assessment | None = unpack_or_none(content, Assessment)
-    if found is None or found.track is None:
-        return None
-    history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
-    prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
-    return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))
+    return reason_if_failed(work, machine)
 
 
 def _reason(job: object, why: str) -> str:

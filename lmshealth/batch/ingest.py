@@ -151,26 +151,26 @@ def _tasks(
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
     manifest = read_manifest(folder)
-    tasks: list[_Task] = []
-    refused: list[Refusal] = list(manifest.refused)
-    digests: dict[Path, str] = {}
+    digests: dict[Path, str | BadLog] = {}
     resources.progress("reading", 0, len(found))
     size = constants.FILES_PER_HASH_TASK
     batches = (tuple(found[first : first + size]) for first in range(0, len(found), size))
     for _, part in resources.pool.map_unordered(_digests, batches, _no_digests):
-        for path, (digest, *trouble) in part.items():
-            digests[path] = digest
-            if trouble:
-                refused.append(Refusal(name_of(path, folder), *trouble))
+        digests |= part
         resources.progress("reading", len(digests), len(found))
+    tasks: list[_Task] = []
+    refused: list[Refusal] = list(manifest.refused)
+    for path, digest in digests.items():
+        if isinstance(digest, BadLog):
+            refused.append(Refusal(name_of(path, folder), digest.reason, digest.detail))
     seen: dict[tuple[str, str], str] = {}
     # Of several copies the one in a manifest is analysed: only that one has its metadata.
     for path in sorted(found, key=lambda path: not manifest.names(path)):
-        name = name_of(path, folder)
-        # A file with the suffix of another format is no copy: only one of the two can be read.
-        content = digests[path], format_name(path)
-        if not digests[path]:
+        name, digest = name_of(path, folder), digests[path]
+        if isinstance(digest, BadLog):
             continue
+        # A file with the suffix of another format is no copy: only one of the two can be read.
+        content = digest, format_name(path)
         try:
             overrides = manifest.overrides(path)
             if content in seen:
@@ -180,26 +180,24 @@ def _tasks(
             refused.append(Refusal(name, error.reason, error.detail))
             continue
         seen[content] = name
-        tasks.append(_Task(path, name, overrides, digests[path], columns))
+        tasks.append(_Task(path, name, overrides, digest, columns))
     return tasks, refused
 
 
-_Digests = dict[Path, tuple[str, ...]]
-
-
-def _digests(paths: Iterable[Path]) -> _Digests:
-    """Hash files; one that cannot be read has an empty digest, a reason and a detail."""
-    found: _Digests = {}
+def _digests(paths: Iterable[Path]) -> dict[Path, str | BadLog]:
+    """Hash files; return the error of one that cannot be read."""
+    found: dict[Path, str | BadLog] = {}
     for path in paths:
         try:
-            found[path] = (content_digest(path),)
+            found[path] = content_digest(path)
         except BadLog as error:
-            found[path] = "", error.reason, error.detail
+            found[path] = error
     return found
 
 
-def _no_digests(paths: Iterable[Path], why: str) -> _Digests:
-    return {path: ("", "missing-file", f"{why}: it cannot be read") for path in paths}
+def _no_digests(paths: Iterable[Path], why: str) -> dict[Path, str | BadLog]:
+    detail = f"{why}: it cannot be read"
+    return {path: BadLog(path.name, "missing-file", detail) for path in paths}
 
 
 def _cached(
@@ -252,16 +250,9 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
         reading = read_ambient(log, described)
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
-        estimates = LogEstimates(
-            log.name,
-            log.digest,
-            log.metadata,
-            modes,
-            loop_error(log),
-            relative_spectrum(log, described),
-            spectra,
-        )
-        return Identified(estimates, by, stage, asked)
+        rms, levels = loop_error(log), relative_spectrum(log, described)
+        found = LogEstimates(log.name, log.digest, log.metadata, modes, rms, levels, spectra)
+        return Identified(found, by, stage, asked)
     except BadLog as error:
         refusal = Refusal(task.name, error.reason, error.detail)
         lasting = error.reason not in constants.RETRIED_REASONS

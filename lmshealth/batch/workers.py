@@ -15,14 +15,7 @@ import socket
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    FIRST_COMPLETED,
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    wait,
-)
+from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
@@ -89,32 +82,28 @@ class _ProcessPool(Pool):
     def start(self) -> None:
         """Start processes; where one is killed meanwhile, try again."""
         for _ in range(constants.START_ATTEMPTS):
+            # The processes exit when the other end of this pipe is closed, by us or by our own end.
+            parent_exit, self._open_end = multiprocessing.Pipe(duplex=False)
+            self.executor: ProcessPoolExecutor = ProcessPoolExecutor(
+                self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
+            )
             try:
-                self._start()
+                resource_tracker.ensure_running()  # its start unblocks SIGINT: not in what follows
+                with _interrupts_blocked():  # the processes start here, and inherit the mask
+                    first = self.executor.submit(os.getpid)
+                first.result()
                 return
-            except BaseException as error:
+            except BrokenExecutor:
                 self.kill()
-                if not isinstance(error, BrokenExecutor):
-                    raise
+            except BaseException:
+                self.kill()
+                raise
         found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
         raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 
-    def _start(self) -> None:
-        # The processes exit when the other end of this pipe is closed, by us or by our own end.
-        parent_exit, self._open_end = multiprocessing.Pipe(duplex=False)
-        executor = ProcessPoolExecutor(
-            self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
-        )
-        self.executor: Executor = executor
-        resource_tracker.ensure_running()  # its start unblocks SIGINT: not amid what follows
-        with _interrupts_blocked():  # the processes start here, and inherit the mask
-            first = executor.submit(os.getpid)
-        first.result()
-
     def kill(self) -> None:
         """End all processes at once, whatever they are doing."""
-        if isinstance(self.executor, ProcessPoolExecutor):
-            self.executor.shutdown(kill_workers=True)
+        self.executor.shutdown(kill_workers=True)
         self._open_end.close()
 
     def close(self) -> None:
@@ -151,7 +140,8 @@ class _ProcessPool(Pool):
         """Run a task that may have ended its process; a process may also be killed from outside."""
         for _ in range(constants.ATTEMPTS_ALONE):
             try:
-                return self.executor.submit(function, item).result()
+                result: Result = self.executor.submit(function, item).result()
+                return result
             except BrokenExecutor:
                 self.kill()
                 self.start()
@@ -176,7 +166,7 @@ def _completed(
                 break  # perhaps by a crash: see below before more items are taken
         if not running:
             return
-        for future in wait(running, return_when=FIRST_COMPLETED).done:
+        for future in wait(running, return_when="FIRST_COMPLETED").done:
             if isinstance(future.exception(), BrokenExecutor):
                 items = iter(())
             yield running.pop(future), future
@@ -293,8 +283,8 @@ def cluster(address: str) -> Iterator[Pool]:
     try:
         from distributed.comm.core import CommClosedError
     except ImportError as error:
-        needed = "pip install 'lmshealth[distributed]'"
-        raise SchedulerError(f"--scheduler needs Dask: {needed}") from error
+        missing = "--scheduler needs Dask: pip install 'lmshealth[distributed]'"
+        raise SchedulerError(missing) from error
     try:
         client = _connected(address)
     # Dask's settings may name modules that are missing, or lack certificates (a TypeError).
