@@ -6,7 +6,7 @@ The noise comes from the sensors and from forces that still excite the same mode
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -42,6 +42,11 @@ _AROUND = 24
 _SKIPS = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 # Rejections of the strongest mode that a later start may avoid.
 _TOO_EARLY = ("too-uncertain", "too-close")
+# Source of the modes of each kind of channels.
+_SOURCES = {"acceleration": "acc", "displacement": "delta_e"}
+
+Range = tuple[float, float]
+"""Lowest and highest frequency in Hz."""
 
 
 def identify_decays(
@@ -110,10 +115,10 @@ def identify_decays(
     targets = () if stage is None else choose_targets(stage, band)
     limits = _limits(log, decays, targets, band)
     found: list[_BandModes] = []
-    for source, kind in (("acc", "acceleration"), ("delta_e", "displacement")):
+    for kind in _SOURCES:
         group = tuple(c for c in used if c.kind == kind)
         if group:
-            found += _fit_bands(log, group, source, decays, limits, targets)
+            found += _fit_bands(log, group, decays, limits, targets)
     if not targets:
         return _number(log, found)
     named, ambiguous = _name(targets, found)
@@ -146,36 +151,23 @@ class _BandModes:
     rejected: tuple[_Pole, ...]
 
 
-@dataclass(frozen=True, slots=True)
-class _Request:
-    """Source and names of the channels, and the frequencies in Hz in which modes are accepted."""
-
-    source: str
-    channels: tuple[str, ...]
-    limits: tuple[float, float]
-
-
 def _limits(
-    log: Log,
-    decays: tuple[Segment, ...],
-    targets: tuple[Target, ...],
-    band: tuple[float, float] | None,
-) -> tuple[float, float]:
+    log: Log, decays: Sequence[Segment], targets: Sequence[Target], band: Range | None
+) -> Range:
     """Return the frequencies in Hz between which modes are searched for."""
     duration = max(s.stop - s.start for s in decays) / log.sample_rate
     least, top = constants.DECAY_PERIODS / duration, constants.USABLE * log.sample_rate
+    low, high = band or (least, top)
     if targets:
         low = min(t.frequency / (1 + t.search) for t in targets)
         high = max(t.frequency * (1 + t.search) for t in targets)
-    else:
-        low, high = band or (least, top)
-    if targets and high > top:
-        raise BadLog(
-            log.name,
-            "sample-rate",
-            f"{log.sample_rate:g} Hz cannot show modes up to {high:.0f} Hz; needed is at least "
-            f"{high / constants.USABLE:.0f} Hz",
-        )
+        if high > top:
+            raise BadLog(
+                log.name,
+                "sample-rate",
+                f"{log.sample_rate:g} Hz cannot show modes up to {high:.0f} Hz; needed is at "
+                f"least {high / constants.USABLE:.0f} Hz",
+            )
     low, high = max(low, least), min(high, top)
     needed = constants.DECAY_PERIODS + constants.DECAY_ORDINATES
     if high * duration < needed:
@@ -189,7 +181,7 @@ def _limits(
 
 
 def _cut(
-    log: Log, channels: tuple[Channel, ...], decays: tuple[Segment, ...], skip: float
+    log: Log, channels: Sequence[Channel], decays: Sequence[Segment], skip: float
 ) -> list[FloatArray]:
     """Cut out decays, those of similar length to one length.
 
@@ -203,24 +195,19 @@ def _cut(
             groups[-1].append(i)
         else:
             groups.append([i])
-    return [
-        np.array(
-            [
-                np.stack([c.values[starts[i] : starts[i] + sizes[group[-1]]] for c in channels], -1)
-                for i in group
-            ]
-        )
-        for group in groups
-    ]
+
+    def samples(i: int, size: int) -> FloatArray:
+        return np.stack([c.values[starts[i] : starts[i] + size] for c in channels], axis=-1)
+
+    return [np.array([samples(i, sizes[group[-1]]) for i in group]) for group in groups]
 
 
 def _fit_bands(
     log: Log,
-    channels: tuple[Channel, ...],
-    source: str,
-    decays: tuple[Segment, ...],
-    limits: tuple[float, float],
-    targets: tuple[Target, ...],
+    channels: Sequence[Channel],
+    decays: Sequence[Segment],
+    limits: Range,
+    targets: Sequence[Target],
 ) -> list[_BandModes]:
     """Fit the modes of each band with peaks."""
     # Cut again for every band: copies of all decays at every start would exceed the memory.
@@ -230,21 +217,21 @@ def _fit_bands(
     peaks = _peaks(longest, log.sample_rate, limits)
     if targets:
         peaks = [f for f in peaks if any(is_near(t, f, slack=1.2) for t in targets)]
-    names = tuple(c.name for c in channels)
     bands = []
     for group, (low, high) in _bands(peaks, duration):
         reach = _reach(duration, group[-1])
         ends = max(group[0] - reach, 1.5 / duration), min(group[-1] + reach, 0.49 * log.sample_rate)
-        request = _Request(source, names, (max(low, limits[0]), min(high, limits[1])))
-        bands += _fit_band(cut, log.sample_rate, ends, request)
+        inside = max(low, limits[0]), min(high, limits[1])
+        bands += _fit_band(cut, log.sample_rate, ends, channels, inside)
     return bands
 
 
 def _fit_band(
     cut: Callable[[float], list[FloatArray]],
     sample_rate: float,
-    ends: tuple[float, float],
-    request: _Request,
+    ends: Range,
+    channels: Sequence[Channel],
+    limits: Range,
 ) -> list[_BandModes]:
     """Start the decays later until they are sums of separate modes in stationary noise.
 
@@ -255,7 +242,7 @@ def _fit_band(
     stationary: DecayFit | None = None
     for skip in _SKIPS:
         blocks = tuple(transform_decays(samples, sample_rate, *ends) for samples in cut(skip))
-        fit = fit_decays(blocks, displacement=request.source == "delta_e")
+        fit = fit_decays(blocks, displacement=channels[0].kind == "displacement")
         if not fit.likelihood.n_modes:
             break
         if stationarity(fit) <= constants.NOT_STATIONARY:
@@ -263,22 +250,27 @@ def _fit_band(
             continue
         stationary = stationary or fit
         if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
-            band = _accept(fit, request)
-            poles = (*band.poles, *band.rejected)
-            strongest = max(poles, key=lambda pole: pole.snr.max(), default=None)
+            band = _accept(fit, channels, limits)
+            strongest = _strongest((*band.poles, *band.rejected))
             why = strongest.rejection if strongest is not None else None
             if why is None or why.reason not in _TOO_EARLY:
                 return [band]
     if stationary is not None:
-        return [_accept(stationary, request)]
-    return [_accept(nonstationary, request, linear=False)] if nonstationary is not None else []
+        return [_accept(stationary, channels, limits)]
+    if nonstationary is not None:
+        return [_accept(nonstationary, channels, limits, linear=False)]
+    return []
+
+
+def _strongest(poles: Iterable[_Pole]) -> _Pole | None:
+    return max(poles, key=lambda pole: pole.snr.max(), default=None)
 
 
 def _reach(duration: float, f: float) -> float:
     return max(_REACH / duration, _SHARE * f)
 
 
-def _peaks(samples: FloatArray, sample_rate: float, limits: tuple[float, float]) -> list[float]:
+def _peaks(samples: FloatArray, sample_rate: float, limits: Range) -> list[float]:
     """Return frequencies of peaks of the sum over decays and channels, relative to its level."""
     n_segments, n_samples, n = samples.shape
     reach = (_AROUND + 2) * sample_rate / n_samples
@@ -293,7 +285,7 @@ def _peaks(samples: FloatArray, sample_rate: float, limits: tuple[float, float])
     return [float(f) for f in block.frequency[top]]
 
 
-def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], tuple[float, float]]]:
+def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], Range]]:
     """Group peaks whose bands overlap, and divide the frequencies between the groups.
 
     A mode on the flank of a stronger one is no peak; the fit of its band finds it.
@@ -314,10 +306,11 @@ def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], tuple
     return bands
 
 
-def _accept(fit: DecayFit, request: _Request, *, linear: bool = True) -> _BandModes:
+def _accept(
+    fit: DecayFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
+) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
-    low, high = request.limits
-    lines = fit.is_line()
+    source, lines = _SOURCES[channels[0].kind], fit.is_line()
     rejected: list[_Pole] = []
     modal: list[int] = []
 
@@ -325,7 +318,7 @@ def _accept(fit: DecayFit, request: _Request, *, linear: bool = True) -> _BandMo
         return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
 
     for i, f in enumerate(fit.frequency.tolist()):
-        if not low <= f <= high:
+        if not limits[0] <= f <= limits[1]:
             continue
         if not linear:
             detail = (
@@ -338,17 +331,17 @@ def _accept(fit: DecayFit, request: _Request, *, linear: bool = True) -> _BandMo
         else:
             modal.append(i)
     if not modal:
-        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), request.source, ())
-        return _BandModes(request.source, (), nothing, tuple(rejected))
+        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), source, ())
+        return _BandModes(source, (), nothing, tuple(rejected))
     result = estimate(fit, modal)
     poles = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
     snr = np.array([one.snr for one in poles])
-    best = [request.channels[c] for c in snr.argmax(axis=1)]
-    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), request.source, best)
+    best = [channels[c].name for c in snr.argmax(axis=1)]
+    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), source, best)
     credible = [k for k, one in enumerate(poles) if one.rejection is None]
     rejected += [one for one in poles if one.rejection is not None]
     accepted = tuple(poles[k] for k in credible)
-    return _BandModes(request.source, accepted, modes.select(credible), tuple(rejected))
+    return _BandModes(source, accepted, modes.select(credible), tuple(rejected))
 
 
 def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
@@ -391,30 +384,30 @@ def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejecti
 def _number(log: Log, bands: list[_BandModes]) -> Modes:
     """Merge and number the modes; of Δe only those that accelerometers do not show."""
     seen = [pole for band in bands if band.source == "acc" for pole in band.poles]
-
-    def is_new(pole: _Pole) -> bool:
-        return all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in seen)
-
     kept = []
     for band in bands:
-        new = [i for i, pole in enumerate(band.poles) if band.source == "acc" or is_new(pole)]
+        others = () if band.source == "acc" else seen
+        new = [
+            i
+            for i, pole in enumerate(band.poles)
+            if all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in others)
+        ]
         kept.append(band.modes.select(new))
     modes = numbered(merge(kept, (), log.refused))
     if not modes.names:
-        rejected = [pole for band in bands for pole in band.rejected]
-        strongest = max(rejected, key=lambda pole: pole.snr.max(), default=None)
+        strongest = _strongest(pole for band in bands for pole in band.rejected)
         nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
         raise BadLog(log.name, *((strongest and strongest.rejection) or nothing)[:2])
     return modes
 
 
 def _name(
-    targets: tuple[Target, ...], bands: list[_BandModes]
+    targets: Sequence[Target], bands: list[_BandModes]
 ) -> tuple[list[Modes], dict[str, Rejection]]:
     """Assign accelerometers' modes to the targets, then those of Δe to the remaining ones."""
     named: list[Modes] = []
     ambiguous: dict[str, Rejection] = {}
-    for source in ("acc", "delta_e"):
+    for source in _SOURCES.values():
         taken = {name for modes in named for name in modes.names}
         missing = [target for target in targets if target.name not in taken]
         poles = [pole for band in bands if band.source == source for pole in band.poles]
@@ -433,14 +426,13 @@ def _name(
 def _why_missing(target: Target, bands: list[_BandModes]) -> Rejection:
     """Return why a mode was not found, from the strongest resonance within its search."""
     poles = [pole for band in bands for pole in (*band.poles, *band.rejected)]
-    near = [pole for pole in poles if is_near(target, pole.frequency)]
-    if not near:
+    strongest = _strongest(pole for pole in poles if is_near(target, pole.frequency))
+    if strongest is None:
         return Rejection(
             "not-excited",
             f"nothing decays within {100 * target.search:.0f} % of {target.frequency:.4g} Hz; "
             "excite it more, or identify it while the stage moves",
         )
-    strongest = max(near, key=lambda pole: pole.snr.max())
     return strongest.rejection or Rejection(
         "outside-search",
         f"the damping {strongest.damping:.2g} at {strongest.frequency:.5g} Hz is not within a "
