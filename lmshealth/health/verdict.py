@@ -141,15 +141,16 @@ def doubt_of_names(
 ) -> str:
     """Return why health that depends on the names of modes is not published; empty if it may be.
 
-    Modes move with wear, so that only those of the baseline are compared with the description.
+    Modes move with wear, and a repair need not restore them: those of the first baseline are
+    compared with the description, as all logs until the next baseline estimate it.
     ``readings`` are the estimates of the logs of the history, in its order, for their flags.
     """
     specs = {mode.name: mode for mode in stage.modes}
-    n_needed, first = stage.description.baseline.logs, history.baseline
-    early = min(first + n_needed, len(history.logs)) - 1
-    ln_f = track.ln_frequency[-1] - track.drift[-1]
+    last = [*history.baselines[1:], len(history.logs)][0] - 1
+    early = min(history.baselines[0] + stage.description.baseline.logs - 1, last)
+    ln_f = track.ln_frequency[last] - track.drift[last]
     estimate = np.array([ln_f, track.ln_damping[early]])
-    std = np.array([track.ln_frequency_std[-1], track.ln_damping_std[early]])
+    std = np.array([track.ln_frequency_std[last], track.ln_damping_std[early]])
     known = [k for k, m in enumerate(track.modes) if m in specs and np.isfinite(ln_f[k])]
     names = [track.modes[k] for k in known]
     off = off_description(stage, names, estimate[:, known], std[:, known])
@@ -167,11 +168,11 @@ def doubt_of_names(
         )
     flags = Counter(
         name
-        for reading in readings[first:]
+        for reading in readings[history.baseline :]
         for name, own in zip(reading.modes.names, reading.modes.flags, strict=True)
         if "doubtful-name" in own.split()
     )
-    n_logs = len(readings) - first
+    n_logs = len(readings) - history.baseline
     often = [f"{name} in {k} of {n_logs} logs" for name, k in flags.items() if 2 * k > n_logs]
     if not often:
         return ""

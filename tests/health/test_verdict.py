@@ -216,6 +216,10 @@ def test_names_are_compared_with_the_description_at_the_baseline_only(stage: Sta
     names = dict(zip(track.modes, track.ln_frequency[0].tolist(), strict=True))
     readings = [make_reading(log, float(k), 0.0, names) for k, log in enumerate(logs(8).logs)]
     assert doubt_of_names(stage, logs(8), track, readings) == ""
+    repaired = replace(logs(8), baselines=(0, 4))
+    since = np.where(np.arange(8)[:, None] < 4, drift, drift - drift[4])
+    again = replace(track, drift=since)
+    assert doubt_of_names(stage, repaired, again, readings) == ""
     off = replace(track, ln_frequency=track.ln_frequency + np.array([0.05, 0.0]))
     doubt = doubt_of_names(stage, logs(8), off, readings)
     declared, found = FREQUENCY[0], FREQUENCY[0] * np.exp(0.05)
