@@ -112,14 +112,17 @@ def print_figure(
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)
         draw(figure)
-        _fix_layout(figure)
         # Directly, because `savefig` draws everything twice.
         canvas: Any
         if kind == "svg":
             canvas = FigureCanvasSVG(figure)
+            figure.dpi = 72  # at which `print_svg` places texts
+            _fix_layout(figure)
+            figure.dpi = _DPI
             canvas.print_svg(target, metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")))
         else:
             canvas = FigureCanvasAgg(figure)
+            _fix_layout(figure)
             canvas.print_png(target, metadata={"Software": None})
     return target.getvalue()
 

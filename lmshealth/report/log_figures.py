@@ -248,13 +248,14 @@ def settling_spectra(log: Log, channels: Sequence[str] | None) -> LogSpectra:
 
 
 def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refusal, ...]:
-    """Append resonances that are not listed, ascending, named by their frequencies."""
-    found = [
-        (one.frequency, replace(one, mode=f"{one.frequency:.4g} Hz"))
-        for one in rejected
-        if one not in listed and one.frequency is not None and one.reason != "not-excited"
-    ]
-    return (*listed, *(one for _, one in sorted(found, key=lambda pair: pair[0])))
+    """Append resonances that are not listed, ascending; name those without one by frequency."""
+    found = [one for one in rejected if one not in listed and one.reason != "not-excited"]
+    found.sort(key=lambda one: one.frequency or 0.0)
+    named = [replace(one, mode="") for one in found if one.frequency]
+    return tuple(
+        replace(one, mode=f"{one.frequency:.4g} Hz") if one.frequency and not one.mode else one
+        for one in (*listed, *named)
+    )
 
 
 def response_figure(
@@ -272,7 +273,7 @@ def response_figure(
     def draw(figure: Figure) -> None:
         panels = list(figure.subplots(3, sharex=True, height_ratios=[2, 1.2, 0.8]))
         points: Any = {"color": figures.MUTED, "ms": 2.5, "lw": 0}
-        fitted: Any = {"color": figures.INK, "lw": 1.2, "label": "fit"}
+        fitted: Any = {"color": figures.GREEN, "lw": 1.4, "label": "fit"}
         x, gain = fit.ordinates.frequency, np.abs(frf.response)
         panels[0].plot(frf.frequency, gain, "o", label="measured", **points)
         panels[0].plot(x, np.abs(fit.response), **fitted)
@@ -370,10 +371,9 @@ def _annotate(
     for refusal in modes.refused:
         at = _place(refusal, stage)
         if at is not None and band[0] <= at <= band[1]:
-            found = refusal.mode.endswith(" Hz")
-            label = "refused candidate" if found else "refused mode, where it is described"
+            style: Any = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
-                ax.axvline(at, color=figures.RED, lw=1, ls=(0, (4, 3)), label=label)
+                ax.axvline(at, **style, label="refused, where found or else sought")
             labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
     panels[-1].set_xlabel("frequency in Hz")
     panels[-1].set_xlim(*band)

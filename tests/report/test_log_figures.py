@@ -73,7 +73,7 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
     away = np.abs(x - 50) > 2
     assert y[away].mean() == pytest.approx(1.0, abs=5 / np.sqrt(away.sum() * 4))
     assert curves["line: mains"].get_xdata() == pytest.approx([50.0])
-    assert curves["refused candidate"].get_xdata() == pytest.approx([80.5, 80.5])
+    assert curves["refused, where found or else sought"].get_xdata() == pytest.approx([80.5, 80.5])
     assert not [line for line in second.lines if line.get_label() == "line: mains"
                 and len(np.asarray(line.get_xdata()))]  # fmt: skip
     (span,) = (p for p in second.patches if "95 %" in str(p.get_label()))
@@ -104,7 +104,7 @@ def test_a_described_mode_that_is_refused_is_drawn_where_it_is_described(log: Lo
     stage = make_stage([("roll", 80.0, 0.02)])
     refusal = Refusal("log", "not-excited", "none", mode=stage.modes[0].name)
     whole = draw(modes_figure(log, read(log, merge([], [], [refusal])), stage))
-    (line,) = (one for one in whole.axes[0].lines if "described" in str(one.get_label()))
+    (line,) = (one for one in whole.axes[0].lines if "refused" in str(one.get_label()))
     assert np.asarray(line.get_xdata()) == pytest.approx(80.0)
     reach = stage.modes[0].search
     assert whole.axes[0].get_xlim() == pytest.approx((80 * (1 - reach), 80 * (1 + reach)))
