@@ -117,14 +117,8 @@ def test_a_key_that_is_missing_is_named_by_its_table(
         ),
         ("name = ", "line 1: no TOML: "),
         ("name = 1\nname = 2", "line 2: no TOML: "),
-        (
-            "# a\nname = [\n1,\n}\n]\nx = 2",
-            "line 2: no TOML: ",
-        ),
-        (
-            'name = """\nno end\n\nx = 2\n',
-            "line 1: no TOML: ",
-        ),
+        ("# a\nname = [\n1,\n}\n]\nx = 2", "line 2: no TOML: "),
+        ('name = """\nno end\n\nx = 2\n', "line 1: no TOML: "),
         ("name = " + 9999 * "[", "no TOML that can be read: it is nested too deeply"),
     ],
 )

@@ -61,11 +61,7 @@ _VERDICTS = {
 # --- Single logs ---
 
 
-def print_modes(
-    rows: Sequence[Row],
-    refused: Sequence[Row],
-    off: Sequence[Row] = (),
-) -> None:
+def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] = ()) -> None:
     """Print modes with their standard deviations, and logs that differ from the description."""
     logs = short_names([row["log"] for row in rows])
     cells = []

@@ -54,7 +54,7 @@ QUICK_SEEDS = 10
 # What does not hold, and why.
 NOT_MET = {
     "wide intervals do not": "0.1 %, one stop: few ordinates give its ambient response, tails are "
-    "heavier than normal ones, and 400 logs do not distinguish 98 % from 95 %",
+    "heavier than normal ones, and 400 logs do not distinguish 98 % from 95 %"
 }
 
 

@@ -192,9 +192,7 @@ def moves(values: Array, at: float, std: float, velocity: Array | None = None) -
 
 
 def modes(
-    n: int,
-    crossings: tuple[float, ...] = CROSSINGS,
-    places: tuple[float, ...] = PLACES_ON_MODE,
+    n: int, crossings: tuple[float, ...] = CROSSINGS, places: tuple[float, ...] = PLACES_ON_MODE
 ) -> Row:
     """Measure by how many σ lines on a mode move it, with lines removed and left in."""
     rows = []

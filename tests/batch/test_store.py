@@ -351,8 +351,7 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
         with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
             file.execute(f"UPDATE identified_{SCHEMA} SET content = ?", (b"nonsense",))
             file.execute(
-                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'",
-                (pack({"stage": 3}),),
+                f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
             )
             file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
         assert got_from(store, "k", "a.h5") is None

@@ -371,10 +371,7 @@ def test_a_cluster_without_workers_is_an_error(
     with Client(cluster.address, timeout=servers.WAIT_S, set_as_default=False) as client:
         servers.wait_until(lambda: not client.nthreads(), "losing the workers")
     monkeypatch.setattr(constants, "SCHEDULER_TIMEOUT_S", 2)
-    with (
-        pytest.raises(SchedulerError, match="has no workers"),
-        workers.cluster(cluster.address),
-    ):
+    with pytest.raises(SchedulerError, match="has no workers"), workers.cluster(cluster.address):
         pass
 
 

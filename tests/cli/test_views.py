@@ -82,9 +82,7 @@ def test_magnitudes_fit_eighty_columns(capsys: pytest.CaptureFixture[str]) -> No
     assert line.count("777") == 7
 
 
-def test_omitted_velocities_are_counted(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_omitted_velocities_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
     """Of twelve velocities seven are shown, the slowest and the fastest among them."""
     print_magnitudes([magnitude("100 Hz", float(v)) for v in range(1, 13)], [], [])
     out = capsys.readouterr().out
@@ -93,9 +91,7 @@ def test_omitted_velocities_are_counted(
     assert (head[1], head[-2]) == ("1", "12")
 
 
-def test_missing_values_are_dashes_and_lines_are_marked(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_missing_values_are_dashes_and_lines_are_marked(capsys: pytest.CaptureFixture[str]) -> None:
     """Unknown velocity is called so, no slope a dash, a line a tilde, listed once."""
     rows = [magnitude("50 Hz", NAN, line="mains", slope=NAN, slope_std=NAN, grows=None)]
     line = {"log": "a.h5", "channel": "acc_feed", "kind": "mains", "frequency_hz": 50.01,
@@ -308,9 +304,7 @@ def test_without_health_only_modes_are_shown(
     assert "No [[parameter]]" in out
 
 
-def test_plans_are_one_table_each_with_reasons(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_plans_are_one_table_each_with_reasons(capsys: pytest.CaptureFixture[str]) -> None:
     """A number of logs or what hinders, dashes for what is not known, what stands for what."""
     asked = {
         "parameter": "p", "loss": 0.05, "power": 0.9, "false_alarm": 0.01, "n_baseline": 7,
@@ -351,9 +345,7 @@ def test_changes_are_in_percent(capsys: pytest.CaptureFixture[str]) -> None:
     assert "nan" not in shown
 
 
-def test_a_too_cautious_filter_is_not_widened(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_a_too_cautious_filter_is_not_widened(capsys: pytest.CaptureFixture[str]) -> None:
     """Logs that vary less than their uncertainty need no missing cause."""
     ln_f = np.tile(np.log(FREQUENCY[:2]), (40, 1))
     ln_zeta = np.tile(np.log(DAMPING[:2]), (40, 1))

@@ -18,12 +18,7 @@ from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import inference
 from lmshealth.health.ensemble_sampling import Sample
-from lmshealth.health.inference import (
-    EpochPosterior,
-    epochs_to_infer,
-    infer,
-    infer_together,
-)
+from lmshealth.health.inference import EpochPosterior, epochs_to_infer, infer, infer_together
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Uniform
@@ -235,10 +230,7 @@ def test_the_baseline_of_a_real_track_is_no_epoch(tmp_path: Path) -> None:
         rng = np.random.default_rng(seed)
         ln_f = np.log(120) + 1e-3 * rng.standard_normal((6, 3))
         history = make_history(
-            ln_f,
-            travel=np.linspace(0, 2e6, 6),
-            std=8e-4,
-            temperature=21 + rng.standard_normal(6),
+            ln_f, travel=np.linspace(0, 2e6, 6), std=8e-4, temperature=21 + rng.standard_normal(6)
         )
         first.append(min(epochs_to_infer(track(history, stage), stage, 100)))
     assert first == [1] * 12

@@ -58,12 +58,7 @@ def test_degraded_is_a_quarter_of_what_may_be_lost(stage: Stage, tmp_path: Path)
 
 @pytest.mark.parametrize(
     ("preload", "mount", "word"),
-    [
-        (0.99, 1.0, "healthy"),
-        (0.8, 0.99, "preload"),
-        (0.98, 0.8, "mount"),
-        (0.7, 0.75, "both"),
-    ],
+    [(0.99, 1.0, "healthy"), (0.8, 0.99, "preload"), (0.98, 0.8, "mount"), (0.7, 0.75, "both")],
 )
 def test_the_verdict_is_that_of_the_draws(
     stage: Stage, preload: float, mount: float, word: str

@@ -259,11 +259,7 @@ def test_velocity_from_position(make):
     """A set point given as position is differentiated, never across a gap."""
     time = np.arange(400) / 2000
     time[250:] += 5 / 2000
-    columns = {
-        "reference_velocity_mm_s": None,
-        "reference_position_mm": 50 * time,
-        "time_s": time,
-    }
+    columns = {"reference_velocity_mm_s": None, "reference_position_mm": 50 * time, "time_s": time}
     np.testing.assert_allclose(read_log(make(columns=columns)).reference_velocity, 0.05)
 
 

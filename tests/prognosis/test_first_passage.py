@@ -9,13 +9,7 @@ from scipy import stats
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis.remaining_life import first_passage
 from lmshealth.prognosis.scenarios import DegradationPath
-from lmshealth.stage.degradation_laws import (
-    AnyLaw,
-    HertzWear,
-    Linear,
-    Loosening,
-    Unchanging,
-)
+from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from tests.oracles import binomial_band
 

@@ -27,14 +27,7 @@ from lmshealth.prognosis.fleet_prior import (
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.scenarios import list_scenarios
-from lmshealth.stage.degradation_laws import (
-    AnyLaw,
-    HertzWear,
-    Linear,
-    Loosening,
-    Power,
-    Unchanging,
-)
+from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
 from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from lmshealth.tracking.history import History

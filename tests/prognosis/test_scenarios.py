@@ -10,13 +10,7 @@ from scipy.optimize import brentq
 from lmshealth._arrays import FloatArray
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.scenarios import DegradationPath, Scenario, list_scenarios
-from lmshealth.stage.degradation_laws import (
-    AnyLaw,
-    HertzWear,
-    Linear,
-    Loosening,
-    Unchanging,
-)
+from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.description import ParameterSpec
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 

@@ -149,11 +149,7 @@ def test_a_report_without_results_or_logs_has_gaps_not_failures(tmp_path: Path) 
     """Without results only the verdict is kept; also without logs."""
     bare = nothing(worn(tmp_path))
     state = reported(bare)
-    assert (state.health, state.remaining, state.service_by) == (
-        {},
-        None,
-        None,
-    )
+    assert (state.health, state.remaining, state.service_by) == ({}, None, None)
     assert sentences(state, state) == [
         "Verdict: still not enough data for a verdict.",
         "Same number of logs.",

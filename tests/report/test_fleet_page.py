@@ -15,11 +15,7 @@ import pytest
 
 from lmshealth._serialize import pack, unpack
 from lmshealth.report.assessment import Assessment, Summary, summarise
-from lmshealth.report.fleet_page import (
-    by_urgency,
-    file_names,
-    write_index,
-)
+from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from studies.scale.rows import TODAY, make_refused, make_rows
 from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
 

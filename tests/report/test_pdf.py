@@ -11,10 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from lmshealth.report.figures import (
-    GREEN,
-    RED,
-)
+from lmshealth.report.figures import GREEN, RED
 from lmshealth.report.rendering import PdfError, write_pdfs
 from tests.assessments import worn, write_report
 

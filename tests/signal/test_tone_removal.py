@@ -259,10 +259,7 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
 @pytest.mark.parametrize("line", [104.0, 104.908, 105.0, 106.2])
 def test_a_line_crossing_a_mode_moves_it_less_than_its_uncertainty(line: float) -> None:
     """A line 100 times above the peak moves f by less than 1σ and ζ by less than 2σ."""
-    stage, log = (
-        make_stage(ROLL),
-        acceleration_log(rng(14), [Mode(105.0, 0.015)], 60, RATE, 0.5),
-    )
+    stage, log = (make_stage(ROLL), acceleration_log(rng(14), [Mode(105.0, 0.015)], 60, RATE, 0.5))
     clean = identify(log, stage)
     values = log.channels[0].values + sine(60_000, RATE, line, 60.0)
     dirty = identify(make_log({"acc_0": values}, RATE), stage)

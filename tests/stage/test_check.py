@@ -280,10 +280,7 @@ def test_a_surrogate_is_judged_by_target_and_logs(fine: StageCheck) -> None:
     slight = replace(fine.modes[0], surrogate_error=0.04 * reached)
     text = merits(replace(fine, modes=(slight, fine.modes[1])))
     assert "1e-05; 4 % of the standard deviation of typical logs. It does not limit" in text
-    for error, needle in (
-        (0.06 * reached, "more than the target of 1e-05"),
-        (2e-3, "grid denser"),
-    ):
+    for error, needle in ((0.06 * reached, "more than the target of 1e-05"), (2e-3, "grid denser")):
         modes = (replace(fine.modes[0], surrogate_error=error), fine.modes[1])
         (text,) = faults(replace(fine, modes=modes))
         assert needle in text

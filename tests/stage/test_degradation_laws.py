@@ -221,10 +221,7 @@ def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
     [
         (lambda: HertzWear(life_km=Uniform(-5.0, -1.0)), "life_km must lie between 0 and inf"),
         (lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)), "exponent needs a range above"),
-        (
-            lambda: Loosening(Lognormal(4000, 1), Uniform(1.3, 2.0)),
-            "floor must lie between",
-        ),
+        (lambda: Loosening(Lognormal(4000, 1), Uniform(1.3, 2.0)), "floor must lie between"),
         (lambda: Loosening(Normal(-9.0, 1.0), Uniform(0.3, 1.0)), "life_km must lie between"),
     ],
 )

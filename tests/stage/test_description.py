@@ -127,8 +127,7 @@ def test_one_thing_chooses_the_service_date(tmp_path: Path) -> None:
     """A risk and a ratio of costs together are refused by line and key; 5 % where neither is."""
     both = "[decision]\nmax_risk = 0.1\ncost_ratio = 20\n"
     with pytest.raises(
-        BadStage,
-        match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 each",
+        BadStage, match=r"line \d+: decision\.cost_ratio: cost_ratio = 20 and max_risk = 0\.1 each"
     ):
         make_stage(tmp_path, tail=both)
     with pytest.raises(BadStage, match=r"line \d+: decision\.cost_ratio: Expected `float` > 1"):

@@ -26,12 +26,7 @@ _PARAMETER = "guide_preload"
 
 
 def _called(
-    rng: np.random.Generator,
-    stage: Stage,
-    loss: float,
-    n_modes: int,
-    n: int,
-    alarm: float = _ALARM,
+    rng: np.random.Generator, stage: Stage, loss: float, n_modes: int, n: int, alarm: float = _ALARM
 ) -> int:
     """Count tests that call a loss of the mount, from single logs."""
     slopes = np.column_stack([SENSITIVITY[p.name][:n_modes] for p in stage.parameters])

@@ -203,11 +203,7 @@ def test_without_nptdms(tmp_path, monkeypatch):
 
 
 SHORT = NOISE[:240]
-CHANNELS = {
-    "delta_e_um": SHORT,
-    "other": np.arange(240, dtype="i2"),
-    "acc_x_g": SHORT.astype("f4"),
-}
+CHANNELS = {"delta_e_um": SHORT, "other": np.arange(240, dtype="i2"), "acc_x_g": SHORT.astype("f4")}
 
 
 def agree(path):

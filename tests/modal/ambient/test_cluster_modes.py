@@ -42,12 +42,7 @@ ALIKE, UNLIKE = [[1.0, 0.5], [1.0, 0.45]], [[1.0, 0.5], [0.5, -1.0]]
 
 @pytest.mark.parametrize(
     ("apart", "shapes", "close"),
-    [
-        (1.2, ALIKE, False),
-        (0.9, ALIKE, True),
-        (0.3, UNLIKE, False),
-        (0.1, UNLIKE, True),
-    ],
+    [(1.2, ALIKE, False), (0.9, ALIKE, True), (0.3, UNLIKE, False), (0.1, UNLIKE, True)],
 )
 def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
     apart: float, shapes: list[list[float]], close: bool

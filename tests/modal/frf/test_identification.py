@@ -16,10 +16,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.io.reading import read_log
-from lmshealth.modal.frf.identification import (
-    FrfReading,
-    read_frf,
-)
+from lmshealth.modal.frf.identification import FrfReading, read_frf
 from lmshealth.modal.naming import name_response, why_unnamed
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named
@@ -469,9 +466,7 @@ def bench(needs: Callable[[str], None], tmp_path: Path) -> Callable[[str], Log]:
 
 
 @pytest.mark.slow
-def test_two_encoders_and_experiments_of_a_linear_guide_agree(
-    bench: Callable[[str], Log],
-) -> None:
+def test_two_encoders_and_experiments_of_a_linear_guide_agree(bench: Callable[[str], Log]) -> None:
     """Friction moves the resonance by 0.3 Hz between experiments: it is within what is stated."""
     found = []
     for name in GUIDE:

@@ -6,13 +6,7 @@ import numpy as np
 import pytest
 
 from models.dynamics.modal_coordinates import diagonalise, frequency_response
-from models.dynamics.plant import (
-    INPUTS,
-    OUTPUTS,
-    closed_loop,
-    closed_loop_modes,
-    sensor_rows,
-)
+from models.dynamics.plant import INPUTS, OUTPUTS, closed_loop, closed_loop_modes, sensor_rows
 from models.dynamics.quantities import Number
 from models.dynamics.servo import TUNINGS, controller, current_loop, servo_matrices
 from models.dynamics.stages import (

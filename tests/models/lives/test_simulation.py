@@ -11,13 +11,7 @@ import pytest
 
 from models.dynamics.plant import closed_loop_modes
 from models.dynamics.stages import STAGES, Condition
-from models.errors import (
-    BadParameter,
-    OccupiedFolder,
-    UnknownFault,
-    UnknownFormat,
-    UnknownLife,
-)
+from models.errors import BadParameter, OccupiedFolder, UnknownFault, UnknownFormat, UnknownLife
 from models.lives.degradation import LIVES
 from models.lives.simulation import Plan, schedule, simulate_life
 from models.recordings.recording import COLUMNS
