@@ -58,6 +58,23 @@ def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     assert answer["weak_mode"]["modes_at_mains"] == 0
 
 
+def test_modes_real_without_a_description(root: Path, needs: Callable[[str], None]) -> None:
+    """A search without a description finds the known modes of real records."""
+    needs("data")
+    answer = json.loads(run_study(root, "modes_real", "blind"))
+    assert all(answer["passed"].values())
+
+
+def test_blind_modes(root: Path) -> None:
+    """Modes that nobody described are found, harmonics that wander are none, peaks fall short."""
+    families = json.loads(run_study(root, "blind_modes"))["families"].values()
+    assert sum(one["found"] for one in families) >= 0.97 * sum(one["there"] for one in families)
+    assert not any(one["wandering_called_modes"] for one in families)
+    controls = [one["others"]["peaks of single channels"] for one in families]
+    found, there, false = (sum(c[key] for c in controls) for key in ("found", "there", "false"))
+    assert found < 0.97 * there or false > 2
+
+
 def test_modes_peers(root: Path, needs: Callable[[str], None]) -> None:
     """No peer is clearly more accurate on the same records, and decomposition is clearly less."""
     needs("peers")
