@@ -152,10 +152,13 @@ def read_ambient(
         sought, tested = _search(log, used, stretches, spectra, band)
         progress("searching", 1, 1)
         harmonics, spectra, unlike = sought.harmonics, sought.spectra, sought.left_out
-        groups = split_groups(sought.modes)
-        for k, group in enumerate(groups):
+        groups: dict[tuple[Target, ...], tuple[Target, ...]] = {}  # by their neighbourhoods
+        for group in split_groups(sought.modes):
+            near = neighbourhood(group, sought.modes)
+            groups[near] = (*groups.get(near, ()), *group)
+        for k, (near, group) in enumerate(groups.items()):
             progress("fitting", k, len(groups))
-            fits += _fit_group(sought, group, neighbourhood(group, sought.modes), top)
+            fits += _fit_group(sought, group, near, top)
         progress("fitting", len(groups), len(groups))
     else:
         fits, known, more = _fit_described(spectra, targets, top)

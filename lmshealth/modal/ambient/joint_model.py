@@ -52,7 +52,7 @@ class JointModel:
         self.data, self.floor = data, floor
         self.f, self.zeta, self.phi, self.r = f, zeta, phi, r
         self.rho = np.zeros_like(phi) if rho is None else rho
-        self.misfit = self._misfit()
+        self.misfit, self._inverse = self._evaluate()
 
     def without(self, i: int) -> JointModel:
         """Return the model without one mode."""
@@ -79,7 +79,7 @@ class JointModel:
 
         The median square of the residual is resistant to lines.
         """
-        g = np.linalg.inv(self.expected())
+        g = self._inverse
         ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / np.einsum("kaa->ka", g).real
         squares = self.data.count[:, None] * (ratio - 1) ** 2
         return np.asarray(np.median(squares, axis=0) / _MEDIAN_SQUARE)
@@ -124,19 +124,21 @@ class JointModel:
         b = (self.phi[:, kept] * h.T[:, None, :] + self.rho[:, kept]) * self.data.scale[:, None]
         return np.asarray((b @ self.r[np.ix_(kept, kept)]) @ np.swapaxes(b.conj(), 1, 2))
 
-    def _misfit(self) -> float:
+    def _evaluate(self) -> tuple[float, ComplexArray]:
+        """Return the negative log posterior, infinite where E is singular, and the inverse of E."""
+        e = self.expected()
         try:
-            e = self.expected()
             root = np.linalg.cholesky(e)
         except np.linalg.LinAlgError:
-            return np.inf
+            return np.inf, e
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2).real).sum(axis=1)
-        white = np.linalg.solve(e, self.data.matrix)
-        value = self.data.count @ (log_det + np.trace(white, axis1=1, axis2=2).real)
+        inverse = np.asarray(np.linalg.inv(e), dtype=np.complex128)
+        # tr E⁻¹ W of Hermitian matrices
+        trace = np.sum(inverse.conj() * self.data.matrix, axis=(1, 2)).real
         prior = np.sum(self.rho**2 / self._rho_variance()[:, None]) + np.sum(
             np.tril(self.r, -1) ** 2
         )
-        return float(value + 0.5 * prior)
+        return float(self.data.count @ (log_det + trace) + 0.5 * prior), inverse
 
     def _rho_variance(self) -> FloatArray:
         return np.asarray(np.mean(self.floor, axis=1))
@@ -162,18 +164,16 @@ class JointModel:
 
     def _refine_floor(self) -> None:
         for _ in range(2):
-            g = np.asarray(np.linalg.inv(self.expected()), dtype=np.complex128)
+            g = self._inverse
             gwg = g @ self.data.matrix @ g
             up = (self.data.count * np.einsum("kaa->ak", gwg).real) @ self.data.basis.T
             down = (self.data.count * np.einsum("kaa->ak", g).real) @ self.data.basis.T
             old = self.floor
             ratio = np.sqrt((up / down).clip(1e-2, 1e2)) ** 1.8
             self.floor = np.maximum(self.floor * ratio, LEAST_FLOOR)
-            value = self._misfit()
-            if value > self.misfit:
+            if not self._improved():
                 self.floor = old
                 break
-            self.misfit = value
 
     def _refine_mode(self, i: int) -> None:
         """Improve pole, shape and static response of a mode, then its share of the forces."""
@@ -181,7 +181,6 @@ class JointModel:
         h = receptance(self.f[i : i + 1, None], self.zeta[i : i + 1, None], self.data.frequency)[
             :3, 0
         ]
-        g = np.asarray(np.linalg.inv(self.expected()), dtype=np.complex128)
         eye = np.eye(n)
         u = np.concatenate(
             [
@@ -191,7 +190,7 @@ class JointModel:
             ],
             axis=2,
         )
-        gradient, fisher = self._score(g, self._columns() @ self.r[:, i], u)
+        gradient, fisher = self._score(self._inverse, self._columns() @ self.r[:, i], u)
         weak = 1 / self._rho_variance()
         gradient[2 + n :] += weak * self.rho[:, i]
         step = _solve(gradient, fisher, np.concatenate([np.zeros(2 + n), weak]))
@@ -217,8 +216,7 @@ class JointModel:
         m = self.f.size
         b = self._columns()
         others = np.arange(m) != i
-        g = np.asarray(np.linalg.inv(self.expected()), dtype=np.complex128)
-        gradient, fisher = self._score(g, b[:, :, i], b[:, :, others])
+        gradient, fisher = self._score(self._inverse, b[:, :, i], b[:, :, others])
         step = _solve(gradient + self.r[i, others], fisher, np.ones(m - 1))
         state = self.r
         for _ in range(_HALVINGS):
@@ -231,10 +229,10 @@ class JointModel:
 
     def _improved(self) -> bool:
         """Return whether the misfit decreased, and keep it if so."""
-        value = self._misfit()
+        value, inverse = self._evaluate()
         better = value < self.misfit
         if better:
-            self.misfit = value
+            self.misfit, self._inverse = value, inverse
         return better
 
     def _score(
