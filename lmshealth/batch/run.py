@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
-from typing import NamedTuple
 
 from lmshealth.batch import constants
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
@@ -153,15 +152,15 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        published = _report(usable, refused, resources, out)
+        summaries, excluded, not_reported = _report(usable, refused, resources, out)
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | published.excluded) & ingested.logs
+    lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
             f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
         )
-    rows = tuple(by_urgency(published.rows.values()))
+    rows = tuple(by_urgency(summaries.values()))
     return RunResult(
         index=write_index(out, rows, refused),
         rows=rows,
@@ -169,7 +168,7 @@ def run(
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
-        failed=failed | published.failed,
+        failed=failed | not_reported,
     )
 
 
@@ -232,18 +231,10 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
     return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
-class _Published(NamedTuple):
-    """Rows of the index by machine, logs excluded from a life, and machines that failed."""
-
-    rows: dict[str, Summary]
-    excluded: set[str]
-    failed: dict[str, str]
-
-
 def _report(
     machines: Sequence[Machine], refused: Sequence[Refusal], resources: Resources, out: Path
-) -> _Published:
-    """Write pages and tables of machines.
+) -> tuple[dict[str, Summary], set[str], dict[str, str]]:
+    """Write pages and tables; return rows of the index, excluded logs, and machines that failed.
 
     Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
@@ -281,7 +272,7 @@ def _report(
                 break
         tables.write()
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    return _Published(rows, excluded, not_updated | unread | failed)
+    return rows, excluded, not_updated | unread | failed
 
 
 def _record(

@@ -181,7 +181,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     """Plot the bands of a health parameter against the odometer; the limit is a fraction."""
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
-    informed = _is_informed(health, parameter)
+    informed = bool(health.publishable_parameters()[column])
     name = "each epoch by itself" if informed else "mostly prior, not measured"
     _bands(ax, health.travel / _KM, bands, name, informed=informed)
     if informed:  # else no values are published
@@ -225,7 +225,7 @@ def plot_life(
     bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
     _bands(ax, travel, bands, "law", informed=True)
     top = 108.0
-    if health is not None and _is_informed(health, parameter):
+    if health is not None and health.publishable_parameters()[health.parameters.index(parameter)]:
         top = max(top, 1.04 * _epochs(ax, health, parameter))
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
@@ -311,12 +311,6 @@ def _levels(ax: Axes, limit: float | None) -> None:
     if limit is not None:
         name = f"limit {100 * limit:.3g} %"
         ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
-
-
-def _is_informed(health: Health, parameter: str) -> bool:
-    """Return whether the data of the last epoch determine a parameter."""
-    informed = dict(zip(health.parameters, health.publishable_parameters(), strict=True))
-    return bool(informed.get(parameter, False))
 
 
 def _epochs(ax: Axes, health: Health, parameter: str) -> float:

@@ -6,12 +6,11 @@ import hashlib
 import re
 from base64 import b64encode
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
 from importlib import resources
 from pathlib import Path
-from typing import Any
 
 from lmshealth._files import write_text
 from lmshealth.io.log import Refusal
@@ -73,6 +72,10 @@ def write_index(
         templates = resources.files("lmshealth") / "report" / "templates"
         script = (templates / "index.js").read_text(encoding="utf-8")
     newest = max((one.last_log for one in ranked), default=date.min)
+    by_reason = [
+        (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])
+        for reason, count in Counter(one.reason for one in refused).most_common()
+    ]
     text = render(
         "index.html.j2",
         generated,
@@ -83,7 +86,7 @@ def write_index(
         bar=constants.FLEET_BAR,
         months=_months(ranked, newest) if script else [],
         newest=newest,
-        refused=list(_by_reason(refused)),
+        refused=by_reason,
         fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
         script_hash=b64encode(hashlib.sha256(script.encode()).digest()).decode() if script else "",
@@ -107,10 +110,3 @@ def _months(summaries: Sequence[Summary], newest: date) -> list[Month]:
         months.append(Month(f"{begin:%b}", year, after, counts[begin]))
         begin = after
     return months if any(month.count for month in months) else []
-
-
-def _by_reason(refused: Sequence[Refusal]) -> Iterator[dict[str, Any]]:
-    """Group refused logs by reason, the most frequent reason first."""
-    for reason, count in Counter(item.reason for item in refused).most_common():
-        shown = [item for item in refused if item.reason == reason][: constants.REFUSED_SHOWN]
-        yield {"reason": reason, "count": count, "shown": shown}

@@ -272,21 +272,17 @@ def prognosis_rows(
     """
     rows = []
     for j, one in enumerate(life.limits):
-        last = one.parameter == "any"
-        row: Row = {"stage": life.stage, "parameter": one.parameter, "limit": one.limit}
-        in_units = {"km": np.array(one.travel) / _KM, "hours": 24 * np.array(one.days)}
-        for unit, values in (in_units | {"days": np.array(one.days)}).items():
-            for level, value in zip(RUL_LEVELS, values.tolist(), strict=True):
-                row[f"rul_{unit}_q{100 * level:02.0f}"] = None if np.isinf(value) else value
+        days = np.array(one.days)
+        quantiles = np.concatenate([np.array(one.travel) / _KM, 24 * days, days]).tolist()
         pairs = zip(RUL_LEVELS, one.days, strict=True)
-        row |= {
-            "censored_from": next((level for level, days in pairs if np.isinf(days)), None),
-            "probability_beyond_horizon": one.beyond_horizon,
-            "probability_already_past": one.already_past,
-            "service": service.kind if last else None,
-            "service_by": service.by if last else None,
-            "service_risk": service.risk if last else None,
-        }
+        values = (
+            *(life.stage, one.parameter, one.limit),
+            *(None if np.isinf(value) else value for value in quantiles),
+            next((level for level, wait in pairs if np.isinf(wait)), None),
+            *(one.beyond_horizon, one.already_past),
+            *((service.kind, service.by, service.risk) if one.parameter == "any" else [None] * 3),
+        )
+        (row,) = _rows("prognosis", [values])
         if before is not None:
             day, reached = before
             at_least, at_most = reached.at_least[j], reached.at_most[j]

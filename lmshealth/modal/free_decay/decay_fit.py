@@ -16,7 +16,6 @@ from scipy.special import softmax
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.free_decay.transient_likelihood import (
-    BlockFit,
     DecaySpectra,
     Evaluation,
     IntArray,
@@ -186,25 +185,19 @@ def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) ->
 
     Returns the covariance of the free parameters, shape ``(n_free, n_free)``.
     """
-    try:
-        factor = np.linalg.cholesky(_hessian(likelihood, optimum, free))
-    except np.linalg.LinAlgError:
-        factor = np.linalg.cholesky(optimum.at.fisher[np.ix_(free, free)])
-    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
-
-
-def _hessian(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
-    """Differentiate the gradient by some parameters, shape ``(n_free, n_free)``."""
     p = optimum.p
-    scale = 1 / np.sqrt(np.diag(likelihood.metric(optimum.at)))
-    reach = likelihood.reach(p)
-    rows = []
+    scale, reach = 1 / np.sqrt(np.diag(likelihood.metric(optimum.at))), likelihood.reach(p)
+    rows = []  # differences of the gradient
     for j in free:
         step = np.zeros(p.size)
         step[j] = _DIFFERENCE * min(scale[j], reach[j])
         up, down = likelihood.evaluate(p + step), likelihood.evaluate(p - step)
         rows.append((up.gradient - down.gradient)[free] / (2 * step[j]))
-    return np.asarray(np.add(rows, np.transpose(rows)) / 2)
+    try:
+        factor = np.linalg.cholesky(np.add(rows, np.transpose(rows)) / 2)
+    except np.linalg.LinAlgError:
+        factor = np.linalg.cholesky(optimum.at.fisher[np.ix_(free, free)])
+    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -290,7 +283,9 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
     The result has no modes where the band holds only noise.
     """
     n = blocks[0].ordinates.shape[2]
-    levels = np.log(_levels(blocks))
+    # The level of the noise between the peaks of each channel.
+    medians = [np.median(np.abs(block.ordinates) ** 2, axis=(0, 1)) for block in blocks]
+    levels = np.log(np.mean(medians, axis=0) / np.log(2))
     likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
     start = np.concatenate([levels, np.zeros(n)])
     found = DecayFit(likelihood, maximise(likelihood, start, np.arange(2 * n)))
@@ -306,12 +301,6 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
             break
         found = more
     return found
-
-
-def _levels(blocks: tuple[DecaySpectra, ...]) -> FloatArray:
-    """Return the level of the noise between the peaks of each channel."""
-    medians = [np.median(np.abs(block.ordinates) ** 2, axis=(0, 1)) for block in blocks]
-    return np.asarray(np.mean(medians, axis=0) / np.log(2))
 
 
 def _best_pole(found: DecayFit) -> tuple[float, float]:
@@ -352,25 +341,17 @@ def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
         shapes=np.concatenate([before.shapes, np.ones((1, before.n_channels))]),
         units=np.append(before.units, unit),
     )
-    without = np.delete(np.arange(start.size), 3 * m + 2)
-    first = DecayFit(
-        likelihood, maximise(likelihood, likelihood.clip(start), without, tolerance=_ROUGH)
-    )
-    shape = _shape(np.concatenate(first.sizes(m), axis=1), first.white_level())
-    shapes = np.concatenate([before.shapes, shape[None]])
-    likelihood = replace(likelihood, shapes=shapes)
+    without, start = np.delete(np.arange(start.size), 3 * m + 2), likelihood.clip(start)
+    first = DecayFit(likelihood, maximise(likelihood, start, without, tolerance=_ROUGH))
+    # The real shape that its decays have in common.
+    scale, sizes = np.sqrt(first.white_level()), np.concatenate(first.sizes(m), axis=1)
+    seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
+    shape = np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale
+    likelihood = replace(likelihood, shapes=np.concatenate([before.shapes, shape[None]]))
     start = first.optimum.p + 0.0
     start[3 * m + 2] = _FIRST_LEVEL
-    return DecayFit(
-        likelihood, maximise(likelihood, start, np.arange(start.size), tolerance=_ROUGH)
-    )
-
-
-def _shape(sizes: ComplexArray, noise: FloatArray) -> FloatArray:
-    """Return the common real shape of a mode's decays."""
-    scale = np.sqrt(noise)
-    seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
-    return np.asarray(np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale)
+    free = np.arange(start.size)
+    return DecayFit(likelihood, maximise(likelihood, start, free, tolerance=_ROUGH))
 
 
 def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstimate:
@@ -408,29 +389,19 @@ def stationarity(found: DecayFit) -> float:
     Noise whose power varies over the record correlates neighbouring ordinates. The lag-one products
     of the whitened residual are compared with those of white noise after the same fit.
     """
-    total = np.zeros((3, 2))
+    n = found.likelihood.n_channels
+    seen, expected, variance = np.zeros((3, 2))  # of the products, real and imaginary
     for fit in found.optimum.at.fits:
-        total += _lag_one(fit, found.likelihood.n_channels)
-    return float(stats.chi2.sf(np.sum((total[0] - total[1]) ** 2 / total[2]), 2))
-
-
-def _lag_one(fit: BlockFit, n: int) -> FloatArray:
-    """Return lag-one products, real and imaginary: found, expected, variance; ``(3, 2)``."""
-    found = np.empty((3, 2))
-    for k, turn in enumerate((1.0, -1j)):
-        moved_residual = _neighbours(fit.residual, n, turn)
-        moved_removed = _neighbours(fit.removed, n, turn)
-        n_segments = fit.residual.shape[1]
-        n_rows = fit.residual.shape[0]
-        inner = fit.removed.T @ moved_removed
-        # tr(A²) of the symmetric shift: half of the ordinates that have a neighbour, twice.
-        whole = n_rows / 2 - n
-        found[0, k] = np.sum(fit.residual * moved_residual)
-        found[1, k] = -0.5 * n_segments * np.trace(inner)
-        found[2, k] = (
-            0.5 * n_segments * (whole - 2 * np.sum(moved_removed**2) + np.sum(inner * inner.T))
-        )
-    return found
+        n_rows, n_segments = fit.residual.shape
+        for k, turn in enumerate((1.0, -1j)):
+            moved = _neighbours(fit.removed, n, turn)
+            inner = fit.removed.T @ moved
+            seen[k] += np.sum(fit.residual * _neighbours(fit.residual, n, turn))
+            expected[k] += -0.5 * n_segments * np.trace(inner)
+            # tr(A²) of the symmetric shift: half of the ordinates that have a neighbour, twice.
+            spread = n_rows / 2 - n - 2 * np.sum(moved**2) + np.sum(inner * inner.T)
+            variance[k] += 0.5 * n_segments * spread
+    return float(stats.chi2.sf(np.sum((seen - expected) ** 2 / variance), 2))
 
 
 def _neighbours(rows: FloatArray, n: int, turn: complex) -> FloatArray:
