@@ -7,6 +7,7 @@ import math
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from string import Formatter
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
@@ -15,12 +16,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from lmshealth.report.text import plain
+from lmshealth.report.text import fixed, number, percent, plain
 
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.report.tables import Row
 
 _WIDTH = 78
+_REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
 # Names up to this length are not split in a table that is too wide.
 _NAME = 16
 
@@ -66,10 +68,33 @@ def print_text(text: str, mark: str = "") -> None:
 def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons."""
     logs = short_names([row["log"] for row in rows])
-    names = ("log", "channel", "mode", "reason", "detail")
-    cells = [{name: row[name] for name in names} | {"log": logs[row["log"]]} for row in rows]
     if rows:
-        print_table("Refused", cells, len(names))
+        shown = [row | {"log": logs[row["log"]]} for row in rows]
+        print_table("Refused", cells(_REFUSED, shown), 5)
+
+
+class _Numbers(Formatter):
+    """Format strings with numbers of `lmshealth.report.text`; a missing one is a dash.
+
+    ``n`` is for significant digits, ``%`` for a share in percent, ``p`` for one without the sign.
+    """
+
+    def format_field(self, value: Any, spec: str) -> str:
+        if value is None or value != value:  # NaN
+            return "–"
+        if spec.endswith("n"):
+            return number(value, int(spec[1:-1]))
+        if spec.endswith("p"):
+            return fixed(100 * value, int(spec[1:-1]))
+        return percent(value, int(spec[1:-1])) if spec.endswith("%") else format(value, spec)
+
+
+def cells(columns: str, rows: Iterable[Row]) -> list[dict[str, str]]:
+    """Format the cells of a table with columns ``heading {key:format}``, separated by bars."""
+    split = [column.partition("{") for column in columns.split("|")]
+    forms = {head.strip(): (start + rest).strip() for head, start, rest in split}
+    fill = _Numbers().vformat
+    return [{head: fill(form, (), row) for head, form in forms.items()} for row in rows]
 
 
 def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:

@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from datetime import date
-from itertools import combinations
+from itertools import combinations, permutations, zip_longest
 from typing import TYPE_CHECKING
 
 import click
 
-from lmshealth.cli.terminal import print_refused, print_table, print_text, short_names
+from lmshealth.cli.terminal import cells, print_refused, print_table, print_text, short_names
 from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
     change,
     day,
-    exponent,
     fixed,
     in_brackets,
     interval,
@@ -57,6 +56,56 @@ _VERDICTS = {
     "not-told": "not identifiable",
 }
 
+# Columns of the tables, as `cells` reads them.
+_MODES = (
+    "log {log} | mode {mode} | channel {channel} | frequency Hz {frequency} | "
+    "damping % {damping_ratio:.2p} ± {damping_ratio_std:.2p} | SNR {snr:.3n} | flags {flags}"
+)
+_OFF = (
+    "log {log} | mode {mode} | declared Hz {declared_hz:.3f} | found Hz {found_hz:.3f} | "
+    "off % {off} | declared damping % {declared_damping_ratio:.2p} | "
+    "found damping % {found_damping_ratio:.2p}"
+)
+_ERROR = (
+    "mm/s {velocity_mm_s:.3n} | s {duration_s:.3n} | min {min_um:.3n} | max {max_um:.3n} | "
+    "std {std_um:.3n} | mean {mean_um:.3n}"
+)
+_STRONGEST = (
+    "number {n_harmonics} | max µm {max_magnitude_um:.3n} | at Hz {strongest_hz:.4n} | "
+    "bandwidth Hz {bandwidth_hz:.4n} | share {share_explained:.1%}"
+)
+_ABOVE_FLOOR = (
+    "number {n_above_floor} | bandwidth Hz {bandwidth_above_floor_hz:.4n} | "
+    "share {share_explained_above_floor:.1%}"
+)
+_STAGE_MODES = (
+    "mode {mode} | tracked {answer} | Hz {frequency_hz:.1f} | "
+    "search band {searched_low_hz:.0f}-{searched_high_hz:.0f} | map Hz {map_hz:.1f} | "
+    "at limits {map_at_limits_hz:.1f} | map error {surrogate_error_ln_f:.1e} | "
+    "drift std {logs_reach_ln_f:.1e}"
+)
+_COVERAGE = (
+    "parameter {parameter} | baseline {baseline:g} | limit {limit:g} | "
+    "prior 90 % {prior_q05:.3g}-{prior_q95:.3g} | map {map_low:.3g}-{map_high:.3g} | "
+    "prior outside {outside:.1%}"
+)
+_IDENTIFIABILITY = (
+    "parameter {parameter} | prior {prior_std_ln:.1%} | logs {logs_std_ln:.1%} | "
+    "endless logs {endless_logs_std_ln:.1%} | informed {informed:.1%} | {answer}"
+)
+_PLAN = (
+    "s per log {seconds_per_log:g} | logs {n_logs} | power, 1 log {power_of_one_log:.1%} | "
+    "loss, 1 log {smallest_loss_of_one_log:.1%} | loss, N logs {smallest_loss:.1%}"
+)
+_TRACK = (
+    "mode {mode} | frequency Hz {frequency_hz:.3f} ± {frequency_std_hz:.3f} | drift {drift} | "
+    "damping ratio {damping}"
+)
+_HEALTH = (
+    "parameter {parameter} | median {median:.3f} | 90 % interval {interval} | "
+    "informed {informed:.0%} | prior × 2 {prior} | ESS {ess:.0f} | R-hat {r_hat:.3f}"
+)
+
 
 # --- Single logs ---
 
@@ -64,43 +113,26 @@ _VERDICTS = {
 def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] = ()) -> None:
     """Print modes with their standard deviations, and logs that differ from the description."""
     logs = short_names([row["log"] for row in rows])
-    cells = []
+    shown = []
     for row in rows:
-        frequency, std, damping = row["frequency_hz"], row["frequency_std_hz"], row["damping_ratio"]
-        cells.append(
-            {
-                "log": logs[row["log"]],
-                "mode": row["mode"],
-                "channel": row["channel"],
-                "frequency Hz": f"{number(frequency, 4)} ± {number(std, 2)}"
-                if std >= 1
-                else f"{fixed(frequency, 3)} ± {fixed(std, 3)}",
-                "damping %": f"{100 * damping:.2f} ± {100 * row['damping_ratio_std']:.2f}",
-                "SNR": number(row["snr"]),
-                "flags": row["flags"],
-            }
-        )
+        frequency, std = row["frequency_hz"], row["frequency_std_hz"]
+        text = f"{fixed(frequency, 3)} ± {fixed(std, 3)}"
+        if std >= 1:
+            text = f"{number(frequency, 4)} ± {number(std, 2)}"
+        shown.append(row | {"log": logs[row["log"]], "frequency": text})
     if rows:
-        print_table("Modes (± one standard deviation)", cells, 3)
-        present = {flag for row in rows for flag in row["flags"].split()}
-        for flag in sorted(present):
+        print_table("Modes (± one standard deviation)", cells(_MODES, shown), 3)
+        for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
             print_text(f"{flag}: {_FLAGS[flag]}")
     else:
         print_text("No modes found.")
-    cells = [
-        {
-            "log": logs[row["log"]],
-            "mode": row["mode"],
-            "declared Hz": fixed(row["declared_hz"], 3),
-            "found Hz": fixed(row["found_hz"], 3),
-            "off %": signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1),
-            "declared damping %": fixed(100 * row["declared_damping_ratio"], 2),
-            "found damping %": fixed(100 * row["found_damping_ratio"], 2),
-        }
-        for row in off
-    ]
-    if cells:
-        print_table("Warning: the description differs; a mode may have a wrong name", cells, 2)
+    shown = []
+    for row in off:
+        percents = signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1)
+        shown.append(row | {"log": logs[row["log"]], "off": percents})
+    if shown:
+        title = "Warning: the description differs; a mode may have a wrong name"
+        print_table(title, cells(_OFF, shown), 2)
         print_text(
             "A new machine agrees with its description: correct it, or describe the modes that it "
             "lacks. Compare a worn machine with its baseline."
@@ -113,7 +145,7 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
     if not rows:
         print_text("No mode shapes: they need the fit of segments of constant velocity.")
     logs = short_names([row["log"] for row in rows])
-    cells = [
+    shapes = [
         {
             "log": logs[row["log"]],
             "mode": row["mode"],
@@ -125,25 +157,25 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
         for key, amplitude in row.items()
         if key.startswith("amplitude_") and amplitude is not None
     ]
-    if cells:
-        print_table("Mode shapes (accelerations relative to the largest)", cells, 3)
-    of_pair = {(pair["log"], pair["mode_a"], pair["mode_b"]): pair["mac"] for pair in pairs}
+    if shapes:
+        print_table("Mode shapes (accelerations relative to the largest)", shapes, 3)
+    mac = {
+        (pair["log"], *modes): pair["mac"]
+        for pair in pairs
+        for modes in permutations((pair["mode_a"], pair["mode_b"]))
+    }
+    title = "Phase collinearity (MPC) and modal assurance criterion (MAC)"
     for log in logs:
         own = [row for row in rows if row["log"] == log]
+        names = [row["mode"] for row in own]
         for first in range(0, len(own), _MATRIX):
-            some = [row["mode"] for row in own[first : first + _MATRIX]]
-            cells = []
+            matrix = []
             for row in own:
                 cell = {"log": logs[log], "mode": row["mode"], "MPC": _criterion(row["mpc"])}
-                for name in some:
-                    mac = of_pair.get((log, *sorted((row["mode"], name), key=_order(own))), 1.0)
-                    cell[name] = _criterion(mac)
-                cells.append(cell)
-            print_table("Phase collinearity (MPC) and modal assurance criterion (MAC)", cells, 2)
-
-
-def _order(rows: Sequence[Row]) -> Callable[[str], int]:
-    return [row["mode"] for row in rows].index
+                for name in names[first : first + _MATRIX]:
+                    cell[name] = _criterion(mac.get((log, row["mode"], name), 1.0))
+                matrix.append(cell)
+            print_table(title, matrix, 2)
 
 
 def _criterion(value: float | None) -> str:
@@ -163,7 +195,7 @@ def print_frf(
 
 def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // constants.TERMINAL_LINES))
-    cells = [
+    lines = [
         {
             "Hz": f"{row['frequency_hz']:.5g}",
             "gain"
@@ -175,20 +207,18 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
         }
         for row in frf[step // 2 :: step]
     ]
-    title = f"Response of {fit['output']} to {fit['input']}, {len(cells)} of {len(frf)} lines"
-    print_table(title, cells, 0)
+    title = f"Response of {fit['output']} to {fit['input']}, {len(lines)} of {len(frf)} lines"
+    print_table(title, lines, 0)
     n = fit["n_averages"]
+    noise = "its noise is unknown and taken from the residual of the fit."
+    if math.isfinite(fit["chi_square"]):
+        noise = f"its noise follows from the coherence of {n:.0f} averages."
     methods = {
         "segments": f"H1 of {n:.0f} segments: the input is not periodic.",
         "periods": f"Mean of {n:.0f} periods of {fit['period_s']:.6g} s.",
         "blows": f"H1 of {fit['note']}",
-        "measured": "Measured response in the units of the file; ",
+        "measured": f"Measured response in the units of the file; {noise}",
     }
-    methods["measured"] += (
-        f"its noise follows from the coherence of {n:.0f} averages."
-        if math.isfinite(fit["chi_square"])
-        else "its noise is unknown and taken from the residual of the fit."
-    )
     print_text(methods[fit["method"]])
     if fit["distortion"] > 0:
         print_text(
@@ -206,48 +236,29 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
 def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence[Row]) -> None:
     """Print the following error: statistics and strongest harmonics."""
     if rows:
-        columns = {"mm/s": "velocity_mm_s", "s": "duration_s", "min": "min_um", "max": "max_um"}
-        columns |= {"std": "std_um", "mean": "mean_um"}
-        _print_statistics("Following error (µm)", rows, columns)
-        columns = {"number": "n_harmonics", "max µm": "max_magnitude_um", "at Hz": "strongest_hz"}
-        columns |= {"bandwidth Hz": "bandwidth_hz", "share": "share_explained"}
-        _print_statistics("Strongest harmonics", rows, columns)
-        columns = {"number": "n_above_floor", "bandwidth Hz": "bandwidth_above_floor_hz"}
-        columns |= {"share": "share_explained_above_floor"}
-        _print_statistics(f"Those above {rows[0]['floor_nm']:g} nm", rows, columns)
+        logs = short_names([row["log"] for row in rows])
+        shown = [row | {"log": logs[row["log"]]} for row in rows]
+        several = len({row["channel"] for row in rows}) > 1
+        names = "log {log} | channel {channel} | " if several else "log {log} | "
+        for title, columns in (
+            ("Following error (µm)", _ERROR),
+            ("Strongest harmonics", _STRONGEST),
+            (f"Those above {rows[0]['floor_nm']:g} nm", _ABOVE_FLOOR),
+        ):
+            print_table(title, cells(names + columns, shown), 2 if several else 1)
         print_text(
             "bandwidth: highest minus lowest frequency; share: of the variance they explain."
         )
-        _print_harmonics(rows, harmonics)
+        if harmonics:
+            _print_harmonics(rows, harmonics)
     print_refused(refused)
-
-
-def _print_statistics(title: str, rows: Sequence[Row], columns: dict[str, str]) -> None:
-    logs = short_names([row["log"] for row in rows])
-    several = len({row["channel"] for row in rows}) > 1
-    cells = [
-        {"log": logs[row["log"]]}
-        | ({"channel": row["channel"]} if several else {})
-        | {head: _statistic(key, row[key]) for head, key in columns.items()}
-        for row in rows
-    ]
-    print_table(title, cells, 2 if several else 1)
-
-
-def _statistic(key: str, value: float) -> str:
-    if key.startswith("n_"):
-        return str(value)
-    if key.startswith("share"):
-        return percent(value, 1)
-    return number(value, 4 if key.endswith("_hz") else 3)
 
 
 def _print_harmonics(rows: Sequence[Row], harmonics: Sequence[Row]) -> None:
     """Print harmonics, strongest first: all of a single channel, else the first of each."""
     logs = short_names([row["log"] for row in rows])
     most = constants.TERMINAL_HARMONICS if len(rows) > 1 else len(harmonics)
-    if harmonics:
-        print_text("Strongest harmonics, Hz (amplitude in µm):")
+    print_text("Strongest harmonics, Hz (amplitude in µm):")
     for row in rows:
         own = [h for h in harmonics if (h["log"], h["channel"]) == (row["log"], row["channel"])]
         listed = ", ".join(
@@ -277,36 +288,33 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
 
 def _print_channel(title: str, rows: Sequence[Row]) -> None:
     """Print a table of bands by velocities: magnitudes, or RMS of health and watched bands."""
-    cells: dict[str, dict[float, list[float]]] = {}
-    lines: set[tuple[str, float]] = set()
+    at: dict[tuple[str, float], list[Row]] = {}
     for row in rows:
-        key = "rms_mm_s2" if row["kind"] in ("health", "watch") else "magnitude_mm_s2"
         speed = row["velocity_mm_s"]
         speed = -1.0 if math.isnan(speed) else float(f"{speed:.2g}")
-        cells.setdefault(row["band"], {}).setdefault(speed, []).append(row[key])
-        if row["line"] and key == "magnitude_mm_s2":
-            lines.add((row["band"], speed))
-    speeds = sorted({speed for own in cells.values() for speed in own})
+        at.setdefault((row["band"], speed), []).append(row)
+    speeds = sorted({speed for _, speed in at})
     left_out = len(speeds) - constants.TERMINAL_VELOCITIES
     if left_out > 0:
         step = (len(speeds) - 1) / (constants.TERMINAL_VELOCITIES - 1)
         speeds = [speeds[round(k * step)] for k in range(constants.TERMINAL_VELOCITIES)]
         title += f" ({left_out} more velocities in csv and json)"
-    kinds = {row["band"]: row for row in rows}
     table = []
-    for band, own in cells.items():
-        levels = {
-            "unknown" if v < 0 else f"{v:g}": _mean(own.get(v, []))
-            + ("~" if (band, v) in lines else " ")
-            for v in speeds
-        }
-        row = kinds[band]
-        in_hz = f"RMS {row['low_hz']:g}-{row['high_hz']:g}"
-        name = band if row["kind"] in ("mode", "grid") else in_hz
-        slope = "–"
+    for band, row in {row["band"]: row for row in rows}.items():
+        name, key = band, "magnitude_mm_s2"
+        if row["kind"] in ("health", "watch"):
+            name, key = f"RMS {row['low_hz']:g}-{row['high_hz']:g}", "rms_mm_s2"
+        cell = {"band": name}
+        for speed in speeds:
+            own = at.get((band, speed), [])
+            is_line = key == "magnitude_mm_s2" and any(row["line"] for row in own)
+            level = _mean([row[key] for row in own])
+            cell["unknown" if speed < 0 else f"{speed:g}"] = level + ("~" if is_line else " ")
+        cell["grows"] = "–"
         if row["grows"] is not None:
-            slope = f"{row['slope']:.2f}±{row['slope_std']:.2f}{'*' if row['grows'] else ' '}"
-        table.append({"band": name, **levels, "grows": slope})
+            star = "*" if row["grows"] else " "
+            cell["grows"] = f"{row['slope']:.2f}±{row['slope_std']:.2f}{star}"
+        table.append(cell)
     print_table(f"{title}: mm/s² at velocities in mm/s", table)
     _print_places([row for row in rows if row["kind"] == "mode"])
 
@@ -322,13 +330,11 @@ def _print_places(rows: Sequence[Row]) -> None:
         strongest = _range([row["strongest_hz"] for row in own])
         found.append(f"{band} at {strongest} Hz (band {ends} Hz, {how})")
     if found:
-        print_text(f"Strongest harmonic of {'; '.join(found)}.")
-        click.echo()
+        print_text(f"Strongest harmonic of {'; '.join(found)}.\n")
 
 
 def _range(values: Sequence[float]) -> str:
-    ends = [f"{end:.0f}" for end in (min(values), max(values))]
-    return " to ".join(dict.fromkeys(ends))
+    return " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(values), max(values))))
 
 
 def _mean(values: Sequence[float]) -> str:
@@ -341,7 +347,7 @@ def _print_lines(lines: Sequence[Row]) -> None:
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for row in lines:
         groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
-    cells = [
+    shown = [
         {
             "channel": channel,
             "kind": kind,
@@ -351,7 +357,7 @@ def _print_lines(lines: Sequence[Row]) -> None:
         }
         for (channel, kind, _), rows in sorted(groups.items())
     ]
-    print_table("Lines", cells, 2)
+    print_table("Lines", shown, 2)
 
 
 # --- Stage descriptions and plans ---
@@ -359,74 +365,35 @@ def _print_lines(lines: Sequence[Row]) -> None:
 
 def print_stage(content: dict[str, list[Row]]) -> None:
     """Print the modes, parameters, sensitivities and findings of a stage description."""
-    (stage,), parameters = content["stage"], content["parameters"]
-    cells = [
-        {
-            "mode": row["mode"],
-            "tracked": "yes" if row["tracked"] else "no",
-            "Hz": f"{row['frequency_hz']:.1f}",
-            "search band": f"{row['searched_low_hz']:.0f}-{row['searched_high_hz']:.0f}",
-            "map Hz": fixed(row["map_hz"], 1),
-            "at limits": fixed(row["map_at_limits_hz"], 1),
-            "map error": exponent(row["surrogate_error_ln_f"]),
-            "drift std": exponent(row["logs_reach_ln_f"]),
-        }
-        for row in content["modes"]
-    ]
-    print_table(f"{stage['name']}: modes", cells, 2)
+    (stage,) = content["stage"]
+    modes = [row | {"answer": "yes" if row["tracked"] else "no"} for row in content["modes"]]
+    print_table(f"{stage['name']}: modes", cells(_STAGE_MODES, modes), 2)
+    parameters = []
+    for row in content["parameters"]:
+        outside = row["prior_below_map"] + row["prior_above_map"]
+        parameters.append(row | {"outside": outside, "answer": _VERDICTS[row["verdict"]]})
     if parameters:
-        _print_coverage(parameters)
-        _print_identifiability(stage, parameters)
+        print_table("Health parameters", cells(_COVERAGE, parameters))
+        print_table("Standard deviation of the parameters", cells(_IDENTIFIABILITY, parameters))
+        print_text(
+            f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the "
+            "baseline, averaged over the priors (Cramér-Rao bound). map error: of ln f. drift std: "
+            "of the drift of ln f between these two groups. informed: expected share of the prior "
+            "variance of the ln parameter that the logs remove; identifiable from 50 % on.\n"
+        )
         _print_sensitivities(content)
     for row in content["findings"]:
         print_text(row["text"], "+ " if row["good"] else "! ")
 
 
-def _print_coverage(parameters: Sequence[Row]) -> None:
-    cells = [
-        {
-            "parameter": row["parameter"],
-            "baseline": f"{row['baseline']:g}",
-            "limit": "–" if row["limit"] is None else f"{row['limit']:g}",
-            "prior 90 %": f"{row['prior_q05']:.3g}-{row['prior_q95']:.3g}",
-            "map": f"{row['map_low']:.3g}-{row['map_high']:.3g}",
-            "prior outside": percent(row["prior_below_map"] + row["prior_above_map"], 1),
-        }
-        for row in parameters
-    ]
-    print_table("Health parameters", cells)
-
-
-def _print_identifiability(stage: Row, parameters: Sequence[Row]) -> None:
-    cells = [
-        {
-            "parameter": row["parameter"],
-            "prior": percent(row["prior_std_ln"], 1),
-            "logs": percent(row["logs_std_ln"], 1),
-            "endless logs": percent(row["endless_logs_std_ln"], 1),
-            "informed": percent(row["informed"], 1),
-            "": _VERDICTS[row["verdict"]],
-        }
-        for row in parameters
-    ]
-    print_table("Standard deviation of the parameters", cells)
-    print_text(
-        f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline, "
-        "averaged over the priors (Cramér-Rao bound). map error: of ln f. drift std: of the drift "
-        "of ln f between these two groups. informed: expected share of the prior variance of the "
-        "ln parameter that the logs remove; identifiable from 50 % on."
-    )
-    click.echo()
-
-
 def _print_sensitivities(content: dict[str, list[Row]]) -> None:
-    cells: dict[str, dict[str, str]] = {}
+    modes: dict[str, dict[str, str]] = {}
     for row in content["sensitivities"]:
         ends = [number(row[key], 2) for key in ("at_baseline", "at_limits")]
-        own = cells.setdefault(row["mode"], {"mode": row["mode"]})
+        own = modes.setdefault(row["mode"], {"mode": row["mode"]})
         own[row["parameter"]] = " → ".join(ends)
     title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
-    print_table(title, list(cells.values()))
+    print_table(title, list(modes.values()))
     for row in content["correlations"]:
         pair = f"{row['parameter_a']} and {row['parameter_b']}"
         click.echo(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
@@ -436,17 +403,9 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
     """Print the number of logs needed per length of log, one table per loss to detect."""
     for asked in detect:
-        name, n_baseline = asked["parameter"], asked["n_baseline"]
-        cells = [
-            {
-                "s per log": f"{row['seconds_per_log']:g}",
-                "logs": _HINDRANCES[row["hindrance"]][0]
-                if row["hindrance"]
-                else str(row["n_logs"]),
-                "power, 1 log": percent(row["power_of_one_log"], 1),
-                "loss, 1 log": percent(row["smallest_loss_of_one_log"], 1),
-                f"loss, {n_baseline} logs": percent(row["smallest_loss"], 1),
-            }
+        name = asked["parameter"]
+        rows = [
+            row | ({"n_logs": _HINDRANCES[row["hindrance"]][0]} if row["hindrance"] else {})
             for row in plan
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
@@ -454,13 +413,11 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             f"{name}: to detect a loss of {percent(asked['loss'], 1)} with power "
             f"{asked['power']:g}, false-alarm probability {asked['false_alarm']:g}"
         )
-        print_table(title, cells, 0)
+        columns = _PLAN.replace("N logs", f"{asked['n_baseline']} logs")
+        print_table(title, cells(columns, rows), 0)
         alone = asked["seconds_for_one_log"]
-        click.echo(
-            f"One log is enough from {alone} s on.\n"
-            if alone
-            else "A single log of up to an hour is not enough.\n"
-        )
+        enough = "A single log of up to an hour is not enough."
+        click.echo(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
     for kind in dict.fromkeys(row["hindrance"] for row in plan if row["hindrance"]):
         print_text(": ".join(_HINDRANCES[kind]))
     print_text(
@@ -476,22 +433,14 @@ def print_track(track: Track) -> None:
     """Print the latest modes of a machine, its events and the consistency of the filter."""
     from lmshealth.report.tables import track_rows
 
-    cells = [
-        {
-            "mode": row["mode"],
-            "frequency Hz": " ± ".join(fixed(row[f"frequency{k}_hz"], 3) for k in ("", "_std")),
-            "drift": change(row["drift"], row["drift_std"], 3),
-            "damping ratio": f"{fixed(100 * row['damping_ratio'], 2)} ± "
-            f"{percent(row['damping_ratio_std'], 2)}"
-            if row["damping_ratio"] >= 0
-            else "–",
-        }
-        for row in track_rows(track, epochs=[len(track.logs) - 1])
-    ]
-    print_table(
-        f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)", cells
-    )
-    cells = [
+    rows = []
+    for row in track_rows(track, epochs=[len(track.logs) - 1]):
+        damping = f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
+        damping = damping if row["damping_ratio"] >= 0 else "–"
+        rows.append(row | {"drift": change(row["drift"], row["drift_std"], 3), "damping": damping})
+    title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
+    print_table(title, cells(_TRACK, rows))
+    events = [
         {
             "since": day(track.recorded_at[event.epoch]),
             "kind": event.kind,
@@ -502,8 +451,8 @@ def print_track(track: Track) -> None:
         }
         for event in track.events
     ]
-    if cells:
-        print_table("Events", cells, 4)
+    if events:
+        print_table("Events", events, 4)
     print_text(_consistency(track))
 
 
@@ -528,66 +477,56 @@ def _consistency(track: Track) -> str:
 
 
 def print_health(health: Health) -> None:
-    """Print the health parameters at the last epoch with their diagnostics."""
-    low, middle, high = (health.latest(level) for level in constants.LEVELS)
-    cells = [
-        {
-            "parameter": name,
-            "median": f"{middle[j]:.3f}",
-            "90 % interval": f"{low[j]:.3f} to {high[j]:.3f}"
-            if health.converged[-1]
-            else "not converged",
-            "informed": percent(health.informed[-1, j], 0),
-            "prior × 2": "–"
-            if math.isnan(health.prior_ratio[-1, j])
-            else f"{health.prior_shift[-1, j]:+.2f} σ × {health.prior_ratio[-1, j]:.2f}",
-            "ESS": fixed(health.ess[-1, j], 0),
-            "R-hat": fixed(health.r_hat[-1, j], 3),
-        }
-        for j, name in enumerate(health.parameters)
-    ]
+    """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
+    from lmshealth.report.tables import health_rows
+
+    rows = health_rows(health)[-len(health.parameters) :]
+    for row in rows:
+        row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
+        if not row["converged"]:
+            row["interval"] = "not converged"
+        row["prior"] = "{prior_shift:+.2f} σ × {prior_ratio:.2f}".format(**row)
+        if math.isnan(row["prior_ratio"]):
+            row["prior"] = "–"
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
-    print_table(f"{health.stage}: health at {when}, the last of {n_epochs} epochs", cells)
+    title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
+    print_table(title, cells(_HEALTH, rows))
     print_text(
         "informed: share of the prior variance of the ln parameter that the data remove; "
         "prior × 2: shift of the median and factor on the interval with priors twice as wide, "
         "within the map."
     )
-    for j, k in combinations(range(len(health.parameters)), 2):
-        rho = health.correlation[-1, j, k]
-        print_text(f"Correlation of {health.parameters[j]} and {health.parameters[k]}: {rho:+.2f}.")
-    _print_doubts(health)
-
-
-def _print_doubts(health: Health) -> None:
-    """Print what limits the use of a posterior."""
+    for one, other in combinations(rows, 2):
+        first, second = one["parameter"], other["parameter"]
+        rho = one[f"correlation_{second}"]
+        print_text(f"Correlation of {first} and {second}: {rho:+.2f}.")
     if not health.explained:
         print_text(
             f"No state of the parameters on the map explains these drifts (p = {health.fit[-1]:.1g}"
             "): no health is reported. Check for other causes of the drifts and errors of the map."
         )
-    for j, name in enumerate(health.parameters):
-        if health.at_edge[-1, j]:
-            print_text(
-                f"{name}: the posterior ends at the edge of the map; this is a bound. Extend the "
-                "map."
-            )
-        shift, ratio = health.laplace_shift[-1, j], health.laplace_ratio[-1, j]
-        if (
-            abs(shift) > constants.LAPLACE_SHIFT
-            or abs(math.log(ratio)) > constants.LAPLACE_LN_RATIO
-        ):
-            print_text(
-                f"{name}: the posterior is not normal; Laplace's approximation lies {shift:+.1f} σ "
-                f"lower, and the posterior is {ratio:.2f} times as wide."
-            )
-        if not health.identifiable[-1, j]:
-            print_text(f"{name}: not identifiable from the tracked modes; see `lmshealth stage`.")
-        elif health.explained and not health.publishable_parameters()[j]:
-            print_text(f"{name}: not determined by these drifts.")
-    for when, converged in zip(health.recorded_at, health.converged, strict=True):
+    for row, publishable in zip(rows, health.publishable_parameters(), strict=True):
+        for doubt in _doubts(row, determined=publishable or not health.explained):
+            print_text(f"{row['parameter']}: {doubt}")
+    for when, converged in zip(map(day, health.recorded_at), health.converged, strict=True):
         if not converged:
-            print_text(f"The sampler did not converge at {day(when)}.")
+            print_text(f"The sampler did not converge at {when}.")
+
+
+def _doubts(row: Row, *, determined: bool) -> Iterator[str]:
+    """Yield what limits the use of the posterior of a parameter."""
+    if row["at_edge"]:
+        yield "the posterior ends at the edge of the map; this is a bound. Extend the map."
+    shift, ratio = row["laplace_shift"], row["laplace_ratio"]
+    if abs(shift) > constants.LAPLACE_SHIFT or abs(math.log(ratio)) > constants.LAPLACE_LN_RATIO:
+        yield (
+            f"the posterior is not normal; Laplace's approximation lies {shift:+.1f} σ lower, and "
+            f"the posterior is {ratio:.2f} times as wide."
+        )
+    if not row["identifiable"]:
+        yield "not identifiable from the tracked modes; see `lmshealth stage`."
+    elif not determined:
+        yield "not determined by these drifts."
 
 
 def print_summaries(summaries: Sequence[Summary]) -> None:
@@ -655,17 +594,16 @@ def print_life(
         f"(horizon {_km(life.horizon)} km)"
     )
     heads = ("until", "probability %", "km", "hours", "days", "date")
-    cells = [cell for block in (blocks if same is None else blocks[:-1]) for cell in block]
-    print_table(title, [dict(zip(heads, cell, strict=True)) for cell in cells])
+    rows = [row for block in (blocks if same is None else blocks[:-1]) for row in block]
+    print_table(title, [dict(zip_longest(heads, row, fillvalue="")) for row in rows])
     if same is not None:
         print_text(f"Any limit: the same as {same}.")
     for name in dict.fromkeys(law.parameter for law in life.laws):
-        laws = [
-            f"{law.kind}{f' from {_km(law.begin)} km after the baseline' if law.begin else ''} "
-            f"{probability(law.probability)}"
-            for law in life.laws
-            if law.parameter == name and law.probability >= constants.LAW_SHOWN
-        ]
+        laws = []
+        for law in life.laws:
+            if law.parameter == name and law.probability >= constants.LAW_SHOWN:
+                begin = f" from {_km(law.begin)} km after the baseline" if law.begin else ""
+                laws.append(f"{law.kind}{begin} {probability(law.probability)}")
         print_text(f"Law of {spell(name)}: {', '.join(laws)}.")
     if life.undetermined:
         names = ", ".join(map(spell, life.undetermined))
@@ -679,26 +617,23 @@ def _limit_cells(
     life: Life, index: int, before: tuple[date, ProbabilityBounds] | None
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
-    one = life.limits[index]
+    one, levels = life.limits[index], constants.RUL_LEVELS
     text = "any limit" if one.parameter == "any" else f"{spell(one.parameter)} below {one.limit:g}"
-    last = constants.RUL_LEVELS[-1]
-    for level, travel, days, when in zip(
-        constants.RUL_LEVELS, one.travel, one.days, one.dates, strict=True
-    ):
+    for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):
-            share = share if level == last else f"{share} to {100 * last:.0f}"
+            share = share if level == levels[-1] else f"{share} to {100 * levels[-1]:.0f}"
             yield text, share, f"beyond {_km(life.horizon)}", "–", "–", "–"
             break
         calendar = "out of range" if when is None else when.isoformat()
         yield text, share, _km(travel), f"{24 * days:,.0f}", f"{days:,.1f}", calendar
         text = ""
-    yield f"  already: {probability(one.already_past)}", *[""] * 5
-    yield f"  beyond horizon: {probability(one.beyond_horizon)}", *[""] * 5
+    yield (f"  already: {probability(one.already_past)}",)
+    yield (f"  beyond horizon: {probability(one.beyond_horizon)}",)
     if before is not None:
         asked, bounds = before
         chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
-        yield f"  before {asked}: {chance}", *[""] * 5
+        yield (f"  before {asked}: {chance}",)
 
 
 def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
@@ -709,11 +644,10 @@ def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
 
 def _advice(life: Life, service: Service) -> Iterator[str]:
     """Yield when to service, by which rule, and the risk of a planned service."""
-    rule = (
-        f"accepted risk {percent(service.max_risk)}"
-        if service.max_risk
-        else f"least cost, where a failure costs {service.cost_ratio:.3g} times a service"
-    )
+    if service.max_risk:
+        rule = f"accepted risk {percent(service.max_risk)}"
+    else:
+        rule = f"least cost, where a failure costs {service.cost_ratio:.3g} times a service"
     yield f"Service: {service_text(service)} ({rule})."
     risk = probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":

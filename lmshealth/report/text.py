@@ -66,11 +66,6 @@ def fixed(value: Number, digits: int) -> str:
     return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
 
 
-def exponent(value: Number) -> str:
-    """Format a small number with two significant digits; NaN is a dash."""
-    return "–" if np.isnan(value) else f"{value:.1e}"
-
-
 def signed(value: Number, digits: int) -> str:
     """Format a number with its sign and fixed decimals."""
     return f"{value:+.{digits}f}".replace("-", "−")
