@@ -11,6 +11,12 @@ Method
     the presets of pyOMA2's clustering, and the automatic selection of pyoma-toolbox (`peers`); a
     time is processor time, the median of its ratio to ours. Controls: intervals two thirds as wide
     must not cover; peaks of the spectra of single channels must miss modes.
+Answer
+    Found: 825 of 826 modes, nothing false, no harmonic that wanders; the one missed is in a record
+    of a single channel. No preset of another program is without false modes in the third and
+    fourth family. Intervals of f are a little too narrow (93 % of 95 %); with a description errors
+    on forty such records were 1.09 of what is stated, so that the search is not the reason. Six to
+    eight channels take up to twice the time of pyOMA2's SSI, which gives no intervals.
 Run time
     About half an hour on one processor. Needs the extra ``peers``.
 """
@@ -47,6 +53,17 @@ CONTROL = "peaks of single channels"
 # The first of all seeds, so that records are others than those of development.
 KEY = 20261123
 
+NOT_MET = {
+    "intervals of f cover": (
+        "with a description errors are as much larger than stated: presumably ordinates on the "
+        "skirts of peaks of 40 dB are correlated by the ends of short records, which is neglected"
+    ),
+    "at most the time of pyOMA2's SSI": (
+        "a record of six to eight channels with a harmonic that wanders is searched twice, and "
+        "every group of modes is fitted, which SSI without intervals does not do"
+    ),
+}
+
 
 def main() -> None:
     """Run the study; ``--quick`` does two records of each family and records nothing."""
@@ -64,7 +81,16 @@ def main() -> None:
     with spawn_pool(1) as pool:
         records = study.trials.collect(examine, tasks, pool=pool)
     families = {name: summarise([r for r in records if r["family"] == name]) for name in seeds}
-    study.conclude({"families": families, "passed": verdicts(families)}, quick_may_fail=True)
+    passed = verdicts(families)
+    study.conclude(
+        {
+            "families": families,
+            "passed": passed,
+            "not_met": {name: why for name, why in NOT_MET.items() if not passed[name]},
+        },
+        not_met=NOT_MET,
+        quick_may_fail=True,
+    )
 
 
 def examine(family: str, seed: int, peers: bool = False) -> dict[str, Any]:
