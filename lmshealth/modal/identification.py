@@ -291,9 +291,11 @@ def _fit_described(
 ) -> tuple[list[ClusterFit], list[Target], bool]:
     """Locate, fit and name described modes.
 
-    Returns the fits, their resonances, and whether the spectra show more near the targets.
+    Returns the fits, their resonances, and whether the spectra show more near the targets, or one
+    resonance is so wide that it may stand for two.
     """
-    searched, fits, known = [], [], []
+    searched, fits, known, wide = [], [], [], False
+    damping = {target.name: target.damping_ratio for target in targets}
     for cluster in clusters(targets):
         binned = bin_cluster(spectra, cluster, targets, top, searched=True)
         around, located = locate(binned, cluster)
@@ -304,7 +306,9 @@ def _fit_described(
             modes = fit.modes.modes
             values = np.stack([modes.frequency, modes.damping_ratio], axis=1).tolist()
             known += [Target("", f, zeta, 0.0) for f, zeta in values]
-    return fits, known, any(shows_more(binned, known, targets) for binned in searched)
+            ratio = modes.damping_ratio / [damping[name] for name in modes.names]
+            wide |= bool((ratio > constants.WIDE).any())
+    return fits, known, wide or any(shows_more(binned, known, targets) for binned in searched)
 
 
 def _named(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:

@@ -165,8 +165,7 @@ def name_together(
     """
     near = [any(is_near(target, f) for target in targets) for f in found.frequency.tolist()]
     found = found.select(np.flatnonzero(near).tolist())
-    places = np.array([[k.frequency, k.damping_ratio] for k in known]).reshape(-1, 2).T
-    more = _apart(found, np.log(places[0]), places[1])
+    more = _unexplained(found, known)
     if not more:
         return described
     reach = BAND_HALF_WIDTH * np.maximum(
@@ -176,8 +175,8 @@ def name_together(
     alone = (off > reach).all(axis=1)
     kept = described.select(np.flatnonzero(alone).tolist())
     rest = described.select(np.flatnonzero(~alone).tolist())
-    rest = rest.select(_apart(rest, found.ln_frequency, found.damping_ratio))
-    found = found.select(_apart(found, kept.ln_frequency, kept.damping_ratio))
+    rest = rest.select(_apart(rest, found.ln_frequency))
+    found = found.select(_apart(found, kept.ln_frequency))
     parts = [replace(one, names=("",) * len(one.names)) for one in (kept, found, rest)]
     both = merge(parts, described.lines, (), described.shape_channels)
     values: Any = {"damping": both.damping_ratio.tolist(), "shapes": likeness(both, targets)}
@@ -195,10 +194,21 @@ def name_together(
     return replace(both, names=names, flags=flags, refused=refused).select(index)
 
 
-def _apart(modes: Modes, ln_f: FloatArray, damping: FloatArray) -> list[int]:
-    """Return the modes that are further than a half-power bandwidth from all of others."""
+def _unexplained(found: Modes, known: Sequence[Target]) -> list[int]:
+    """Return the modes that are not the nearest of a known one within a half-power bandwidth."""
+    explained = set()
+    for one in known:
+        off = np.abs(found.ln_frequency - np.log(one.frequency))
+        relative = off / (found.damping_ratio + one.damping_ratio)
+        if relative.size and relative.min() < 1:
+            explained.add(int(relative.argmin()))
+    return [i for i in range(len(found.names)) if i not in explained]
+
+
+def _apart(modes: Modes, ln_f: FloatArray) -> list[int]:
+    """Return the modes that are further than their half-power bandwidth from all of others."""
     off = np.abs(modes.ln_frequency[:, None] - ln_f)
-    return np.flatnonzero((off > modes.damping_ratio[:, None] + damping).all(axis=1)).tolist()
+    return np.flatnonzero((off > 2 * modes.damping_ratio[:, None]).all(axis=1)).tolist()
 
 
 def _refuse_unnamed(

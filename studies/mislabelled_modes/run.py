@@ -45,7 +45,7 @@ SAME = 0.015  # relative distance up to which a frequency is that of a mode
 KINDS = ("lacking", "one shifted", "all shifted", "lacking, one shifted", "lacking, all shifted")
 COMPLETE = "complete"
 EACH = 40  # logs of each kind
-FIRST = 4000  # of the seeds: below are those of logs that the rules were developed with
+FIRST = 6000  # of the seeds: below are those of logs that the rules were developed with
 
 
 def main() -> None:
