@@ -225,8 +225,15 @@ def plot_life(
     bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
     _bands(ax, travel, bands, "law", informed=True)
     top = 108.0
-    if health is not None and health.publishable_parameters()[health.parameters.index(parameter)]:
-        top = max(top, 1.04 * _epochs(ax, health, parameter))
+    if health is not None:
+        own = health.parameters.index(parameter)
+        if health.publishable_parameters()[own]:
+            bounds = 100 * health.quantile(_LEVELS[::2])[:, :, own]
+            # The last epoch is always among them.
+            step = max(1, bounds.shape[1] // constants.EPOCHS_SHOWN)
+            some = np.arange(bounds.shape[1])[::-step]
+            bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
+            top = max(top, 1.04 * min(float(bounds[2].max()), 160.0))
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
     end = now + prognosis.horizon / _KM
@@ -311,15 +318,6 @@ def _levels(ax: Axes, limit: float | None) -> None:
     if limit is not None:
         name = f"limit {100 * limit:.3g} %"
         ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
-
-
-def _epochs(ax: Axes, health: Health, parameter: str) -> float:
-    """Draw intervals of epochs without a law; return the top of their bars."""
-    bounds = 100 * health.quantile(_LEVELS[::2])[:, :, health.parameters.index(parameter)]
-    # The last epoch is always among them.
-    some = np.arange(bounds.shape[1])[:: -max(1, bounds.shape[1] // constants.EPOCHS_SHOWN)]
-    bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
-    return min(float(bounds[2].max()), 160.0)
 
 
 def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
@@ -451,7 +449,11 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
         level = track.ln_frequency[:, k]
         _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
         _baselines(ax, history, track, k)
-        _mark_steps(ax, track)
+        names = dict(_WORDS)  # each kind has one entry in the legend
+        for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
+            style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
+            name, x = names.pop(kind, None), track.travel[first] / _KM
+            ax.axvline(x, lw=1.0, label=name, zorder=1, **style)
     # Show at least 1 % of the frequency, so that noise does not appear as a change.
     low, high = ax.get_ylim()
     middle = (low + high) / 2
@@ -688,12 +690,3 @@ def _halo(width: float) -> list[Any]:
     from matplotlib.patheffects import withStroke
 
     return [withStroke(linewidth=width, foreground=_BLACK)]
-
-
-def _mark_steps(ax: Axes, track: Track) -> None:
-    """Mark sudden changes and declared work."""
-    names = dict(_WORDS)  # each kind has one entry in the legend
-    for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
-        colour, style = (RED, "-") if kind == "step" else (INK, ":")
-        name = names.pop(kind, None)
-        ax.axvline(track.travel[first] / _KM, color=colour, ls=style, lw=1.0, label=name, zorder=1)

@@ -80,7 +80,11 @@ def maximise(
         if moved is None:
             metric, fresh = likelihood.metric(at), True
             continue
-        metric, fresh = _updated(metric, moved[0] - p, moved[1].gradient - at.gradient), False
+        step, change = moved[0] - p, moved[1].gradient - at.gradient
+        along, fresh = metric @ step, False
+        expected, seen = float(step @ along), float(step @ change)
+        if seen >= 1e-2 * expected:  # the update of Broyden, Fletcher, Goldfarb and Shanno
+            metric = metric - np.outer(along, along) / expected + np.outer(change, change) / seen
         p, at = moved
     return Optimum(p, at, decrement)
 
@@ -92,15 +96,6 @@ def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArra
     step = np.zeros(gradient.size)
     step[free] = -np.linalg.solve(system, gradient[free] / scale) / scale
     return step
-
-
-def _updated(metric: FloatArray, step: FloatArray, change: FloatArray) -> FloatArray:
-    """Update the metric by the change of the gradient (BFGS)."""
-    along = metric @ step
-    expected, seen = float(step @ along), float(step @ change)
-    if seen < 1e-2 * expected:
-        return metric
-    return np.asarray(metric - np.outer(along, along) / expected + np.outer(change, change) / seen)
 
 
 def _shorten(
@@ -225,11 +220,8 @@ class DecayFit:
 
     def sizes(self, mode: int) -> list[ComplexArray]:
         """Return the complex size of a mode's transient, per block ``(n_channels, n_segments)``."""
-        pairs = [
-            fit.sizes[:, 2 * mode - 2 * self.likelihood.n_modes :][:, :2]
-            for fit in self.optimum.at.fits
-        ]
-        return [pair[:, 0] + 1j * pair[:, 1] for pair in pairs]
+        k = 2 * (mode - self.likelihood.n_modes)  # columns of the modes are the last ones
+        return [fit.sizes[:, k] + 1j * fit.sizes[:, k + 1] for fit in self.optimum.at.fits]
 
     def white_level(self) -> FloatArray:
         """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
