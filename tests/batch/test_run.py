@@ -27,7 +27,7 @@ from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Log
-from lmshealth.modal.modes import Modes
+from lmshealth.modal.identification import AmbientReading
 from lmshealth.prognosis.fleet_prior import FleetPrior
 from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.report.assessment import Assessment
@@ -286,15 +286,15 @@ def test_what_the_computer_failed_at_is_tried_again(
 ) -> None:
     """A full disk or memory is no fault of a log: it is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 3)
-    whole = ingesting.identify
+    whole = ingesting.read_ambient
 
-    def fail(log: Log, stage: Stage) -> Modes:
+    def fail(log: Log, stage: Stage) -> AmbientReading:
         if log.name == "log-01.h5":
             raise error
         return whole(log, stage)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ingesting, "identify", fail)
+        patch.setattr(ingesting, "read_ambient", fail)
         first = run(logs, [modes_only], tmp_path / "out")
     assert (first.n_refused, first.n_remembered) == (1, 0)
     refused = rows(tmp_path / "out" / "refused.csv")
