@@ -17,19 +17,15 @@ if TYPE_CHECKING:
     from lmshealth.stage.description import Stage
 
 
-@click.command(
-    epilog=options.examples(
-        "run logs/ --stage lms-y --out result/",
-        "run exports/ --columns map.toml --stage my-stage.toml --out result/",
-        "run archive/ --stage lms-x --stage lms-y --out result/ "
-        "--store postgresql://me@host/fleet --scheduler tcp://host:8786",
-    )
+@options.command(
+    "run logs/ --stage lms-y --out result/",
+    "run exports/ --columns map.toml --stage my-stage.toml --out result/",
+    "run archive/ --stage lms-x --stage lms-y --out result/ "
+    "--store postgresql://me@host/fleet --scheduler tcp://host:8786",
 )
 @click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@click.option(
-    "--stage",
+@options.stage_option(
     "stages",
-    type=options.StageFile(),
     multiple=True,
     required=True,
     help="Stage description: a .toml file or a shipped name; may be given several times.",
@@ -74,11 +70,9 @@ def run(
     ctx.exit(options.SOME_REFUSED if some else 0)
 
 
-@click.command(
-    epilog=options.examples(
-        "report --store sqlite:///result/lmshealth.sqlite --out pages/",
-        "report --store postgresql://me@host/fleet --out pages/ --pdf",
-    )
+@options.command(
+    "report --store sqlite:///result/lmshealth.sqlite --out pages/",
+    "report --store postgresql://me@host/fleet --out pages/ --pdf",
 )
 @options.store_option(required=True, help="Store that `run` has filled.")
 @options.out_option("Folder of the pages.", options.FOLDER)

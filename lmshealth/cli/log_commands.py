@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -38,16 +40,14 @@ _PLOT = click.option(
 )
 
 
-@click.command(
-    epilog=options.examples(
-        "modes log.h5 --stage lms-y",
-        "modes export.csv --columns map.toml --band 80 200 --format json",
-        "modes moves.h5 --stage lms-y --part settling",
-        "modes log.h5 --band 80 200 --save my-stage.toml --plot modes.html",
-    )
+@options.command(
+    "modes log.h5 --stage lms-y",
+    "modes export.csv --columns map.toml --band 80 200 --format json",
+    "modes moves.h5 --stage lms-y --part settling",
+    "modes log.h5 --band 80 200 --save my-stage.toml --plot modes.html",
 )
 @options.LOGS
-@options.STAGE
+@options.stage_option()
 @click.option(
     "--part",
     type=click.Choice(["constant", "settling"]),
@@ -55,7 +55,11 @@ _PLOT = click.option(
     help="Segments of constant velocity (or a whole log at rest), or free decays after moves.",
 )
 @options.reading_options
-@click.option("--channels", help="Use only these channels, separated by commas.")
+@click.option(
+    "--channels",
+    callback=lambda ctx, option, names: re.split(r"\s*,\s*", names.strip()) if names else None,
+    help="Use only these channels, separated by commas.",
+)
 @options.band_option("Use only this band, in Hz.")
 @click.option(
     "--save",
@@ -78,17 +82,14 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     from lmshealth.signal.following_error import loop_error
     from lmshealth.tracking.history import LogEstimates
 
-    stage, band, channels = given["stage"], options.checked_band(given["band"]), given["channels"]
-    names = [name.strip() for name in channels.split(",")] if channels else None
-    if given["save"]:
-        _check_save(given["save"], stage, given["logs"])
-    _check_plot(given["plot"], given["logs"])
+    stage, band = given["stage"], given["band"]
+    _check_outputs(given)
 
     content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
     def estimate(log: Log) -> LogEstimates:
         with progress_bars(_PATIENCE) as report:
-            reading = _read_modes(log, given, names, report)
+            reading = _read_modes(log, given, report)
         shapes, mac = shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes
         content["mac"] += mac
@@ -102,8 +103,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     rows = [row for one in found for row in modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
-    off = _off_description(found, stage)
-    if off:
+    if off := _off_description(found, stage):
         content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
@@ -114,25 +114,23 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
             if rows and stage is None and band is None:
                 terminal.print_text(_NO_BAND)
 
-    _publish(given["style"], content, refused, lost, show)
+    _publish(ctx, content, refused, lost, show)
     if given["save"] and found:
         _save(given["save"], found[0])
     _exit(ctx, found, lost)
 
 
-def _read_modes(
-    log: Log, given: dict[str, Any], names: list[str] | None, report: Callable[..., None]
-) -> AmbientReading:
+def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
     """Identify the modes of a log by the chosen part of it."""
     from lmshealth.modal.free_decay.identification import identify_decays
     from lmshealth.modal.identification import AmbientReading, read_ambient
     from lmshealth.report.log_figures import settling_spectra
 
-    chosen: Any = {"channels": names, "band": given["band"] or None}
+    chosen: Any = {"channels": given["channels"], "band": given["band"]}
     if given["part"] == "constant":
         return read_ambient(log, given["stage"], **chosen, progress=report)
     found = identify_decays(log, given["stage"], **chosen)
-    return AmbientReading(found, settling_spectra(log, names))
+    return AmbientReading(found, settling_spectra(log, given["channels"]))
 
 
 def _off_description(found: Sequence[LogEstimates], stage: Stage | None) -> list[Row]:
@@ -144,30 +142,23 @@ def _off_description(found: Sequence[LogEstimates], stage: Stage | None) -> list
     return [{"log": r.log, **one._asdict()} for r in found for one in compare(r.modes, stage)]
 
 
-def _check_save(path: Path, stage: object, logs: Sequence[Path]) -> None:
-    """Refuse an output that is no new description, before the log is analysed."""
-    if stage is not None:
+def _check_outputs(given: dict[str, Any]) -> None:
+    """Refuse outputs that cannot be written, before a log is analysed."""
+    if given.get("save") and given["stage"] is not None:
         raise click.UsageError("--save writes a first description; with --stage there is one.")
-    _check_one("--save", logs)
-    if path.suffix != ".toml":
-        raise click.BadParameter(f"{path} must end in .toml", param_hint="--save")
-    if path.exists():
-        raise click.BadParameter(
-            f"{path} exists and is not overwritten; choose another name", param_hint="--save"
-        )
-
-
-def _check_plot(path: Path | None, logs: Sequence[Path]) -> None:
-    """Refuse an unknown format of a figure, before the log is analysed."""
-    if path is not None:
-        _check_one("--plot", logs)
-        if path.suffix not in (".svg", ".png", ".html"):
-            raise click.BadParameter(f"{path} must end in .svg, .png or .html", param_hint="--plot")
-
-
-def _check_one(option: str, logs: Sequence[Path]) -> None:
-    if len(logs) != 1:
-        raise click.UsageError(f"{option} needs exactly one log; got {len(logs)}.")
+    for option, endings in (("save", ".toml"), ("plot", ".svg, .png or .html")):
+        path, logs = given.get(option), given["logs"]
+        if path is None:
+            continue
+        if len(logs) != 1:
+            raise click.UsageError(f"--{option} needs exactly one log; got {len(logs)}.")
+        why = None
+        if path.suffix not in re.findall(r"\.\w+", endings):
+            why = f"must end in {endings}"
+        elif option == "save" and path.exists():
+            why = "exists and is not overwritten; choose another name"
+        if why is not None:
+            raise click.BadParameter(f"{path} {why}", param_hint=f"--{option}")
 
 
 def _save(path: Path, found: LogEstimates) -> None:
@@ -175,8 +166,7 @@ def _save(path: Path, found: LogEstimates) -> None:
     from lmshealth.stage.description import ModeSpec
     from lmshealth.stage.skeleton import searches, write_skeleton
 
-    modes = found.modes
-    specs = []
+    modes, specs = found.modes, []
     for k, search in enumerate(searches(modes.frequency.tolist())):
         frequency, damping = float(modes.frequency[k]), float(modes.damping_ratio[k])
         snr = float(modes.snr[k])
@@ -187,11 +177,9 @@ def _save(path: Path, found: LogEstimates) -> None:
     terminal.print_notes([f"{path}: description of {len(specs)} modes, ready to edit"])
 
 
-@click.command(
-    epilog=options.examples(
-        "error velocities/*.h5",
-        "error log.h5 --count 20 --floor-nm 50 --part settling --format json",
-    )
+@options.command(
+    "error velocities/*.h5",
+    "error log.h5 --count 20 --floor-nm 50 --part settling --format json",
 )
 @options.LOGS
 @click.option("--count", type=click.IntRange(1), default=100, help="Number of strongest harmonics.")
@@ -221,18 +209,16 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     harmonics = [row for pair in pairs for row in harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _publish(given["style"], {"error": rows, "harmonics": harmonics}, refused, lost, show)
+    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, lost, show)
     _exit(ctx, found, lost)
 
 
-@click.command(
-    epilog=options.examples(
-        "spectrum velocities/*.h5 --stage lms-y",
-        "spectrum velocities/*.h5 --band 10 400 --format csv",
-    )
+@options.command(
+    "spectrum velocities/*.h5 --stage lms-y",
+    "spectrum velocities/*.h5 --band 10 400 --format csv",
 )
 @options.LOGS
-@options.STAGE
+@options.stage_option()
 @options.band_option(
     "Only modes, grid and lines in this band, in Hz; default 10 to 400 without a stage."
 )
@@ -251,7 +237,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     from lmshealth.report.tables import growth_rows, magnitudes_rows
     from lmshealth.signal.acceleration_levels import find_growth
 
-    stage, band, part = given["stage"], options.checked_band(given["band"]), given["part"]
+    stage, band, part = given["stage"], given["band"], given["part"]
     found, lost = _each(ctx, lambda log: survey(log, stage, band, part=part))
     magnitudes = [item for own in found for item in own.magnitudes]
     growth = find_growth(magnitudes)
@@ -261,26 +247,24 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _publish(given["style"], content, refused, lost, show)
+    _publish(ctx, content, refused, lost, show)
     _exit(ctx, found, lost)
 
 
-@click.command(
-    epilog=options.examples(
-        "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
-        "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
-        "frf hammer.csv --input current_force --output acc_tool",
-        "frf analyser.uff --output 2+Z --plot response.html",
-        "frf sweeps/*.h5 --input current_excitation --output acc_pitch --stage lms-y "
-        "--format csv > modes.csv",
-    )
+@options.command(
+    "frf sweep.h5 --input current_excitation --output acc_pitch --band 95 175",
+    "frf bench.mat --columns map.toml --input current --output delta_e --period 1",
+    "frf hammer.csv --input current_force --output acc_tool",
+    "frf analyser.uff --output 2+Z --plot response.html",
+    "frf sweeps/*.h5 --input current_excitation --output acc_pitch --stage lms-y "
+    "--format csv > modes.csv",
 )
 @options.LOGS
 @click.option("--input", "source", metavar="NAME", help="Channel of the excitation.")
 @click.option(
     "--output", metavar="NAME", help="Channel of the response; of measured responses, which one."
 )
-@options.STAGE
+@options.stage_option()
 @options.band_option("Use only this band, in Hz; default: the excited band.")
 @click.option(
     "--period",
@@ -324,14 +308,14 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
     from lmshealth.report.tables import fit_row, frf_rows, modes_rows
     from lmshealth.tracking.history import LogEstimates
 
-    stage, band, period = given["stage"], options.checked_band(given["band"]), given["period"]
+    stage, band, period = given["stage"], given["band"], given["period"]
     source, output = given["source"], given["output"]
-    _check_plot(given["plot"], given["logs"])
-    more: Any = {"averages": given["averages"], "window": given["exponential"]}
+    _check_outputs(given)
 
     def analyse(log: Log | MeasuredResponse) -> tuple[Log | MeasuredResponse, FrfReading]:
         if isinstance(log, MeasuredResponse):
-            return log, read_measured(log, band=band, **more)
+            averages, window = given["averages"], given["exponential"]
+            return log, read_measured(log, band=band, averages=averages, window=window)
         impact = given["impact"]
         return log, read_frf(log, source, output, band=band, period=period, impact=impact)
 
@@ -359,7 +343,7 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         if found:
             views.print_frf(content["fit"], content["frf"], rows, rejected)
 
-    _publish(given["style"], content, refused, lost, show)
+    _publish(ctx, content, refused, lost, show)
     if stage and given["style"] != "json":
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
@@ -376,23 +360,23 @@ def _responses(
 
     named = source is not None and output is not None
     measured = read_responses(path, **reading) if named or format_name(path) in FORMATS else ()
-    if not measured:
-        if not named:
-            raise click.UsageError(
-                f"{path} has no column frequency_hz (or data set of function type 4), so it is a "
-                "log: needed are --input NAME and --output NAME."
-            )
-        return [read_log(path, **reading)]
     used = [r for r in measured if output in (None, r.output) and source in (None, r.input)]
-    if not used:
+    if used:
+        return list(used)
+    if measured:
         there = ", ".join(f"{r.output} to {r.input}" for r in measured)
         why = f"no response of {output or 'any'} to {source or 'any'}; there: {there}"
         raise BadLog(str(path), "channel", why)
-    return list(used)
+    if named:
+        return [read_log(path, **reading)]
+    raise click.UsageError(
+        f"{path} has no column frequency_hz (or data set of function type 4), so it is a log: "
+        "needed are --input NAME and --output NAME."
+    )
 
 
 def _publish(
-    style: str,
+    ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
     lost: Sequence[Refusal],
@@ -404,11 +388,11 @@ def _publish(
     """
     from lmshealth.report.tables import COLUMNS, LOG_COLUMNS, frame, refused_rows
 
-    if style == "csv":
+    if ctx.params["style"] == "csv":
         name, rows = next(iter(content.items()))
         table = frame({**COLUMNS, **LOG_COLUMNS}[name], rows)
         click.echo(table.to_csv(index=False), nl=False)
-    elif style == "json":
+    elif ctx.params["style"] == "json":
         terminal.print_json({**content, "refused": refused_rows([*lost, *refused])})
     else:
         show(refused_rows(refused))
@@ -440,25 +424,27 @@ def _each(
     named = ctx.params["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
     for path in [path for path in named if path.name not in NOT_LOGS] or named:
-        try:
+        items: list[Any] = []
+        with _refusing(lost):
             if path.parent not in manifests:
                 beside = manifests[path.parent] = read_manifest_beside(path)
                 faults = [refusal for refusal in beside.refused if refusal.log == MANIFEST]
                 terminal.print_notes(_sentences(faults))
-            overrides = manifests[path.parent].overrides(path)
-            if read is None:
-                items = [read_log(path, overrides=overrides, **reading)]
-            else:
-                items = read(path, overrides=overrides, **reading)
-        except BadLog as why:
-            lost.append(Refusal(why.log, why.reason, why.detail))
-            continue
+            more = reading | {"overrides": manifests[path.parent].overrides(path)}
+            items = [read_log(path, **more)] if read is None else read(path, **more)
         for item in items:
-            try:
+            with _refusing(lost):
                 found.append(analyse(item))
-            except BadLog as why:
-                lost.append(Refusal(why.log, why.reason, why.detail))
     return found, lost
+
+
+@contextmanager
+def _refusing(lost: list[Refusal]) -> Iterator[None]:
+    """Note a log that cannot be used, and go on."""
+    try:
+        yield
+    except BadLog as why:
+        lost.append(Refusal(why.log, why.reason, why.detail))
 
 
 def _sentences(refused: Sequence[Refusal]) -> list[str]:

@@ -32,14 +32,12 @@ Progress = Callable[[str, int, int], None]
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
 
 
-@click.command(
-    epilog=options.examples(
-        "track result/modes.csv --stage lms-y --out track.csv --events events.csv",
-        "track other_program.csv --out track.csv --effects effects.csv --smooth",
-    )
+@options.command(
+    "track result/modes.csv --stage lms-y --out track.csv --events events.csv",
+    "track other_program.csv --out track.csv --effects effects.csv --smooth",
 )
 @click.argument("table", metavar="MODES.csv", type=options.TABLE)
-@options.STAGE
+@options.stage_option()
 @options.out_option("Table of the track.")
 @options.COV
 @options.MAINTENANCE
@@ -104,15 +102,13 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
     return [f"{history.stage}: {note}" for note in notes]
 
 
-@click.command(
-    epilog=options.examples(
-        "infer result/track.csv --stage lms-y --out health.csv --posterior health.nc",
-        "infer y/track.csv --stage lms-y --with x/track.csv lms-x --shared guide_preload "
-        "--out health.csv",
-    )
+@options.command(
+    "infer result/track.csv --stage lms-y --out health.csv --posterior health.nc",
+    "infer y/track.csv --stage lms-y --with x/track.csv lms-x --shared guide_preload "
+    "--out health.csv",
 )
 @click.argument("table", metavar="TRACK.csv", type=options.TABLE)
-@options.REQUIRED_STAGE
+@options.stage_option(required=True)
 @options.out_option("Table of the health parameters.")
 @click.option(
     "--cov",
@@ -123,7 +119,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 @click.option(
     "--with",
     "others",
-    type=(options.TABLE, options.StageFile()),
+    type=(options.TABLE, options.stage_file),
     multiple=True,
     metavar="TRACK.csv STAGE",
     help="Another machine that shares a part with the first; see --shared.",
@@ -216,14 +212,12 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
     return machines[0]
 
 
-@click.command(
-    epilog=options.examples(
-        "prognose result/modes.csv --stage lms-y --out prognosis.csv --by 2027-03-01",
-        "prognose modes.csv --stage lms-y --out prognosis.csv --cost-ratio 20",
-    )
+@options.command(
+    "prognose result/modes.csv --stage lms-y --out prognosis.csv --by 2027-03-01",
+    "prognose modes.csv --stage lms-y --out prognosis.csv --cost-ratio 20",
 )
 @click.argument("table", metavar="MODES.csv", type=options.TABLE)
-@options.REQUIRED_STAGE
+@options.stage_option(required=True)
 @options.out_option("Table of the remaining life.")
 @options.COV
 @options.MAINTENANCE
@@ -232,7 +226,7 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
 )
 @click.option(
     "--by",
-    type=options.Day(),
+    type=options.day,
     metavar="YYYY-MM-DD",
     help="Also give the probability that a limit is reached before this day.",
 )
@@ -255,7 +249,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     from lmshealth.report.tables import prognosis_rows
     from lmshealth.tracking.history import missing_mode_notes
 
-    stage, by = given["stage"], given["by"] and given["by"].date()
+    stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
     machines, notes = _read_machines(table, given)
     print_notes(notes)

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from datetime import date, datetime
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
+
+if TYPE_CHECKING:
+    from lmshealth.io.column_map import ColumnMap
+    from lmshealth.stage.description import Stage
 
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
@@ -29,39 +35,37 @@ class Finite(click.FloatRange):
         return number
 
 
-class Day(click.DateTime):
-    """Day of the calendar."""
-
-    def __init__(self) -> None:
-        super().__init__(["%Y-%m-%d"])
-
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Reject other formats, with an example of the right one."""
-        try:
-            return super().convert(value, param, ctx)
-        except click.BadParameter:
-            self.fail(
-                f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01.", param, ctx
-            )
+def day(value: str) -> date:
+    """Read a day of the calendar; any other text is wrong usage."""
+    try:
+        return datetime.strptime(value, "%Y-%m-%d").date()
+    except ValueError as error:
+        detail = f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01."
+        raise click.BadParameter(detail) from error
 
 
-class StageFile(click.types.StringParamType):
-    """Stage description, loaded."""
+def stage_file(value: str) -> Stage:
+    """Load a stage description: a .toml file or a shipped name."""
+    from lmshealth.stage.description import load_stage  # late: --help needs no scipy
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        """Load a .toml file or a shipped description."""
-        from lmshealth.stage.description import load_stage  # late: --help needs no scipy
-
-        return load_stage(value)
+    return load_stage(value)
 
 
-class _ColumnFile(click.Path):
-    """Column map, loaded."""
+def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
+    from lmshealth.io.column_map import load_columns
 
-    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
-        from lmshealth.io.column_map import load_columns
+    return None if path is None else load_columns(path)
 
-        return load_columns(value)
+
+def _band(
+    ctx: click.Context, option: click.Parameter, band: tuple[float, float] | None
+) -> tuple[float, float] | None:
+    """Reject a band whose ends are not in ascending order."""
+    if band and not 0 <= band[0] < band[1]:
+        raise click.BadParameter(
+            f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
+        )
+    return band
 
 
 TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -70,10 +74,16 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-_STAGE_HELP = "Stage description: a .toml file or a shipped name."
-STAGE = click.option("--stage", type=StageFile(), help=_STAGE_HELP)
-REQUIRED_STAGE = click.option("--stage", type=StageFile(), required=True, help=_STAGE_HELP)
-_COLUMNS = click.option("--columns", type=_ColumnFile(), help="Column map of the export.")
+stage_option = partial(
+    click.option,
+    "--stage",
+    type=stage_file,
+    metavar="TEXT",
+    help="Stage description: a .toml file or a shipped name.",
+)
+_COLUMNS = click.option(
+    "--columns", type=click.Path(), callback=_column_map, help="Column map of the export."
+)
 _MAX_MEMORY = click.option(
     "--max-memory",
     type=Finite(0, min_open=True),
@@ -137,41 +147,13 @@ def format_option(*styles: str) -> Callable[[Any], Any]:
 
 def band_option(text: str) -> Callable[[Any], Any]:
     """Return the option of a frequency band."""
-    return click.option("--band", nargs=2, type=float, metavar="LOW HIGH", help=text)
+    return click.option(
+        "--band", nargs=2, type=float, metavar="LOW HIGH", callback=_band, help=text
+    )
 
 
-def examples(*lines: str) -> str:
-    """Return the examples at the end of a command's help."""
+def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
+    """Return the decorator of a command; the examples are the end of its help."""
     # click does not wrap a paragraph that begins with a backspace.
-    return "\n".join(["\b", "Examples:", *(f"    lmshealth {line}" for line in lines)])
-
-
-def checked_band(band: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Reject a band whose ends are not in ascending order."""
-    if band and not 0 <= band[0] < band[1]:
-        raise click.BadParameter(
-            f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
-        )
-    return band or None
-
-
-def _detections(
-    ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
-) -> list[tuple[str, float]]:
-    """Parse NAME=LOSS, without duplicates."""
-    pairs = [value.split("=") for value in dict.fromkeys(values)]
-    try:
-        return [(name, float(loss)) for name, loss in pairs]
-    except ValueError as error:
-        raise click.BadParameter(f"needs NAME=LOSS with a number, got {values}") from error
-
-
-DETECT = click.option(
-    "--detect",
-    "detections",
-    multiple=True,
-    required=True,
-    metavar="NAME=LOSS",
-    callback=_detections,
-    help="Parameter and the fraction of it that is lost; may be given several times.",
-)
+    lines = ["\b", "Examples:", *(f"    lmshealth {example}" for example in examples)]
+    return click.command(epilog="\n".join(lines))

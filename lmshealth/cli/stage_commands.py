@@ -12,8 +12,8 @@ if TYPE_CHECKING:
     from lmshealth.stage.description import Stage
 
 
-@click.command(epilog=options.examples("stage lms-y", "stage my-stage.toml --format json"))
-@click.argument("described", metavar="STAGE", type=options.StageFile())
+@options.command("stage lms-y", "stage my-stage.toml --format json")
+@click.argument("described", metavar="STAGE", type=options.stage_file)
 @options.format_option("table", "json")
 def stage(described: Stage, style: str) -> None:
     """Check a stage description and the identifiability of its parameters.
@@ -33,14 +33,31 @@ def stage(described: Stage, style: str) -> None:
         views.print_stage(content)
 
 
-@click.command(
-    epilog=options.examples(
-        "plan --stage lms-y --detect guide_preload=0.05",
-        "plan --stage lms-y --detect guide_preload=0.1 --detect mount_stiffness=0.1 --seconds 45",
-    )
+def _detections(
+    ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
+) -> list[tuple[str, float]]:
+    """Parse NAME=LOSS, without duplicates."""
+    pairs = [value.split("=") for value in dict.fromkeys(values)]
+    try:
+        return [(name, float(loss)) for name, loss in pairs]
+    except ValueError as error:
+        raise click.BadParameter(f"needs NAME=LOSS with a number, got {values}") from error
+
+
+@options.command(
+    "plan --stage lms-y --detect guide_preload=0.05",
+    "plan --stage lms-y --detect guide_preload=0.1 --detect mount_stiffness=0.1 --seconds 45",
 )
-@options.REQUIRED_STAGE
-@options.DETECT
+@options.stage_option(required=True)
+@click.option(
+    "--detect",
+    "detections",
+    multiple=True,
+    required=True,
+    metavar="NAME=LOSS",
+    callback=_detections,
+    help="Parameter and the fraction of it that is lost; may be given several times.",
+)
 @click.option("--power", type=options.SHARE, default=0.95, help="Probability to detect the loss.")
 @click.option(
     "--false-alarm",
