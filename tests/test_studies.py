@@ -134,19 +134,20 @@ def test_paper_tables(root: Path) -> None:
     """One seed gives most of the paper's tables, and constant velocity alone less."""
     answer = json.loads(run_study(root, "paper_tables"))
 
-    def hits(summary: str, key: str) -> tuple[int, int]:
-        found, count = answer[summary][key].split(" of ")
+    def hits(plant: str, summary: str, key: str) -> tuple[int, int]:
+        found, count = answer[plant][summary][key].split(" of ")
         return int(found), int(count)
 
-    for key, least in (
-        ("table_3_std_within_1.5", 0.9),
-        ("table_4_max_magnitude_within_1.5", 0.6),
-        ("table_6_7_mode_rows_within_3", 0.7),
-    ):
-        found, count = hits("summary", key)
-        assert found >= least * count, key
-        assert hits("control_constant_velocity_only", key)[0] < found
-    assert answer["summary"]["std_of_x_below_y"] == "7 of 7"
+    for plant in ("rigid", "full"):
+        for key, least in (
+            ("table_3_std_within_1.5", 0.9),
+            ("table_4_max_magnitude_within_1.5", 0.6),
+            ("table_6_7_mode_rows_within_3", 0.7),
+        ):
+            found, count = hits(plant, "summary", key)
+            assert found >= least * count, key
+            assert hits(plant, "control_constant_velocity_only", key)[0] < found
+        assert answer[plant]["summary"]["std_of_x_below_y"] == "7 of 7"
 
 
 def test_simulation_cost(root: Path) -> None:

@@ -10,17 +10,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from models.dynamics.quantities import Number, Point, refuse_unstated
+from models.dynamics.quantities import Number, Point
 
 Array = NDArray[np.float64]
 
-# Solutions of cos(β) cosh(β) = 1, free-free, and of cos(β) cosh(β) = −1, clamped-free.
-FREE_ROOTS = (4.730040744862704, 7.853204624095838, 10.995607838001671)
+# First solutions of cos(β) cosh(β) = 1, free-free, and of cos(β) cosh(β) = −1, clamped-free.
+FREE_ROOT = 4.730040744862704
 CLAMPED_ROOT = 1.8751040687119611
 # Nodes and weights on −1..1: exact to rounding for the shapes below.
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(16)
@@ -59,31 +58,21 @@ class ElasticMode:
 
 @dataclass(frozen=True, slots=True)
 class FreeBeam:
-    """A body as a free beam along the feed: bending across the feed, or torsion about it.
+    """A body as a free beam along the feed, first bending mode in the vertical plane.
 
     Parameters
     ----------
     name, body
-        Prefix of the modes' names; index of the body, whose mass is the beam's.
-    kind
-        ``vertical`` or ``lateral`` bending, or ``torsion``.
-    modes
-        How many, from the lowest.
+        Name of the mode; index of the body, whose mass is the beam's.
     stiffness
-        Bending E I or torsional G J, N m².
+        Bending E I, N m².
     """
 
     name: str
     body: int
-    kind: str
-    modes: int
     length: Number
     stiffness: Number
     damping: Number
-
-    def __post_init__(self) -> None:
-        """Reject a number without a source, and a mass or stiffness that is not positive."""
-        refuse_unstated(self)
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +104,6 @@ class Overhang:
     stiffness: Number
     damping: Number
 
-    def __post_init__(self) -> None:
-        """Reject a number without a source, and a mass or stiffness that is not positive."""
-        refuse_unstated(self)
-
 
 @dataclass(frozen=True, slots=True)
 class Attachment:
@@ -142,24 +127,18 @@ class Attachment:
     damping: Number
     encoder: bool = False
 
-    def __post_init__(self) -> None:
-        """Reject a number without a source, and a mass or stiffness that is not positive."""
-        refuse_unstated(self)
-
 
 Part = FreeBeam | Overhang | Attachment
 
 
-def free_bending(position: Array | float, order: int) -> tuple[Array, Array]:
+def free_bending(position: Array | float) -> tuple[Array, Array]:
     """Return deflection and slope of a free beam of length 1 at −0.5..0.5, mean square 1."""
-    root = FREE_ROOTS[order]
-    at = np.asarray(position) + 0.5
-    ratio = (math.cosh(root) - math.cos(root)) / (math.sinh(root) - math.sin(root))
-    # cosh − ratio sinh = e^(−βx) + (1 − ratio) sinh: the large parts cancel at the far end.
-    grown = np.exp(-root * at) + (1 - ratio) * np.sinh(root * at)
-    fallen = -np.exp(-root * at) + (1 - ratio) * np.cosh(root * at)
-    deflection = grown + np.cos(root * at) - ratio * np.sin(root * at)
-    slope = root * (fallen - np.sin(root * at) - ratio * np.cos(root * at))
+    at = FREE_ROOT * (np.asarray(position) + 0.5)
+    ratio = (math.cosh(FREE_ROOT) - math.cos(FREE_ROOT)) / (
+        math.sinh(FREE_ROOT) - math.sin(FREE_ROOT)
+    )
+    deflection = np.cosh(at) + np.cos(at) - ratio * (np.sinh(at) + np.sin(at))
+    slope = FREE_ROOT * (np.sinh(at) - np.sin(at) - ratio * (np.cosh(at) + np.cos(at)))
     return deflection, slope
 
 
@@ -176,39 +155,18 @@ def _nowhere(point: Array) -> Array:
     return np.zeros(3)
 
 
-def _bent(order: int, axis: int, length: float, mass: float, point: Array) -> Array:
-    """Return the displacement (3,) of a point in a free bending mode, 1/√kg.
+def beam_mode(part: FreeBeam, mass: float) -> ElasticMode:
+    """Return the mode of a free beam of a mass, kg."""
+    length = part.length.value
+    omega = FREE_ROOT**2 * math.sqrt(part.stiffness.value / (mass * length**3))
 
-    Cross-sections stay plane: they turn about the neutral axis.
-    """
-    deflection, slope = free_bending(point[0] / length, order)
-    moved = deflection * _UNIT[axis] - point[axis] * slope / length * _UNIT[0]
-    return np.asarray(moved / math.sqrt(mass))
+    def shape(point: Array) -> Array:
+        deflection, slope = free_bending(point[0] / length)
+        # Cross-sections stay plane: they turn about the neutral axis.
+        moved = deflection * _UNIT[2] - point[2] * slope / length * _UNIT[0]
+        return np.asarray(moved / math.sqrt(mass))
 
-
-def _twisted(order: int, radius: float, length: float, mass: float, point: Array) -> Array:
-    """Return the displacement (3,) of a point in a free torsional mode, 1/√kg."""
-    turn = math.cos((order + 1) * math.pi * (point[0] / length + 0.5))
-    turn *= math.sqrt(2 / mass) / radius
-    return turn * np.array([0.0, -point[2], point[1]])
-
-
-def beam_modes(part: FreeBeam, mass: float, radius: float) -> list[ElasticMode]:
-    """Return the modes of a free beam of a mass (kg) and radius of gyration about it (m)."""
-    length, stiffness = part.length.value, part.stiffness.value
-    shape: Callable[[Array], Array]
-    modes = []
-    for order in range(part.modes):
-        if part.kind == "torsion":
-            wave = (order + 1) * math.pi
-            omega = wave * math.sqrt(stiffness / (mass * length)) / radius
-            shape = partial(_twisted, order, radius, length, mass)
-        else:
-            omega = FREE_ROOTS[order] ** 2 * math.sqrt(stiffness / (mass * length**3))
-            shape = partial(_bent, order, 1 if part.kind == "lateral" else 2, length, mass)
-        name = f"{part.name}_{order + 1}" if part.modes > 1 else part.name
-        modes.append(ElasticMode(name, omega, part.damping.value, np.zeros(6), shape))
-    return modes
+    return ElasticMode(part.name, omega, part.damping.value, np.zeros(6), shape)
 
 
 def _momentum(arm: Array, unit: Array) -> Array:

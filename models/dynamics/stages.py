@@ -15,7 +15,7 @@ from models.dynamics.elastic import (
     Overhang,
     Part,
     attached_mode,
-    beam_modes,
+    beam_mode,
     overhang_mode,
 )
 from models.dynamics.quantities import Number, Point, refuse_unstated
@@ -90,8 +90,9 @@ class Flexible:
     bench_offset: Number
 
     def __post_init__(self) -> None:
-        """Reject a number without a source."""
-        refuse_unstated(self)
+        """Reject a number without a source, and a mass or stiffness that is not positive."""
+        for owner in (self, *self.parts):
+            refuse_unstated(owner)
 
 
 @dataclass(frozen=True, slots=True)
@@ -243,7 +244,7 @@ def _attached(
 def _bending(name: str, body: int, length: float, stiffness: float) -> FreeBeam:
     """Return the first vertical bending of a body, from its dimensions alone."""
     sizes = Number(length, "m", "our choice"), Number(stiffness, "N m²", "our choice")
-    return FreeBeam(name, body, "vertical", 1, *sizes, Number(0.005, "1", "our choice"))
+    return FreeBeam(name, body, *sizes, Number(0.005, "1", "our choice"))
 
 
 def _load(name: str, bends: int, parity: int, mass: float, stiffness: float) -> Overhang:
@@ -320,6 +321,7 @@ _FULL_Y = replace(
     mount_loss_time=Number(1.2e-5, "s", "our choice"),
     isolator_horizontal_loss_time=Number(0.5e-3, "s", "our choice"),
     housing_box=Point((0.60, 0.165, 0.06), "m", "our choice"),
+    feedforward_lead=Number(5.0e-5, "s", "our choice"),  # by eye on Table 3
     mount_half_spacing=Point((0.104, 0.050, -0.060), "m", "our choice"),
     block_stiffness=Number(4.434358e07, "N/m", "calibrated"),
     isolator_feed=Number(2058052, "N/m", "calibrated"),
@@ -495,7 +497,7 @@ def _elastic(
         if part.body != index:
             continue
         if isinstance(part, FreeBeam):
-            modes += beam_modes(part, body.mass, body.radii[0])
+            modes.append(beam_mode(part, body.mass))
         elif isinstance(part, Overhang):
             carried = 1 + condition.added_payload / stage.payload.value
             modes.append(overhang_mode(part, np.array(body.centre), carried))

@@ -7,7 +7,7 @@ The paper states none of these levels: they are fitted to its Tables 3, 4, 6 and
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,33 +70,73 @@ class Line:
     output: str
 
 
-# Force along the feed, one sequence per block.  X needs more than Y: its stiffer loop would
-# otherwise leave a fifth of Y's error where Table 3 has one half.
-FRICTION = {
-    "lms-x": Noise(density=0.0105, power=0.35, corner_hz=10.0),
-    "lms-y": Noise(density=0.0034, power=0.4, corner_hz=10.0),
-    "lms-x-full": Noise(density=0.0105, power=0.35, corner_hz=10.0),
-    "lms-y-full": Noise(density=0.0034, power=0.4, corner_hz=10.0),
+@dataclass(frozen=True, slots=True)
+class Levels:
+    """What differs from stage to stage.
+
+    Parameters
+    ----------
+    friction
+        Force along the feed, one sequence per block.  X as rigid bodies needs more than Y: its
+        stiffer loop would otherwise leave a fifth of Y's error where Table 3 has one half.
+    roughness
+        Force across the feed, lateral and vertical, one sequence per block and direction: from 1 to
+        20 mm/s Table 7 hardly grows, from there to 400 mm/s a hundredfold.
+    accelerometer
+        An accelerometer's own noise (m/s²), and what the rolling balls make the spot under it
+        tremble: bodies do not, but Tables 6 and 7 have it between all modes at high velocity.
+    encoder
+        Amplitude of the first two harmonics of the encoder's period, m.
+    mains
+        Lines at 50 Hz and its multiples that no velocity moves (Hz, m/s²).
+    """
+
+    friction: Noise
+    roughness: Noise
+    accelerometer: Noise
+    encoder: tuple[float, float]
+    mains: tuple[tuple[float, float], ...]
+
+
+_X = Levels(
+    friction=Noise(density=0.0105, power=0.35, corner_hz=10.0),
+    roughness=Noise(0.0022, power=0.4, corner_hz=200.0, fast_density=0.0012, fast_power=1.5),
+    accelerometer=Noise(4.0e-5, 0.0, math.inf, fast_density=2.0e-5, fast_power=1.8),
+    encoder=(8.0e-9, 4.0e-9),
+    mains=((50.0, 15.0e-3), (100.0, 2.3e-3), (150.0, 10.0e-3), (200.0, 3.2e-3), (250.0, 1.9e-3)),
+)
+_Y = replace(
+    _X,
+    friction=Noise(density=0.0034, power=0.4, corner_hz=10.0),
+    mains=((50.0, 23.0e-3), (100.0, 3.9e-3), (150.0, 7.0e-3), (250.0, 1.0e-3), (350.0, 5.0e-3)),
+)
+# The guides of the full stages lose less (loss time): less roughness shakes them as much.  Their
+# softer loops leave more friction beside the encoder's lines of Table 4.  Their accelerometers have
+# the floor of the tables, and in Y, where most rows grow with velocity, more of the balls.
+LEVELS = {
+    "lms-x": _X,
+    "lms-y": _Y,
+    "lms-x-full": replace(
+        _X,
+        friction=Noise(density=0.0052, power=0.35, corner_hz=10.0),
+        roughness=Noise(0.0014, power=0.4, corner_hz=200.0, fast_density=0.0005, fast_power=1.5),
+        accelerometer=Noise(1.0e-4, 0.0, math.inf, fast_density=2.0e-5, fast_power=1.8),
+        encoder=(12.0e-9, 9.0e-9),
+    ),
+    "lms-y-full": replace(
+        _Y,
+        friction=Noise(density=0.0066, power=0.61, corner_hz=10.0),
+        roughness=Noise(0.0013, power=0.4, corner_hz=200.0, fast_density=0.0008, fast_power=1.5),
+        accelerometer=Noise(1.0e-4, 0.0, math.inf, fast_density=4.5e-5, fast_power=1.8),
+        encoder=(12.0e-9, 9.0e-9),
+    ),
 }
-# Force across the feed, lateral and vertical, one sequence per block and direction: from 1 to
-# 20 mm/s Table 7 hardly grows, from there to 400 mm/s a hundredfold.
-ROUGHNESS = Noise(0.0022, power=0.4, corner_hz=200.0, fast_density=0.0012, fast_power=1.5)
 GROUND_FLAT = Noise(density=4.0e-5, power=0.0, corner_hz=80.0)
 GROUND_UPRIGHT = Noise(density=1.0e-3, power=0.0, corner_hz=15.0)
 # The motor and the encoder themselves add next to nothing between their orders.
 MOTOR = Noise(density=2.0e-4, power=0.0, corner_hz=1000.0)
 ENCODER = Noise(density=1.0e-12, power=0.0, corner_hz=5000.0)
 
-# An accelerometer's own noise (m/s²), and what the rolling balls make the spot under it tremble:
-# rigid bodies do not, but Tables 6 and 7 have it between all modes at high velocity.
-ACCELEROMETER = Noise(4.0e-5, 0.0, math.inf, fast_density=2.0e-5, fast_power=1.8)
-
-# Tables 6 and 7 have lines at 50 Hz and its multiples that no velocity moves (m/s²).
-_MAINS = {
-    "lms-x": {50.0: 15.0e-3, 100.0: 2.3e-3, 150.0: 10.0e-3, 200.0: 3.2e-3, 250.0: 1.9e-3},
-    "lms-y": {50.0: 23.0e-3, 100.0: 3.9e-3, 150.0: 7.0e-3, 250.0: 1.0e-3, 350.0: 5.0e-3},
-}
-_MAINS |= {f"{name}-full": lines for name, lines in _MAINS.items()}
 # The cable of the accelerometer along the feed picks up less: our choice.
 _MAINS_SHARE = {"acc_feed": 0.7, "acc_pitch": 1.0}
 
@@ -105,7 +145,7 @@ def mains(stage: Stage) -> tuple[Line, ...]:
     """Return the mains lines that the accelerometers of a stage pick up."""
     return tuple(
         Line(hertz, share * amplitude, output)
-        for hertz, amplitude in _MAINS[stage.name].items()
+        for hertz, amplitude in LEVELS[stage.name].mains
         for output, share in _MAINS_SHARE.items()
     )
 
@@ -113,7 +153,8 @@ def mains(stage: Stage) -> tuple[Line, ...]:
 def _noise_of(stage: Stage, name: str) -> Noise:
     """Return the noise of an input."""
     if name.startswith("block"):
-        return FRICTION[stage.name] if name.endswith("x") else ROUGHNESS
+        levels = LEVELS[stage.name]
+        return levels.friction if name.endswith("x") else levels.roughness
     if name.startswith("ground"):
         return GROUND_UPRIGHT if name.endswith("z") else GROUND_FLAT
     return MOTOR if name == "motor_force" else ENCODER
@@ -145,13 +186,14 @@ def orders(stage: Stage) -> tuple[Order, ...]:
     vertical = tuple(name for name in INPUTS if name.startswith("block") and name.endswith("z"))
     ball, magnet = stage.ball_pitch.value, stage.magnet_pitch.value
     period = stage.encoder_period.value
+    first, second = LEVELS[stage.name].encoder
     return (
         Order("ball pass", ball, 1, 0.30, vertical),
         Order("ball pass", ball, 2, 0.10, vertical),
         Order("magnet pitch", magnet, 1, 0.010, ("motor_force",)),
         Order("magnet pitch", magnet, 6, 0.015, ("motor_force",)),
-        Order("encoder period", period, 1, 8.0e-9, ("encoder_error",)),
-        Order("encoder period", period, 2, 4.0e-9, ("encoder_error",)),
+        Order("encoder period", period, 1, first, ("encoder_error",)),
+        Order("encoder period", period, 2, second, ("encoder_error",)),
     )
 
 

@@ -29,7 +29,7 @@ from models.dynamics.plant import (
 from models.dynamics.stages import NOMINAL, Condition, Stage, build_structure, tuning_named
 from models.errors import BadParameter
 from models.recordings.disturbances import (
-    ACCELEROMETER,
+    LEVELS,
     drawn_orders,
     mains,
     noise_corners,
@@ -157,7 +157,7 @@ def sense(outputs: Array, stage: Stage, velocity: Array, rng: np.random.Generato
         m/s.
     """
     _add_lines(outputs, *_mains_gains(stage, rng))
-    noise = ACCELEROMETER.at(velocity) * np.sqrt(SAMPLE_RATE_HZ / 2)
+    noise = LEVELS[stage.name].accelerometer.at(velocity) * np.sqrt(SAMPLE_RATE_HZ / 2)
     reach = stage.acc_range.value
     for name in ("acc_feed", "acc_pitch"):
         sensed = outputs[OUTPUTS.index(name)]
@@ -253,7 +253,7 @@ def _sensor_floor(stage: Stage, velocity: float) -> Array:
     """Return the density (output,) of quantisation and accelerometer noise."""
     floor = np.zeros(len(OUTPUTS))
     floor[0] = stage.encoder_count.value**2 / 12 * 2 / SAMPLE_RATE_HZ
-    floor[2:] = ACCELEROMETER.at(np.asarray(velocity)) ** 2
+    floor[2:] = LEVELS[stage.name].accelerometer.at(np.asarray(velocity)) ** 2
     return floor
 
 

@@ -15,7 +15,7 @@ from models.dynamics.plant import INPUTS, closed_loop
 from models.dynamics.stages import NOMINAL, Condition, Stage, tuning_named
 from models.errors import BadParameter
 from models.recordings.disturbances import drawn_orders, noise_levels
-from models.recordings.motion_profile import Profile
+from models.recordings.motion_profile import JERK, Profile
 from models.recordings.recording import (
     SAMPLE_RATE_HZ,
     Recording,
@@ -44,7 +44,8 @@ _ORDERS_S = 2.0
 
 def full_stroke(stage: Stage, velocity: float) -> Profile:
     """Return one full stroke at a set velocity (m/s)."""
-    return Profile(velocity, min(STROKE, 0.95 * stage.travel.value))
+    jerk = tuning_named(stage.name, "commissioning").jerk or JERK
+    return Profile(velocity, min(STROKE, 0.95 * stage.travel.value), jerk=jerk)
 
 
 def commands(stage: Stage, condition: Condition, reference: Array) -> Array:

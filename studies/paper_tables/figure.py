@@ -15,12 +15,13 @@ ERRATUM = {"color": "#56606b", "arrowprops": {"arrowstyle": "-", "color": "#5660
 
 
 def over_velocity(ax: Axes, rows: list[Row], key: str, label: str) -> None:
-    """Draw a row of X and of Y, printed as points and simulated as a line with its scatter."""
+    """Draw a row of X and of Y: printed as points, full stages as a line, rigid as a dashed one."""
     for axis, colour in COLOURS.items():
-        row = next(row for row in rows if row["row"] == f"{axis} {key}")
+        rigid, row = (row for row in rows if row["row"] == f"{axis} {key}")
+        ax.plot(VELOCITIES, rigid["simulated"], "--", lw=1, color=colour)
         mean, scatter = np.array(row["simulated"]), np.array(row["scatter"])
         name = axis.upper()
-        ax.plot(VELOCITIES, mean, color=colour, label=f"{name} simulated, ±1σ of seeds")
+        ax.plot(VELOCITIES, mean, color=colour, label=f"{name} full stage, ±1σ of seeds")
         ax.fill_between(VELOCITIES, mean - scatter, mean + scatter, color=colour, alpha=0.2, lw=0)
         style = {"color": colour, "mfc": "white", "label": f"{name} printed"}
         ax.plot(VELOCITIES, row["printed"], "o", **style)
@@ -33,8 +34,8 @@ def over_velocity(ax: Axes, rows: list[Row], key: str, label: str) -> None:
 
 
 def over_frequency(ax: Axes, rows: list[Row], axis: str, table: str) -> None:
-    """Draw magnitudes over frequency at 10 and 400 mm/s."""
-    own = [row for row in rows if row["table"] == table]
+    """Draw magnitudes of the full stage over frequency at 10 and 400 mm/s."""
+    own = [row for row in rows if row["table"] == table and row["plant"] == "full"]
     hertz = [int(row["row"].split()[1]) for row in own]
     for cell, colour in ((2, GREEN), (6, PINK)):
         for key, style in (("simulated", "-"), ("printed", "o")):

@@ -1,17 +1,18 @@
 """What of the paper's tables do the simulated stages reproduce?
 
 Method
-    Tables 1-7 of doi 10.3390/math9090951 and its velocity experiments on the simulated X and Y. Per
-    velocity and seed one window of 4 s about the middle of a full stroke of 280 mm; Δe and the
-    accelerations are read as the paper reads them. Levels of friction, roughness and mains were set
-    on these tables: agreement shows that one small set of levels serves all of them. Rows at
-    multiples of 50 Hz hold mains whose amplitude was set on that very row; the count is given
-    without them too. Table 1 is from the loops with the flexible modes inside, Table 2 from sine
-    sweeps while moving, Table 5 from the closed-loop modes. Cells are means over seeds. Control:
-    the same tables from constant velocity alone, without acceleration and braking. ``printed/``
-    holds the paper's numbers, errata included; tables.md has every cell.
+    Tables 1-7 of doi 10.3390/math9090951 and its velocity experiments on the simulated X and Y, as
+    rigid bodies on springs in the loop of the equations (rigid), and with elastic parts in the loop
+    as measured (full). Per velocity and seed one window of 4 s about the middle of a full stroke of
+    280 mm; Δe and the accelerations are read as the paper reads them. Levels of friction,
+    roughness, noise and mains were set on these tables: agreement shows that one small set of
+    levels serves all of them. Rows at multiples of 50 Hz hold mains whose amplitude was set on that
+    very row; the count is given without them too. Table 1 is from the loops with the flexible modes
+    inside, Table 2 from sine sweeps while moving, Table 5 from the closed-loop modes. Cells are
+    means over seeds. Control: the same tables from constant velocity alone, without acceleration
+    and braking. ``printed/`` holds the paper's numbers, errata included; tables.md has every cell.
 Run time
-    About three minutes on one processor.
+    About ten minutes on one processor.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ GROWTH, HIGH_MM_S2 = 10.0, 15.0
 
 _ELASTIC = "three rigid bodies have no such mode: bending parts or others"
 _FLOOR = "printed floor of the instrument: simulated accelerometers are quieter"
-_NO_LINE = "the paper's loop has lines or resonances there that three rigid bodies do not have"
+_NO_LINE = "the paper's loop has lines or resonances there that nothing excites in the simulated"
 REASONS = {
     "bandwidth_hz": "printed from the measured loop, whose gain the printed equations do not have",
     "gain_margin_db": "the resonances that limit the measured loop are those of bending parts",
@@ -49,6 +50,8 @@ REASONS = {
     "y bandwidth_hz": _NO_LINE,
     "x bandwidth_above_30nm_hz": "at 200 and 400 mm/s pitch (272 Hz) just passes 30 nm",
     "y bandwidth_above_30nm_hz": "at 100 mm/s pitch (137 Hz) already passes 30 nm",
+    "y 11.7 Hz": "Table 5 has it at 12.4 Hz: an encoder beside the motor sees it above that",
+    "y 117 Hz": "Table 5 has roll at 126.4 Hz: the same mode measured in two ways",
     "x 340 Hz": "printed 4.9 mm/s² at every slow velocity: a line of unknown source",
 }
 
@@ -56,22 +59,33 @@ REASONS = {
 def main() -> None:
     """Run the study; ``--quick`` takes one seed, short controls, no Table 2, records nothing."""
     study = Study(__file__, __doc__, seeds=20)
-    quick, seeds = study.quick, 1 if study.quick else study.options.seeds
-    rows = tables.loop_rows() + ([] if quick else tables.resonance_rows()) + tables.modal_rows()
-    moved = [row for axis in tables.FILES for row in tables.velocity_rows(axis, seeds)]
+    seeds = 1 if study.quick else study.options.seeds
+    answer: Row = {"seeds": seeds}
+    rows = []
+    for plant in tables.PLANTS:
+        answer[plant], own = examine(plant, seeds, quick=study.quick)
+        rows += [{"plant": plant, **record(row)} for row in own]
+    study.conclude(answer, details={"rows": rows})
+    if not study.quick:
+        page = Path(__file__).with_name("tables.md")
+        page.write_text(markdown(rows, seeds), encoding="utf-8")
+
+
+def examine(plant: str, seeds: int, *, quick: bool) -> tuple[Row, list[tables.TableRow]]:
+    """Return the answer about a plant, and all rows of its tables."""
+    rows = tables.loop_rows(plant) + tables.modal_rows(plant)
+    rows += [] if quick else tables.resonance_rows(plant)
+    moved = [row for axis in tables.FILES for row in tables.velocity_rows(axis, plant, seeds)]
     few, length = min(seeds, 2), 1.0 if quick else WINDOW_S
-    control = [row for axis in tables.FILES for row in tables.velocity_rows(axis, few, length)]
+    control = [
+        row for axis in tables.FILES for row in tables.velocity_rows(axis, plant, few, length)
+    ]
     answer = {
-        "seeds": seeds,
         "summary": summarise(moved),
         "control_constant_velocity_only": summarise(control),
         "growing_with_velocity": {axis: growing(axis, moved) for axis in tables.FILES},
     }
-    rows = [record(row) for row in (*rows, *moved)]
-    study.conclude(answer, details={"rows": rows})
-    if not quick:
-        page = Path(__file__).with_name("tables.md")
-        page.write_text(markdown(rows, seeds), encoding="utf-8")
+    return answer, sorted([*rows, *moved], key=lambda row: row.table)
 
 
 def ratios(row: tables.TableRow) -> np.ndarray:
@@ -93,12 +107,13 @@ def within(row: tables.TableRow, factor: float) -> list[bool]:
 
 def verdict(row: tables.TableRow) -> str:
     """Judge a row: by its worst cell, then by its trend over velocity."""
-    tight = {"Table 1": 1.05, "Table 2": 1.1, "Table 5": 1.03}.get(row.table)
-    if tight is not None:
-        if not all(within(row, tight)):
+    limits = {"Table 1": (1.05, 1.1), "Table 2": (1.03, 1.1), "Table 5": (1.015, 1.03)}
+    if row.table in limits:
+        met = next((limit for limit in limits[row.table] if all(within(row, limit))), None)
+        if met is None:
             return "not reproduced"
         hidden = row.table == "Table 2" and row.mode is not None
-        return "mode there, hardly along the feed" if hidden else f"match within {tight:g}"
+        return "mode there, hardly along the feed" if hidden else f"match within {met:g}"
     for factor in (1.05, 1.5, 3.0):
         if all(within(row, factor)):
             return f"match within {factor:g}"
@@ -196,57 +211,102 @@ def growing(axis: str, rows: list[tables.TableRow]) -> Row:
 
 
 def markdown(rows: list[Row], seeds: int) -> str:
-    """Return all rows as one page of tables: simulated / printed."""
+    """Return all rows as one page of tables: rigid, full / printed."""
     lines = ["# Simulated beside printed", ""]
     lines += [
-        f"Means over {seeds} seeds; each cell: simulated / printed. Velocities of Tables "
-        "3, 4, 6 and 7: 1, 5, 10, 20, 100, 200, 400 mm/s. Made by `run.py`.",
+        f"Means over {seeds} seeds; each cell: rigid stage, full stage / printed. Velocities of "
+        "Tables 3, 4, 6 and 7: 1, 5, 10, 20, 100, 200, 400 mm/s. Made by `run.py`.",
         "",
     ]
-    for table in dict.fromkeys(row["table"] for row in rows):
-        own = [row for row in rows if row["table"] == table]
-        width = max(len(row["printed"]) for row in own)
+    rigid = {(row["table"], row["row"]): row for row in rows if row["plant"] == "rigid"}
+    full = {(row["table"], row["row"]): row for row in rows if row["plant"] == "full"}
+    for table in dict.fromkeys(table for table, _ in full):
+        own = [key for key in full if key[0] == table]
+        width = max(len(full[key]["printed"]) for key in own)
         head = {7: list(tables.printed(3)["velocity_mm_s"]), 2: ["X", "Y"], 1: ["Hz"]}[width]
-        lines += [f"## {table}", "", "| row | " + " | ".join(map(str, head)) + " | verdict | why |"]
-        lines.append("| --- |" + " --- |" * (width + 2))
-        for row in own:
-            pairs = zip(row["simulated"], row["printed"], strict=True)
-            cells = [f"{'–' if s is None else f'{s:.3g}'} / {p:.4g}" for s, p in pairs]
-            name = row["row"] + (f" ({row['mode']})" if row["mode"] else "")
-            lines.append("| " + " | ".join([name, *cells, row["verdict"], row["why"]]) + " |")
+        names = ["row", *map(str, head), "rigid", "full", "why not"]
+        lines += [f"## {table}", "", "| " + " | ".join(names) + " |"]
+        lines.append("| " + " | ".join(["---"] * len(names)) + " |")
+        for key in own:
+            one, other = rigid[key], full[key]
+            columns = zip(one["simulated"], other["simulated"], other["printed"], strict=True)
+            cells = [f"{_short(r)}, {_short(f)} / {p:.4g}" for r, f, p in columns]
+            name = key[1] + (f" ({other['mode']})" if other["mode"] else "")
+            judged = [one["verdict"], other["verdict"], other["why"]]
+            lines.append("| " + " | ".join([name, *cells, *judged]) + " |")
         lines.append("")
     return "\n".join(lines)
 
 
+def _short(value: float | None) -> str:
+    """Return a number of a cell, or a dash where there is none."""
+    return "–" if value is None else f"{value:.3g}"
+
+
+def along_the_feed(rows: list[Row], plant: str) -> list[bool]:
+    """Return whether each resonance of Table 2 is seen along the feed, within 3 %."""
+    own = [row for row in rows if row["table"] == "Table 2" and row["plant"] == plant]
+    return [row["verdict"] == "match within 1.03" for row in own]
+
+
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim which cells of the paper's tables are reproduced."""
-    rows, control = answer["rows"], answer["control_constant_velocity_only"]
-    modal = [x for row in rows if row["table"] == "Table 5" for x in row["ratio"]]
-    off = [abs(x - 1) for x in modal if x is not None]
-    yield Claim(
-        "Table 5, all cells, off at most",
-        percents([max(off)]),
-        "",
-        "3 % required",
-        max(off) <= 0.03,
-    )
+    """Claim which cells of the paper's tables the full stages reproduce, beside the rigid."""
+    rows = answer["rows"]
+    modal = {
+        plant: max(
+            abs(row["ratio"][0] - 1)
+            for row in rows
+            if (row["plant"], row["table"]) == (plant, "Table 5")
+        )
+        for plant in tables.PLANTS
+    }
+    text = f"rigid {percents([modal['rigid']])}; 1.5 % asked"
+    yield Claim("Table 5, all cells, off at most", percents([modal["full"]]), "", text,
+                modal["full"] <= 0.015)  # fmt: skip
     for key, what in COUNTS.items():
-        yield Claim(
-            what,
-            answer["summary"][key],
-            f"means over {answer['seeds']} seeds",
-            f"constant velocity alone: {control[key]}",
-        )
-    for table, what in (("Table 1", "margins"), ("Table 2", "resonances")):
-        own = [row["verdict"] != "not reproduced" for row in rows if row["table"] == table]
-        yield Claim(f"{what} of {table} that are there", f"{sum(own)} of {len(own)}", met=all(own))
-    for axis, row in answer["growing_with_velocity"].items():
-        found, named = row["named_and_simulated"].split(" of ")
-        yield Claim(
-            f"frequencies reported to grow with velocity that do ({axis.upper()})",
-            row["named_and_simulated"],
-            met=found == named,
-        )
+        summary = [answer[plant]["summary"][key] for plant in tables.PLANTS]
+        control = answer["full"]["control_constant_velocity_only"][key]
+        beside = f"rigid: {summary[0]}; constant velocity alone: {control}"
+        yield Claim(what, summary[1], f"means over {answer['seeds']} seeds", beside)
+    there = {
+        plant: [r["verdict"] != "not reproduced" for r in rows
+                if (r["plant"], r["table"]) == (plant, "Table 1")]
+        for plant in tables.PLANTS
+    }  # fmt: skip
+    seen = {plant: along_the_feed(rows, plant) for plant in tables.PLANTS}
+    for what, hits, least in (
+        ("settings and margins of Table 1 within 10 %", there, 7),
+        ("resonances of Table 2 seen along the feed, within 3 %", seen, 18),
+    ):
+        beside = f"rigid: {sum(hits['rigid'])} of {len(hits['rigid'])}; {least} asked"
+        found = sum(hits["full"])
+        yield Claim(what, f"{found} of {len(hits['full'])}", "", beside, met=found >= least)
+    grown = {plant: grown_rows(answer[plant]["growing_with_velocity"]) for plant in tables.PLANTS}
+    named, others, count = grown["full"]
+    yield Claim(
+        "frequencies said to grow with velocity that do (Figure 18)",
+        f"{named} of {count}",
+        "",
+        f"rigid: {grown['rigid'][0]} of {count}; 12 asked; {others} other rows grow as well "
+        f"(rigid {grown['rigid'][1]}, printed {_printed_others(answer)})",
+        met=named >= 12,
+    )
+
+
+def grown_rows(growing: Row) -> tuple[int, int, int]:
+    """Return how many named frequencies grow, how many others do, and how many are named."""
+    pairs = [(set(r["named_by_the_paper"]), set(r["simulated_by_the_same_rule"]))
+             for r in growing.values()]  # fmt: skip
+    named = sum(len(a & b) for a, b in pairs)
+    return named, sum(len(b - a) for a, b in pairs), sum(len(a) for a, _ in pairs)
+
+
+def _printed_others(answer: Row) -> int:
+    """Return how many rows that the paper does not name grow by its own numbers."""
+    return sum(
+        len(set(r["printed_by_one_rule"]) - set(r["named_by_the_paper"]))
+        for r in answer["full"]["growing_with_velocity"].values()
+    )
 
 
 if __name__ == "__main__":

@@ -14,7 +14,7 @@ from scipy.signal import find_peaks
 from models.dynamics.equations import controller
 from models.dynamics.margins import cases, margin_record
 from models.dynamics.plant import closed_loop_modes
-from models.dynamics.stages import STAGES
+from models.dynamics.stages import Stage, stage_named
 from models.recordings.recording import Recording, record
 from models.recordings.strokes import VELOCITIES, full_stroke, record_strokes
 from models.recordings.sweep import Sweep, record_sweep
@@ -23,6 +23,8 @@ Array = NDArray[np.float64]
 
 PRINTED = Path(__file__).parent / "printed"
 FILES = {"x": "lms-x", "y": "lms-y"}
+# Rigid bodies on springs; and with elastic parts inside the loop as measured.
+PLANTS = ("rigid", "full")
 COUNT, FLOOR_UM = 100, 0.030
 # A resonance stands out of the smoothed response by this much.
 PROMINENCE_DB = 0.5
@@ -49,6 +51,11 @@ class TableRow:
     simulated: tuple[float, ...]
     scatter: tuple[float, ...] = ()
     mode: str | None = None
+
+
+def stage_of(axis: str, plant: str) -> Stage:
+    """Return the simulated stage of an axis: a plant of `PLANTS`."""
+    return stage_named(FILES[axis] + "-full" * (plant == "full"))
 
 
 def printed(number: int) -> pd.DataFrame:
@@ -93,13 +100,13 @@ def acceleration_reading(recording: Recording, bands: Iterable[Array]) -> list[f
     return [float(magnitude[row].max()) for row in inside]
 
 
-def bands_of(axis: str) -> list[Array]:
+def bands_of(axis: str, plant: str) -> list[Array]:
     """Return the bands (band, 2) in Hz in which each row of Table 6 or 7 is read.
 
     A row without a mode: ±5 Hz about its number.  A row with a mode: ±4 Hz about the simulated
     mode, and, where the number is a multiple of 50 Hz, the mains line that stands in it.
     """
-    modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[FILES[axis]])}
+    modes = {m.name: m.frequency_hz for m in closed_loop_modes(stage_of(axis, plant))}
     bands = []
     for hertz in printed(6 if axis == "x" else 7)["frequency_hz"]:
         if hertz not in MODE_ROWS[axis]:
@@ -111,9 +118,9 @@ def bands_of(axis: str) -> list[Array]:
     return [np.array(row) for row in bands]
 
 
-def moves(axis: str, seed: int, constant: float | None = None) -> list[Recording]:
+def moves(axis: str, plant: str, seed: int, constant: float | None = None) -> list[Recording]:
     """Return the record of every velocity, or of so many s of its constant part alone."""
-    stage = STAGES[FILES[axis]]
+    stage = stage_of(axis, plant)
     records = []
     for velocity in VELOCITIES:
         rng = np.random.default_rng([seed, round(velocity * 1e6)])
@@ -126,12 +133,14 @@ def moves(axis: str, seed: int, constant: float | None = None) -> list[Recording
     return records
 
 
-def velocity_rows(axis: str, seeds: int, constant: float | None = None) -> list[TableRow]:
+def velocity_rows(
+    axis: str, plant: str, seeds: int, constant: float | None = None
+) -> list[TableRow]:
     """Return the rows of Tables 3, 4 and 6 or 7 of one configuration; see `moves`."""
-    bands, number = bands_of(axis), 6 if axis == "x" else 7
+    bands, number = bands_of(axis, plant), 6 if axis == "x" else 7
     errors, accelerations = [], []
     for seed in range(seeds):
-        records = moves(axis, seed, constant)
+        records = moves(axis, plant, seed, constant)
         errors.append([error_reading(record) for record in records])
         accelerations.append([acceleration_reading(record, bands) for record in records])
     cells = {**printed(3).to_dict("list"), **printed(4).to_dict("list")}
@@ -158,8 +167,10 @@ def _row(
                     tuple(spread.tolist()), mode)  # fmt: skip
 
 
-def loop_rows() -> list[TableRow]:
+def loop_rows(plant: str) -> list[TableRow]:
     """Return Table 1: margins with the flexible modes inside, filters from equations 8 and 9.
+
+    Of the rigid stages the loop is that of the corrected equations, of the full that of the drive.
 
     The velocity loop's P stands in the equations only as a product with a scale, so that they tell
     I/P alone.
@@ -168,11 +179,11 @@ def loop_rows() -> list[TableRow]:
     ratio = table.loc["velocity_loop_i"] / table.loc["velocity_loop_p"]
     table.loc["velocity_loop_i_over_p"] = ratio
     found: dict[str, list[float]] = {}
-    for name in STAGES:
+    for axis, name in FILES.items():
         (loop,) = (
             row
-            for row in map(margin_record, cases(name))
-            if (row["reading"], row["structure"]) == ("corrected", "flexible")
+            for row in map(margin_record, cases(stage_of(axis, plant).name))
+            if row["structure"] == "flexible" and row["reading"] in ("corrected", "measured")
         )
         gain = next(c for c in loop["crossovers"] if c["phase_margin_deg"] is not None)
         upper = [c for c in loop["crossovers"] if c["crossover"].startswith("upper")]
@@ -207,9 +218,8 @@ def _controller_numbers(stage: str) -> dict[str, float]:
     }
 
 
-def _feed_response(axis: str, sweep: Sweep, logs: int) -> tuple[Array, Array]:
+def _feed_response(stage: Stage, sweep: Sweep, logs: int) -> tuple[Array, Array]:
     """Return frequencies (Hz) and |acceleration of Δe over motor current| of averaged sweeps."""
-    stage = STAGES[FILES[axis]]
     total = np.zeros((2, sweep.samples // 2 + 1), dtype=complex)
     for seed in range(logs):
         rng = np.random.default_rng(seed)
@@ -223,14 +233,14 @@ def _feed_response(axis: str, sweep: Sweep, logs: int) -> tuple[Array, Array]:
     return hertz[inside], np.abs(total[0] / total[1])[inside] * hertz[inside] ** 2
 
 
-def feed_resonances(axis: str, logs: int = 4) -> Array:
+def feed_resonances(stage: Stage, logs: int = 4) -> Array:
     """Return resonances (Hz) along the feed: peaks of acceleration over current while moving.
 
     Two sweeps: what moves the stage enough at 900 Hz would turn it back at 10 Hz.  At 28 mm/s the
     encoder's period stands at 1400 Hz, above both.
     """
     sweeps = (Sweep(8.0, 60.0, 0.2, 5.0), Sweep(50.0, 1200.0, 1.0, 5.0))
-    parts = [_feed_response(axis, sweep, logs) for sweep in sweeps]
+    parts = [_feed_response(stage, sweep, logs) for sweep in sweeps]
     low = parts[0][0] < 55
     hertz = np.concatenate([parts[0][0][low], parts[1][0][parts[1][0] >= 55]])
     level = np.concatenate([parts[0][1][low], parts[1][1][parts[1][0] >= 55]])
@@ -243,7 +253,7 @@ def feed_resonances(axis: str, logs: int = 4) -> Array:
     return np.asarray(grid[inner][peaks])
 
 
-def resonance_rows() -> list[TableRow]:
+def resonance_rows(plant: str) -> list[TableRow]:
     """Return Table 2: each printed resonance beside a simulated one within 10 % (our tolerance).
 
     A resonance that the simulated sweep shows comes first; else a mode of the structure that has
@@ -252,11 +262,13 @@ def resonance_rows() -> list[TableRow]:
     """
     table = printed(2)
     rows = []
-    for axis, name in FILES.items():
+    for axis in FILES:
+        stage = stage_of(axis, plant)
         wanted = table[f"{axis}_hz"].dropna().to_numpy(dtype=float)
-        modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[name])}
-        seen = _nearest(wanted, dict.fromkeys(feed_resonances(axis)))
-        hidden = _nearest(np.setdiff1d(wanted, list(seen)), {f: n for n, f in modes.items()})
+        modes = {m.name: m.frequency_hz for m in closed_loop_modes(stage)}
+        seen = _nearest(wanted, dict.fromkeys(feed_resonances(stage)))
+        missing = np.setdiff1d(wanted, list(seen))
+        hidden = _nearest(missing, {f: n for n, f in modes.items()}) if missing.size else {}
         for hertz in wanted.tolist():
             value, owner = seen.get(hertz) or hidden.get(hertz) or (np.nan, None)
             label = f"{axis} {hertz:g} Hz"
@@ -278,13 +290,13 @@ def _nearest(
     return pairs
 
 
-def modal_rows() -> list[TableRow]:
+def modal_rows(plant: str) -> list[TableRow]:
     """Return Table 5; labels 1 and 3 are swapped between X and Y, so modes go by frequency."""
     table = printed(5)
     order = ("granite_feed", "granite_yaw", "granite_vertical", "roll", "pitch")
     rows = []
-    for axis, name in FILES.items():
-        modes = {m.name: m.frequency_hz for m in closed_loop_modes(STAGES[name])}
+    for axis in FILES:
+        modes = {m.name: m.frequency_hz for m in closed_loop_modes(stage_of(axis, plant))}
         for line, mode in zip(table.itertuples(), order, strict=True):
             value = float(getattr(line, f"{axis}_hz"))
             label = f"{axis} {getattr(line, f'{axis}_direction')}"

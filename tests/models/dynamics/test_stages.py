@@ -25,7 +25,7 @@ def test_every_number_has_unit_and_source():
     for stage in FULL_STAGES.values():
         owners += [stage.flexible, *stage.flexible.parts]
     plain = {"name", "identity_suffix", "flexible", "parts"}
-    plain |= {"body", "kind", "modes", "along", "bends", "parity", "moves", "encoder"}
+    plain |= {"body", "along", "bends", "parity", "moves", "encoder"}
     for owner in owners:
         for field in fields(owner):
             if field.name not in plain:
@@ -60,6 +60,15 @@ def test_unknown_source_is_refused():
     """A number of unstated origin raises."""
     with pytest.raises(BadParameter, match="moving_mass"):
         replace(STAGES["lms-x"], moving_mass=Number(23.5, "kg", "somewhere"))
+
+
+@pytest.mark.parametrize("bad", [0.0, -1.0])
+def test_impossible_elastic_part_is_refused(bad):
+    """An elastic part whose stiffness is not positive raises."""
+    flexible = FULL_STAGES["lms-x-full"].flexible
+    part = replace(flexible.parts[0], stiffness=Number(bad, "N m²", "our choice"))
+    with pytest.raises(BadParameter, match=r"stiffness is .* a positive number"):
+        replace(flexible, parts=(part,))
 
 
 def test_position_beyond_the_travel_is_refused():

@@ -6,8 +6,7 @@ import pytest
 from models.dynamics.plant import INPUTS, NOISE_INPUTS
 from models.dynamics.stages import STAGES
 from models.recordings.disturbances import (
-    FRICTION,
-    ROUGHNESS,
+    LEVELS,
     drawn_orders,
     mains,
     noise_corners,
@@ -16,13 +15,14 @@ from models.recordings.disturbances import (
 )
 
 STAGE = STAGES["lms-y"]
+ROUGHNESS = LEVELS["lms-y"].roughness
 
 
 def test_noise_grows_with_velocity():
     """Friction and roughness follow their powers of velocity, the ground does not care."""
     slow, fast = (noise_levels(STAGE, np.array(v), 20000.0) for v in (0.010, 0.040))
     ratio = dict(zip(NOISE_INPUTS, fast / slow, strict=True))
-    assert ratio["block1_x"] == pytest.approx(4 ** FRICTION["lms-y"].power)
+    assert ratio["block1_x"] == pytest.approx(4 ** LEVELS["lms-y"].friction.power)
     grown = ROUGHNESS.at(np.array(0.040)) / ROUGHNESS.at(np.array(0.010))
     assert ratio["block4_z"] == pytest.approx(grown)
     assert ratio["ground_z"] == pytest.approx(1.0)
