@@ -251,6 +251,14 @@ def test_frf_lines(root: Path) -> None:
     assert answer["found"]["n"] and answer["refused"]["n"]
 
 
+def test_impact_tests(root: Path) -> None:
+    """Every double hit of a few tests is refused, no other blow is, and no mode is false."""
+    answer = json.loads(run_study(root, "impact_tests"))
+    exact = ("no mode is false", "double hits", "no other blow is refused")
+    assert all(answer["passed"][name] for name in exact)
+    assert answer["double_hits"]["n"] and answer["found"]["hits"] > 5
+
+
 def test_crossings(root: Path) -> None:
     """Some lives of each kind are never swapped silently, and both controls may be."""
     answer = json.loads(run_study(root, "crossings"))

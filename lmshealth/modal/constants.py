@@ -139,11 +139,11 @@ TRIGGER, TRIGGER_SIGMAS = 0.02, 6.0
 # in a random force does not). So many equal intervals are a periodic excitation.
 BLOW_DUTY, BLOW_ENERGY, BLOW_REPEATS = 0.05, 0.2, 3
 # A hammer bounces back within 0.1 s, and nobody strikes twice on purpose in this time in s. The
-# share of the first hit from which a second one counts: below it, it is ringing of the filter.
+# share of the main hit from which another counts: below it, it is ringing of the filter.
 DOUBLE_WITHIN, SECOND_HIT = 0.25, 0.05
 # Blows below this share of the strongest are touches.
 WEAK_BLOW = 0.1
-# Most lines of a blow: decays are cut accordingly, which the model includes.
+# Most lines of a blow: decays are cut accordingly, which does not bias their poles.
 BLOW_LINES = 3000
 # Variance of unknown noise from which the fit of one blow starts, over the power of the answer.
 BLOW_NOISE = 1e-4

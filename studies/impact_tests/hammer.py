@@ -10,8 +10,7 @@ import numpy as np
 Array = np.ndarray[Any, Any]
 
 RATE = 2000.0
-# Double hits follow after these seconds, with these shares of the first.
-DELAY, SHARE = (0.008, 0.12), (0.1, 0.7)
+DELAY = (0.008, 0.12)  # of a second hit, in s
 
 
 @dataclass(frozen=True)
@@ -27,10 +26,11 @@ class Hammer:
     white: float = 0.01  # noise of the sensor over the largest acceleration
     force_noise: float = 0.001  # of the force over the mean peak
     double: tuple[int, ...] = ()  # blows with a second hit
+    share: tuple[float, float] = (0.1, 0.7)  # its peak over that of the first
 
 
-def strike(rng: np.random.Generator, hammer: Hammer) -> tuple[Array, Array, Array]:
-    """Return force and acceleration, ``(time,)`` each, and the times of the blows in s."""
+def strike(rng: np.random.Generator, hammer: Hammer) -> tuple[Array, Array]:
+    """Return force and acceleration, ``(time,)`` each."""
     waits = hammer.seconds + rng.uniform(0, 0.1, hammer.blows)
     waits[1::2] += hammer.gap
     at = 0.3 + np.concatenate([[0.0], np.cumsum(waits[:-1])])
@@ -41,10 +41,10 @@ def strike(rng: np.random.Generator, hammer: Hammer) -> tuple[Array, Array, Arra
         force += _pulse(size, start, peak, hammer.tip)
         if k in hammer.double:
             again = start + rng.uniform(*DELAY)
-            force += _pulse(size, again, peak * rng.uniform(*SHARE), hammer.tip)
+            force += _pulse(size, again, peak * rng.uniform(*hammer.share), hammer.tip)
     answer = respond(hammer.modes, force)
     answer += hammer.white * np.abs(answer).max() * rng.standard_normal(size)
-    return force + hammer.force_noise * rng.standard_normal(size), answer, at
+    return force + hammer.force_noise * rng.standard_normal(size), answer
 
 
 def _pulse(size: int, start: float, peak: float, tip: float) -> Array:

@@ -618,7 +618,7 @@ def test_frf_reads_measured_responses(tmp_path: Path) -> None:
 def test_frf_shows_blows_and_refuses_double_hits(tmp_path: Path) -> None:
     """Recognised without an option; the table states how many are used, and which are not."""
     hammer = Hammer(((62.0, 0.02, 1.0),), blows=3, seconds=1.0, double=(1,))
-    force, answer, _ = strike(np.random.default_rng(1), hammer)
+    force, answer = strike(np.random.default_rng(1), hammer)
     np.savetxt(tmp_path / "blows.csv", np.column_stack([force, answer]), delimiter=",",
                header=f"# sample_rate_hz: {HAMMER_RATE}\ncurrent_force_a,acc_x_m_s2",
                comments="")  # fmt: skip

@@ -17,14 +17,14 @@ from lmshealth.modal.frf.responses import Frf, Pair, average_noise, check_lines,
 
 # Pulses that the filter of the force channel makes of one are no further apart, in samples.
 _RINGING = 4
-_LEAST_PRE = 4  # samples before a blow
+_LEAST_PRE = 2  # samples before a blow, and half a pulse
 # An overload: samples that equal the largest, and their share of those above 0.9 of it. A sine in
 # steps of 1 % of its amplitude spends 0.31 of these in its outermost step.
 _STUCK, _FLAT, _FINE = 3, 0.4, 0.01
 
 
 class Hit(NamedTuple):
-    """A pulse of the force, as half-open range of samples above the trigger level."""
+    """A pulse of the force: half-open range of samples above the trigger level, and its peak."""
 
     start: int
     stop: int
@@ -72,8 +72,8 @@ def from_blows(
 
     The joint likelihood of blows b with Y_b = H U_b and noise of one power depends on the data by
     Σ Y_b U_b* / √Σ|U_b|² alone (H1), and by the scatter around it, which is the noise. One blow
-    has the noise of the residual of the fit. Force outside the pulse is set to zero; the output is
-    not windowed: decays that are cut off are part of the model.
+    has the noise of the residual of the fit. Force outside the pulse is set to zero. The output is
+    not windowed: a decay that is cut off after T keeps its pole at the lines k/T.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def from_blows(
     rate = pair.log.sample_rate
     used, refused = _usable(pair, blows)
     width = max(hit.stop - hit.start for hit, _ in used)
-    before = min(max(_LEAST_PRE, width), min(hit.start for hit, _ in used))
+    before = min(_LEAST_PRE + width // 2, min(hit.start for hit, _ in used))
     n = min(stop - hit.start for hit, stop in used)
     high = min(band[1], constants.USABLE * rate)
     most = int(constants.BLOW_LINES * rate / max(high - band[0], rate / n))
@@ -92,7 +92,7 @@ def from_blows(
     at = np.arange(size)
     for force, (hit, _) in zip(cut[0], used, strict=True):
         force -= np.median(force)
-        force[(at < before - width) | (at >= before + hit.stop - hit.start + width)] = 0.0
+        force[at >= 2 * before + hit.stop - hit.start] = 0.0
     spectra = fft.rfft(cut, axis=2)[:, :, 1:] / rate
     frequency = np.arange(1, spectra.shape[2] + 1) * (rate / size)
     inside = (frequency >= band[0]) & (frequency <= high)
@@ -116,10 +116,7 @@ def from_blows(
         *pair.names, frequency, h1, std, h1, h2, hv, coherence, nan, n_blows, method="blows",
         note=f"{n_blows} of {len(blows)} blows, {size / rate:.4g} s of each.",
     )  # fmt: skip
-    weight = np.abs(cut[0])
-    centre = float(np.sum(weight * at) / np.sum(weight))
-    ordinates = Ordinates(frequency, given + 0j, answer, noise, freedom, periodic=known,
-                          at_rest=True, span=(size - centre) / rate)  # fmt: skip
+    ordinates = Ordinates(frequency, given + 0j, answer, noise, freedom, known, at_rest=True)
     return frf, ordinates, refused
 
 
@@ -129,45 +126,45 @@ def _usable(
     """Return usable blows with the sample at which the next begins, and the others."""
     log, rate, (force, output) = pair.log, pair.log.sample_rate, pair.signals
     ends = [blow[0].start for blow in blows[1:]] + [force.size]
-    margin = max(_LEAST_PRE, *(hit.stop - hit.start for blow in blows for hit in blow))
+    margin = _LEAST_PRE + max(hit.stop - hit.start for blow in blows for hit in blow)
     strongest = max(hit.peak for blow in blows for hit in blow)
     length = np.median([end - blow[0].start for blow, end in zip(blows, ends, strict=True)])
     used: list[tuple[Hit, int]] = []
     refused: list[Refusal] = []
     for number, (blow, end) in enumerate(zip(blows, ends, strict=True), start=1):
-        first, stop = blow[0], end - (margin if end < force.size else 0)
-        others = [h for h in blow[1:] if h.peak >= constants.SECOND_HIT * first.peak]
+        main, stop = max(blow, key=lambda hit: hit.peak), end - (margin if end < force.size else 0)
+        others = [h for h in blow if h != main and h.peak >= constants.SECOND_HIT * main.peak]
         why: tuple[str, str] | None = None
         if others:
             why = (
                 "double-hit",
                 (
-                    f"a second hit of {100 * others[0].peak / first.peak:.0f} % after "
-                    f"{1e3 * (others[0].start - first.start) / rate:.3g} ms; strike again"
+                    f"a second hit of {100 * others[0].peak / main.peak:.0f} %, "
+                    f"{1e3 * abs(others[0].start - main.start) / rate:.3g} ms apart; strike again"
                 ),
             )
-        elif first.peak < constants.WEAK_BLOW * strongest:
+        elif main.peak < constants.WEAK_BLOW * strongest:
             why = (
                 "weak-blow",
                 (
-                    f"{100 * first.peak / strongest:.2g} % of the strongest, needed "
+                    f"{100 * main.peak / strongest:.2g} % of the strongest, needed "
                     f"{100 * constants.WEAK_BLOW:.0f} %; strike harder"
                 ),
             )
-        elif any(_overloaded(x[first.start : stop]) for x in (force, output, -force, -output)):
+        elif any(_overloaded(x[main.start : stop]) for x in (force, output, -force, -output)):
             why = "overload", "force or output stays at its largest value; raise the range"
-        elif stop - first.start < min(length, force.size) / 2:
+        elif stop - main.start < min(length, force.size) / 2:
             why = (
                 "too-short",
                 (
-                    f"{(stop - first.start) / rate:.3g} s until the next blow or the end, half the "
+                    f"{(stop - main.start) / rate:.3g} s until the next blow or the end, half the "
                     f"others have {length / rate:.3g} s; wait longer"
                 ),
             )
         if why is None:
-            used.append((first, stop))
+            used.append((main, stop))
         else:
-            detail = f"blow {number} at {first.start / rate:.4g} s: {why[1]}"
+            detail = f"blow {number} at {main.start / rate:.4g} s: {why[1]}"
             refused.append(Refusal(log.name, why[0], detail, pair.names[0], source="frf"))
     if not used:
         raise BadLog(

@@ -119,7 +119,15 @@ def read_frf(
         blows = find_hits(pair[0], log.sample_rate, certain=not impact)
         if blows:
             measured = Pair(log, (input, output), pair, 0)
-            return _read_blows(*from_blows(measured, blows, (low, min(high, top))), log)
+            frf, ordinates, refused = from_blows(measured, blows, (low, min(high, top)))
+            return _identify(log.name, frf, ordinates, (*log.refused, *refused))
+        if impact:
+            raise BadLog(
+                log.name,
+                "not-excited",
+                f"no blow: no pulse of {input} exceeds {constants.TRIGGER_SIGMAS:g} times its "
+                "noise; strike harder, or read it without --impact",
+            )
     samples = _period(log, pair[0], period)
     band = _excited_band(pair[0], log.sample_rate, (low, min(high, top)), samples)
     lag = 0
@@ -135,23 +143,6 @@ def read_frf(
     fit = fit_response(ordinates)
     modes = _modes(log.name, frf, fit, log.refused, _lines(log, response, fit))
     return FrfReading(frf, fit, modes)
-
-
-def _read_blows(frf: Frf, ordinates: Ordinates, refused: list[Refusal], log: Log) -> FrfReading:
-    """Identify the modes of blows."""
-    if ordinates.scatter:
-        _check_coherence(log.name, frf)
-    fit = fit_response(ordinates)
-    modes = _modes(log.name, frf, fit, (*log.refused, *refused))
-    return FrfReading(_with_noise(frf, fit), fit, modes)
-
-
-def _with_noise(frf: Frf, fit: ResponseFit) -> Frf:
-    """Return a response whose noise, if it was unknown, is that of the residual of the fit."""
-    if fit.ordinates.scatter:
-        return frf
-    std = np.sqrt(fit.ordinates.noise) / np.abs(fit.ordinates.given)
-    return replace(frf, std=np.interp(frf.frequency, fit.ordinates.frequency, std))
 
 
 def read_measured(
@@ -181,12 +172,26 @@ def read_measured(
         If there are too few lines, too many, or the output does not respond.
     """
     frf, ordinates = from_measured(response, band or (0.0, np.inf), averages)
+    return _identify(response.name, frf, ordinates, window=window)
+
+
+def _identify(
+    log: str,
+    frf: Frf,
+    ordinates: Ordinates,
+    before: tuple[Refusal, ...] = (),
+    window: float | None = None,
+) -> FrfReading:
+    """Identify the modes of blows or of a measured response, whose noise may be unknown."""
     if ordinates.scatter:
-        _check_coherence(response.name, frf)
+        _check_coherence(log, frf)
     fit = fit_response(ordinates)
     if window is not None:
         fit = without_window(fit, window)
-    return FrfReading(_with_noise(frf, fit), fit, _modes(response.name, frf, fit))
+    if not ordinates.scatter:
+        std = np.sqrt(fit.ordinates.noise) / np.abs(fit.ordinates.given)
+        frf = replace(frf, std=np.interp(frf.frequency, fit.ordinates.frequency, std))
+    return FrfReading(frf, fit, _modes(log, frf, fit, before))
 
 
 def _channel(log: Log, name: str) -> Channel:
@@ -402,7 +407,7 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
             "too-uncertain",
             "all of its damping is that of the exponential window; choose a longer window",
         )
-    if unresolved := _unresolved(fit.ordinates, f, zeta):
+    if unresolved := _unresolved(frf, fit.ordinates, f, zeta):
         return unresolved
     if fit.over_distortion[i] < constants.OVER_DISTORTION:
         return Rejection(
@@ -419,17 +424,17 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
     return None
 
 
-def _unresolved(ordinates: Ordinates, f: float, zeta: float) -> Rejection | None:
+def _unresolved(frf: Frf, ordinates: Ordinates, f: float, zeta: float) -> Rejection | None:
     """Return why lines do not show a mode, or why it may be a line of the spectrum itself."""
     spacing = ordinates.spacing
-    if np.isfinite(ordinates.span):
-        fades = 1 - float(np.exp(-2 * np.pi * f * zeta * ordinates.span))
+    if frf.method == "blows":
+        fades = 1 - float(np.exp(-2 * np.pi * f * zeta / spacing))
         # Over several blows the phase of a line is random.
         if ordinates.scatter or fades >= constants.LEAST_FADING:
             return None
         return Rejection(
             "line-not-mode",
-            f"it fades by {100 * fades:.0f} % in the {ordinates.span:.3g} s after the blow, needed "
+            f"it fades by {100 * fades:.0f} % in {1 / spacing:.3g} s after the blow, needed "
             f"{100 * constants.LEAST_FADING:.0f} %: strike several times, or record longer",
         )
     if ordinates.periodic:

@@ -25,7 +25,7 @@ from lmshealth.io.formats.uff import UFF, Function, load_functions
 from lmshealth.io.log import Metadata
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
-from lmshealth.io.refusal import Unusable, listed, shown
+from lmshealth.io.refusal import Unusable, listed, shown, visible
 from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import Ordinates
 from lmshealth.modal.frf.responses import Frf, average_noise
@@ -33,7 +33,8 @@ from lmshealth.modal.frf.responses import Frf, average_noise
 FORMATS = (CSV.name, CSV_GZ.name, UFF.name)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
-_ROUNDING = 1e-9
+_PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
+_ROUNDING, _HEAD = 1e-9, 4096
 # Variance of unknown noise from which a fit starts, over the power of the response.
 _START = 1e-4
 
@@ -49,7 +50,7 @@ class MeasuredResponse:
     output: str
     frequency: FloatArray  # in Hz, ascending
     values: ComplexArray  # output per input
-    coherence: FloatArray | None
+    coherence: FloatArray  # NaN where the file has none
     unit: str  # of the values; empty where it is unknown
 
     def __post_init__(self) -> None:
@@ -84,21 +85,23 @@ def read_responses(
     try:
         content = Content({}, {}, ())
         functions: list[Function] = []
-        if format_name(path) == UFF.name:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+        if format_name(path) == UFF.name and UFF.sniff(head):
             functions = load_functions(path, max_memory)
         elif format_name(path) in FORMATS:
             own = _ResponseColumns(columns=given.columns, csv=given.csv)
             content = load(path, own, max_memory)
             functions = _tabulated(content, own)
         metadata, _ = parse_metadata(content.metadata | given.constants() | dict(overrides or {}))
-        coherences = {f[:2]: f for f in functions if f.coherence}
+        coherences = {f[:2]: f.values.real for f in functions if f.coherence}
         responses = [f for f in functions if not f.coherence]
         return tuple(
             _checked(
                 MeasuredResponse(
                     f"{label}:{f.output}" if len(responses) > 1 else label,
                     *(digest, metadata, f.input or "input", f.output, f.frequency, f.values),
-                    coherences[f[:2]].values.real if f[:2] in coherences else None,
+                    coherences.get(f[:2], np.full(f.frequency.size, np.nan)),
                     f.unit,
                 )
             )
@@ -106,6 +109,10 @@ def read_responses(
         )
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
+    except Exception as error:
+        # As for logs, whatever a library raises on a damaged file ends only this file.
+        detail = f"cannot be read ({type(error).__name__}: {error}); copy the file again"
+        raise BadLog(label, "corrupt", visible(detail)) from error
 
 
 def _tabulated(content: Content, columns: _ResponseColumns) -> list[Function]:
@@ -131,9 +138,7 @@ def _tabulated(content: Content, columns: _ResponseColumns) -> list[Function]:
             gain = 10 ** (part["db"] / 20) if "db" in part else part.get("magnitude")
             phase = np.radians(part["phase_deg"]) if "phase_deg" in part else part.get("phase_rad")
             if gain is None or phase is None:
-                needed = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
-                there = f"response {name!r} has {listed(part)}"
-                raise Unusable("columns", f"{there}; {needed}; there: {listed(content.present)}")
+                raise Unusable("columns", f"response {name!r} has {listed(part)}; {_PARTS}")
             values = gain * np.exp(1j * phase)
         whole = np.asarray(factor * values, dtype=np.complex128)
         functions.append(Function(name, "", frequency, whole, False, unit))
@@ -141,9 +146,7 @@ def _tabulated(content: Content, columns: _ResponseColumns) -> list[Function]:
             whole = part["coherence"].astype(np.complex128)
             functions.append(Function(name, "", frequency, whole, True, ""))
     if not functions:
-        needed = "needed real and imag, or magnitude and phase_deg, of a response"
-        raise Unusable("columns", f"frequencies and no response; {needed}; there: "
-                       f"{listed(content.present)}")  # fmt: skip
+        raise Unusable("columns", f"no response; {_PARTS}; there: {listed(content.present)}")
     return functions
 
 
@@ -168,7 +171,7 @@ def _unit(column: str) -> tuple[str, float, str]:
 def _checked(response: MeasuredResponse) -> MeasuredResponse:
     """Require ascending frequencies; leave out the static value and lines that are not finite."""
     f = response.frequency
-    if response.coherence is not None and response.coherence.shape != f.shape:
+    if response.coherence.shape != f.shape:
         found = f"{response.output}: {f.size} lines, but {response.coherence.size} of coherence"
         raise Unusable("columns", f"{found}; needed the same")
     use = np.isfinite(f) & np.isfinite(response.values) & (f > 0)
@@ -176,8 +179,8 @@ def _checked(response: MeasuredResponse) -> MeasuredResponse:
         at = int(np.argmin(np.diff(f[use]) > 0))
         found = f"frequencies do not ascend: {f[use][at + 1]:g} Hz follows {f[use][at]:g} Hz"
         raise Unusable("columns", f"{found}; needed one row per line, in ascending order")
-    coherence = None if response.coherence is None else response.coherence[use]
-    return replace(response, frequency=f[use], values=response.values[use], coherence=coherence)
+    parts = {key: getattr(response, key)[use] for key in ("frequency", "values", "coherence")}
+    return replace(response, **parts)
 
 
 def from_measured(
@@ -195,27 +198,24 @@ def from_measured(
     """
     use = (response.frequency >= band[0]) & (response.frequency <= band[1])
     f, h = response.frequency[use], response.values[use]
-    known = response.coherence is not None and averages is not None
+    coherence = response.coherence[use]
+    known = averages is not None and bool(np.isfinite(coherence).all())
     fewest = constants.FRF_LINES if known else constants.FRF_LINES_OF_UNKNOWN_NOISE
     if not fewest <= f.size <= constants.FRF_MOST_LINES:
-        there = response.frequency
-        span = f"{there[0]:.4g} to {there[-1]:.4g} Hz" if there.size else "none"
-        need = f"needed {fewest} to {constants.FRF_MOST_LINES}"
         hint = "" if known else f" ({constants.FRF_LINES} suffice with coherence and --averages)"
         raise BadLog(
             response.name,
             "band-too-narrow" if f.size < fewest else "band-too-wide",
-            f"{response.output} has {f.size} lines in the band, of {use.size} in all ({span}); "
-            f"{need}{hint}: choose another band, or measure more lines",
+            f"{response.output} has {f.size} lines in the band, {use.size} in all; needed {fewest} "
+            f"to {constants.FRF_MOST_LINES}{hint}: choose another band, or measure more lines",
         )
-    coherence = np.full(f.size, np.nan) if response.coherence is None else response.coherence[use]
     noise, freedom = np.full(f.size, _START * np.mean(np.abs(h) ** 2)), 0.0
     if known and averages is not None:
         at = np.clip(coherence, _ROUNDING, 1 - _ROUNDING)
         noise = np.abs(h) ** 2 * (1 - at) / (at * (averages - 1))
         noise, freedom = average_noise(noise, h, averages - 1)
-    n = float("nan") if averages is None else float(averages)
-    names = response.input, response.output
-    frf = Frf(*names, f, h, np.sqrt(noise), h, h, h, coherence, float("nan"), n, method="measured")
-    one = np.ones(f.size, dtype=complex)
-    return frf, Ordinates(f, one, h, noise, freedom, periodic=True)
+    nan = float("nan")
+    n = nan if averages is None else float(averages)
+    names, std = (response.input, response.output), np.sqrt(noise)
+    frf = Frf(*names, f, h, std, h, h, h, coherence, nan, n, method="measured")
+    return frf, Ordinates(f, np.ones(f.size, dtype=complex), h, noise, freedom, periodic=True)

@@ -40,7 +40,6 @@ class Ordinates:
     freedom: float  # complex degrees of freedom of each variance; 0 where it is unknown
     periodic: bool  # means over whole periods or blows: no transient, noise from their scatter
     at_rest: bool = False  # at both ends of the record: no transient
-    span: float = float("inf")  # from a blow to the end of the record in s: decays are cut there
 
     def __post_init__(self) -> None:
         freeze(self)
@@ -123,41 +122,24 @@ def stack(values: ComplexArray) -> FloatArray:
     return np.concatenate([values.real, values.imag])
 
 
-def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray, float]:
-    """Return jω, ``(n_lines,)``, and poles, ``(n_modes,)``, over the band's centre; and the span.
-
-    The span is multiplied by the centre.
-    """
+def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray]:
+    """Return jω, shape ``(n_lines,)``, and poles, ``(n_modes,)``, over the band's centre."""
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     f, zeta = order.modes
-    pole = f / centre * (-zeta + 1j * np.sqrt(1 - zeta**2))
-    return 1j * ordinates.frequency / centre, pole, 2 * np.pi * float(centre) * ordinates.span
+    return (1j * ordinates.frequency / centre, f / centre * (-zeta + 1j * np.sqrt(1 - zeta**2)))
 
 
-def _cut(
-    s: ComplexArray, pole: ComplexArray, span: float
-) -> tuple[ComplexArray | float, ComplexArray | float]:
-    """Return by what a cut after a span changes 1/(s - p), and its derivative by p.
-
-    The transform of a decay from 0 to T is (1 - exp((p - s) T)) / (s - p).
-    """
-    if not np.isfinite(span):
-        return 1.0, 1.0
-    rest = np.exp(-span * s)[:, None] * np.exp(span * pole)
-    return 1 - rest, 1 - rest * (1 + span * (s[:, None] - pole))
-
-
-def _modal(s: ComplexArray, pole: ComplexArray, span: float) -> ComplexArray:
+def _modal(s: ComplexArray, pole: ComplexArray) -> ComplexArray:
     """Return the columns of real and imaginary parts of residues, ``(n_lines, 2 n_modes)``."""
-    upper, lower = (_cut(s, p, span)[0] / (s[:, None] - p) for p in (pole, pole.conj()))
+    upper, lower = 1 / (s[:, None] - pole), 1 / (s[:, None] - pole.conj())
     return np.hstack([upper + lower, 1j * (upper - lower)])
 
 
 def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     """Solve for the linear unknowns at given poles and variances of shape ``(n_lines,)``."""
     m = order.n_modes
-    s, pole, span = _poles(ordinates, order)
-    modal = _modal(s, pole, span)
+    s, pole = _poles(ordinates, order)
+    modal = _modal(s, pole)
     response = np.hstack([modal, s[:, None] ** np.arange(order.low, order.high + 1)])
     n = response.shape[1]
     columns = response * ordinates.given[:, None]
@@ -197,7 +179,7 @@ def slopes(
     The linear unknowns are projected out (Kaufman's variable projection [Golub2003]): the product
     with its transpose is the Fisher information of ln f and ln ζ, all else marginalised.
     """
-    s, pole, span = _poles(ordinates, order)
+    s, pole = _poles(ordinates, order)
     _, zeta = order.modes
     by_zeta = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(1 - zeta**2))
     given = ordinates.given[:, None]
@@ -205,7 +187,6 @@ def slopes(
     lower = (given * solution.residues.conj() + solution.swing.conj()) / (
         s[:, None] - pole.conj()
     ) ** 2
-    upper, lower = upper * _cut(s, pole, span)[1], lower * _cut(s, pole.conj(), span)[1]
     moved = np.hstack([upper * move + lower * move.conj() for move in (pole, by_zeta)])
     slope = -stack(moved * np.sqrt(2 / variance)[:, None])
     return np.asarray(slope - solution.basis @ (solution.basis.T @ slope))
@@ -256,7 +237,7 @@ def vector_fit(ordinates: Ordinates, order: Order, n_modes: int) -> Order:
     powers = s[:, None] ** np.arange(order.low, order.high + 1)
     pole = np.linspace(s[0], s[-1], n_modes + 2)[1:-1] * (1 + 1j * _TRIED_DAMPING[1])
     for _ in range(_RELOCATIONS):
-        modal = _modal(s, pole, ordinates.span * 2 * np.pi * float(centre))
+        modal = _modal(s, pole)
         columns = np.hstack([modal, powers, -measured[:, None] * modal])
         stacked = stack(columns * whiten[:, None])
         scale = np.linalg.norm(stacked, axis=0)

@@ -335,10 +335,14 @@ def _is_admissible(trial: _State, before: _State) -> bool:
 
 
 def _wide_enough(state: _State) -> BoolArray:
-    """Return which lines are not the centre of a mode narrower than a line."""
+    """Return which lines are not the centre of a mode that is narrower than their distance."""
     f, zeta = state.order.modes
     frequency = state.ordinates.frequency
-    narrow = f[2 * zeta * f < state.ordinates.spacing]
+    is_narrow = 2 * zeta * f < state.ordinates.spacing
+    if state.ordinates.periodic:
+        inside = np.abs(frequency[:, None] - f) <= constants.BANDWIDTHS_OF_LINES * zeta * f
+        is_narrow &= inside.sum(axis=0) < constants.LINES_OF_MODE
+    narrow = f[is_narrow]
     keep = np.ones(frequency.size, dtype=bool)
     keep[np.argmin(np.abs(frequency[:, None] - narrow), axis=0)] = False
     return keep

@@ -111,7 +111,7 @@ def test_uff_holds_responses_with_coherence(
         )  # fmt: skip
     one, other = read_responses(tmp_path / "a.uff")
     assert (one.output, one.input, other.output) == ("1+Z", "1-X", "2+Z")
-    assert (one.coherence is None, other.unit) == (True, "(m/s2)/(N)")
+    assert (bool(np.isnan(one.coherence).all()), other.unit) == (True, "(m/s2)/(N)")
     np.testing.assert_allclose(other.frequency, F[1:], rtol=1e-5)
     np.testing.assert_allclose(other.values, 2 * H[1:], rtol=1e-4, atol=1e-6)
     np.testing.assert_allclose(other.coherence, COHERENCE[1:], rtol=1e-4)
@@ -165,3 +165,13 @@ def test_a_real_file_of_few_lines_is_refused_as_that(needs: Callable[[str], None
     assert response.output == "ref6_23_Mar"
     with pytest.raises(BadLog, match="has 5 lines"):
         read_measured(response)
+
+
+def test_a_damaged_file_is_refused_as_that(tmp_path: Path) -> None:
+    """Cut off, or of another format: no traceback."""
+    (tmp_path / "a.uff").write_bytes(b"    -1\n    58\n")
+    with pytest.raises(BadLog, match=r"corrupt"):
+        read_responses(tmp_path / "a.uff")
+    (tmp_path / "b.uff").write_bytes(b"\x89HDF\r\n\x1a\n" + b"\0" * 100)
+    with pytest.raises(BadLog, match=r"the content is HDF5; rename the file"):
+        read_responses(tmp_path / "b.uff")
