@@ -8,7 +8,7 @@ checks what the library reads before it gets it.
 
 from __future__ import annotations
 
-from io import FileIO
+from io import SEEK_END, FileIO
 from pathlib import Path
 from typing import Any, Literal
 
@@ -38,11 +38,8 @@ class Guarded(FileIO):
     error of its own.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path)
-        self.size = path.stat().st_size
-        self.now: Literal["columns", "texts", "samples"] = "columns"
-        self.trouble: Unusable | None = None
+    now: Literal["columns", "texts", "samples"] = "columns"
+    trouble: Unusable | None = None
 
     def readinto(self, buffer: Any) -> int:
         """Read for the library; zeros in the place of damaged bytes."""
@@ -97,7 +94,8 @@ def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
     chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
     stream.now = "texts"
     metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
-    check_size(8 * sum(dataset.size for dataset in chosen.values()), stream.size)
+    stored = stream.seek(0, SEEK_END)
+    check_size(8 * sum(dataset.size for dataset in chosen.values()), stored)
     stream.now = "samples"
     with spools(chosen) as taken:
         for name, dataset in chosen.items():

@@ -43,7 +43,6 @@ _NUMERIC = range(6, 16)
 _OBJECT = "an object or a function (save plain arrays or structs)"
 _OTHERS = {1: "cells", 3: _OBJECT, 5: "a sparse matrix", 16: _OBJECT, 17: _OBJECT}
 _COMPLEX = 1 << 11
-_NUMBERS, _TEXT = "numbers", "text"
 
 
 class _Variable(NamedTuple):
@@ -59,46 +58,53 @@ class _Variable(NamedTuple):
 class _Array(NamedTuple):
     """An array that is no struct, called as in MATLAB, which stores column after column.
 
-    ``what`` is `_NUMBERS`, `_TEXT`, or words for a message; ``values`` are the numbers as stored,
-    shape ``(prod(shape),)``.
+    ``what`` is its kind in words; ``values`` are the numbers as stored, shape ``(prod(shape),)``.
     """
 
     name: str
     shape: tuple[int, ...]
-    what: str
+    what: str = "numbers"
     values: np.ndarray | None = None
-    text: str = ""
+    text: str | None = None
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    stored = path.stat().st_size
-    read: dict[str, Samples] = {}
-    metadata: dict[str, str] = {}
-    present: list[str] = []
-    n_samples = 0
     with path.open("rb") as stream:
         version = stream.read(_HEADER)[-4:]
         if version in _HDF5_INSIDE:
             needed = "save it in MATLAB with the option -v7"
             raise Unusable("format", f"MAT-file of version 7.3; {needed}")
-        order = _ORDERS[version]
-        variables = list(_variables(stream, order, stored))
-        names = [variable.name for variable in variables]
-        chosen = _chosen(names, columns)
-        wanted = [variable for variable in variables if variable.name in chosen]
-        inside = columns.mat.variable is not None
-        for array in _signals(stream, order, wanted, max_memory, inside=inside):
-            present.append(array.name)
-            if columns.target(array.name) is not None:
-                values = _vector(array)
-                n_samples += values.size
-                # MATLAB stores whole numbers in fewer bytes than they take here.
-                check_size(8 * n_samples, stored)
-                spool = Spool(values.size)
-                spool.append(values)
-                read[array.name] = spool.samples()
-            elif array.name in KEYS:
-                metadata[array.name] = _text(array)
+        try:
+            return _read(stream, _ORDERS[version], columns, max_memory)
+        except (struct.error, zlib.error) as error:
+            raise corrupt("a variable is cut off or damaged") from error
+
+
+def _read(stream: IO[bytes], order: str, columns: ColumnMap, max_memory: float) -> Content:
+    read: dict[str, Samples] = {}
+    metadata: dict[str, str] = {}
+    present: list[str] = []
+    n_samples, stored = 0, stream.seek(0, SEEK_END)
+    variables = list(_variables(stream, order, stored))
+    names = [variable.name for variable in variables]
+    chosen = _chosen(names, columns)
+    wanted = [variable for variable in variables if variable.name in chosen]
+    inside = columns.mat.variable is not None
+    for array in _signals(stream, order, wanted, max_memory, inside=inside):
+        present.append(array.name)
+        if columns.target(array.name) is not None:
+            if array.values is None:
+                raise not_numeric(array.name, array.what)
+            if array.values.size not in array.shape:
+                raise not_numeric(array.name, f"numbers of shape {array.shape}")
+            n_samples += array.values.size
+            # MATLAB stores whole numbers in fewer bytes than they take here.
+            check_size(8 * n_samples, stored)
+            spool = Spool(array.values.size)
+            spool.append(array.values)
+            read[array.name] = spool.samples()
+        elif array.name in KEYS:
+            metadata[array.name] = _text(array)
     present += [name for name in names if name and name not in chosen]
     return Content(read, metadata, tuple(present))
 
@@ -108,39 +114,22 @@ def _variables(stream: IO[bytes], order: str, end: int) -> Iterator[_Variable]:
     at = _HEADER
     while at < end:
         stream.seek(at)
-        kind, size = _tag(stream.read(_TAG), order)
-        if kind not in (_COMPRESSED, _MATRIX):
-            raise corrupt(f"no variable begins at byte {at}")
+        kind, size = struct.unpack(order + "II", stream.read(_TAG))
+        packed = kind == _COMPRESSED
         start, stored = at + _TAG, size
         at = start + stored
         if at > end:
             raise corrupt("the last variable is cut off")
         head = stream.read(min(stored, _PEEK))
-        packed = kind == _COMPRESSED
         if packed:
-            head = _inflate(zlib.decompressobj(), head, _PEEK)
-            kind, size = _tag(head[:_TAG], order)
-            if kind != _MATRIX:
-                raise corrupt("a compressed element is no variable")
+            head = zlib.decompressobj().decompress(head, _PEEK)
+            kind, size = struct.unpack_from(order + "II", head)
             head = head[_TAG:]
+        if kind != _MATRIX:
+            raise corrupt(f"no variable begins at byte {start - _TAG}")
         # Objects of newer classes have no name, and neither have empty variables.
         name = _head(_elements(memoryview(head), order), order)[2] if head else ""
         yield _Variable(name, packed, start, stored, size)
-
-
-def _tag(tag: bytes, order: str) -> tuple[int, int]:
-    """Read type and size of an element."""
-    if len(tag) < _TAG:
-        raise corrupt("the last variable is cut off")
-    kind, size = struct.unpack(order + "II", tag)
-    return kind, size
-
-
-def _inflate(inflater: zlib._Decompress, packed: bytes, size: int) -> bytes:
-    try:
-        return inflater.decompress(packed, size)
-    except zlib.error as error:
-        raise corrupt("a compressed variable is damaged") from error
 
 
 def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
@@ -188,13 +177,11 @@ def _content(stream: IO[bytes], variable: _Variable) -> memoryview:
     stored = stream.read(variable.stored)
     if not variable.packed:
         return memoryview(stored)
-    inflater = zlib.decompressobj()
-    content = _inflate(inflater, stored, _TAG + variable.size + 1)
-    if len(content) < _TAG + variable.size:
-        raise corrupt(f"the variable at byte {variable.start} is cut off")
+    inflater, size = zlib.decompressobj(), _TAG + variable.size
+    content = inflater.decompress(stored, size + 1)
     # The checksum is that of the whole variable.
-    if len(content) > _TAG + variable.size or not inflater.eof:
-        raise corrupt("a compressed variable is damaged")
+    if len(content) != size or not inflater.eof:
+        raise corrupt(f"the variable at byte {variable.start} is cut off or damaged")
     return memoryview(content)[_TAG:]
 
 
@@ -205,18 +192,9 @@ def _columns(array: _Array) -> list[_Array]:
     if values is None or not is_matrix:
         return [array]
     return [
-        _Array(f"{array.name}(:,{k + 1})", (shape[0], 1), _NUMBERS, column)
+        _Array(f"{array.name}(:,{k + 1})", (shape[0], 1), values=column)
         for k, column in enumerate(values.reshape(shape[::-1]))
     ]
-
-
-def _vector(array: _Array) -> np.ndarray:
-    """Return the numbers of a vector, shape ``(n,)``."""
-    if array.values is None:
-        raise not_numeric(array.name, array.what)
-    if array.values.size not in array.shape:
-        raise not_numeric(array.name, f"numbers of shape {array.shape}")
-    return array.values
 
 
 def _text(array: _Array) -> str:
@@ -225,7 +203,7 @@ def _text(array: _Array) -> str:
         value = array.values[0].item()
         # An integer may be stored as one or not.
         return str(int(value) if float(value).is_integer() else value)
-    if array.what == _TEXT and (not prod(array.shape) or array.shape[0] == 1):
+    if array.text is not None and (not prod(array.shape) or array.shape[0] == 1):
         return array.text
     raise Unusable("metadata", f"{array.name} is no single text or number; write it as text")
 
@@ -237,8 +215,6 @@ def _elements(view: memoryview, order: str) -> Elements:
     """Split the content of a variable into its data elements: type and content of each."""
     at, stop = 0, len(view)
     while at < stop:
-        if at + _TAG > stop:
-            raise corrupt("a variable is cut off")
         kind, size = struct.unpack_from(order + "II", view, at)
         if kind >> 16:  # up to four bytes are inside the tag itself
             start, after, kind, size = at + 4, at + _TAG, kind & 0xFFFF, kind >> 16
@@ -267,10 +243,7 @@ def _integers(elements: Elements, order: str) -> tuple[int, ...]:
 
 def _head(elements: Elements, order: str) -> tuple[int, tuple[int, ...], str, bool]:
     """Read class, shape, name, and whether complex; objects of newer classes have but a class."""
-    _, flags = _next(elements, _UINT32)
-    if len(flags) != 8:
-        raise corrupt("a variable has no class")
-    (word,) = struct.unpack_from(order + "I", flags)
+    word, _ = struct.unpack(order + "II", _next(elements, _UINT32)[1])
     kind = word & 0xFF
     if kind == _OPAQUE:
         return kind, (), "", False
@@ -286,7 +259,7 @@ def _arrays(
 ) -> Iterator[_Array]:
     """Yield all arrays of a matrix that are no structs; the prefix names fields of a struct."""
     if not len(view):
-        yield _Array(name, (0, 0), _NUMBERS, np.empty(0))
+        yield _Array(name, (0, 0), values=np.empty(0))
         return
     if depth > constants.DEEPEST:
         raise corrupt(f"{name[:80]!r} is nested deeper than {constants.DEEPEST}")
@@ -302,13 +275,13 @@ def _arrays(
         encoding = _ENCODINGS[stored]
         if encoding in ("utf-16", "utf-32"):
             encoding += "-le" if order == "<" else "-be"
-        yield _Array(name, shape, _TEXT, text=str(content, encoding))
+        yield _Array(name, shape, "text", text=str(content, encoding))
     elif kind in _NUMERIC:
         stored, content = _next(elements, *_TYPES)
         dtype = np.dtype(order + _TYPES[stored])
         if len(content) != prod(shape) * dtype.itemsize:
             raise corrupt(f"{name[:80]!r} is cut off")
-        what = "complex numbers" if is_complex else _NUMBERS
+        what = "complex numbers" if is_complex else "numbers"
         values = None if is_complex else np.frombuffer(content, dtype=dtype)
         yield _Array(name, shape, what, values)
     else:
@@ -322,9 +295,8 @@ def _fields(
     length, (_, names) = sum(_integers(elements, order)), _next(elements, _INT8)
     if not 1 <= length <= _PEEK or len(names) % length:
         raise corrupt("a struct has impossible fields")
-    fields = [
-        str(names[k : k + length], "latin-1").split("\0")[0] for k in range(0, len(names), length)
-    ]
+    parts = (names[k : k + length] for k in range(0, len(names), length))
+    fields = [str(part, "latin-1").split("\0")[0] for part in parts]
     n_items = prod(shape)
     if n_items * len(fields) * _TAG > size:
         raise corrupt(f"{name[:80]!r} is cut off")
