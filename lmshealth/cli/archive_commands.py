@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -53,9 +52,9 @@ def run(
     from lmshealth.batch.run import Settings
     from lmshealth.batch.run import run as run_pipeline
 
-    pdf, workers = given.pop("pdf"), given.pop("workers") or _processors()
+    pdf = given.pop("pdf")
     with progress_bars() as progress:
-        result = run_pipeline(logs, stages, out, Settings(workers=workers, **given), progress)
+        result = run_pipeline(logs, stages, out, Settings(**given), progress)
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
@@ -79,7 +78,7 @@ def run(
 @options.WORKERS
 @options.PDF
 @click.pass_context
-def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pdf: bool) -> None:
+def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool) -> None:
     """Write the pages of all machines in a store, without their logs.
 
     The pages are those that `run` wrote last for each machine, byte for byte.
@@ -88,18 +87,10 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int | None, pd
     from lmshealth.batch.run import report as write_pages
     from lmshealth.batch.store import Store
 
-    settings = Settings(workers=workers or _processors())
     with progress_bars() as progress, closing(Store(store, create=False)) as opened:
-        result = write_pages(opened, out, settings, progress)
+        result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")
     terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
     if pdf:
         write_pdfs(result.pages)
     ctx.exit(options.SOME_REFUSED if result.failed else 0)
-
-
-def _processors() -> int:
-    """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1

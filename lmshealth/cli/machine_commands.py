@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -60,17 +60,18 @@ def track(table: Path, **given: Any) -> None:
     without --stage every covariate column is regressed about its median.
     """
     from lmshealth.report import tables
+    from lmshealth.tracking.read_tables import read_machines
     from lmshealth.tracking.smoother import smooth
     from lmshealth.tracking.track import accepted_estimates, outlier_refusals
     from lmshealth.tracking.track import track as track_modes
 
     stage, targets = given["stage"], given | {"track": given["out"]}
-    machines, notes = _read_machines(table, given)
+    more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
+    machines, notes = read_machines(table, stage, **more)
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     for history, refused in machines:
-        found = track_modes(history, stage)
+        found, smoothed = track_modes(history, stage), None
         refused += outlier_refusals(history, found)
-        smoothed = None
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
         rows["track"] += tables.track_rows(found, smoothed)
@@ -145,12 +146,8 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
-    _exit_if_none(ctx, found, lost)
-    _write(given["out"], "health", [row for health in found for row in health_rows(health)])
-    if given["posterior"]:
-        trees = [health.to_arviz() for health in found]
-        write_draws(given["posterior"], [health.stage for health in found], trees)
-    ctx.exit(options.SOME_REFUSED if lost else 0)
+    rows = [row for health in found for row in health_rows(health)]
+    _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
 
 
 def _infer_machines(
@@ -158,16 +155,14 @@ def _infer_machines(
 ) -> tuple[list[Health], list[str]]:
     """Infer all machines of a table; return results, and reasons of those that have none."""
     from lmshealth.health.ensemble_sampling import seed_of
-    from lmshealth.health.inference import epochs_to_infer, infer_together
-    from lmshealth.health.inference import infer as infer_one
+    from lmshealth.health.inference import epochs_to_infer, infer, infer_together
 
     stage, machines = given["stage"], _read_drifts(table, given["cov"])
     if given["others"]:
         others = [(_single(path, _read_drifts(path, None)), own) for path, own in given["others"]]
         together = [(_single(table, machines), stage), *others]
-        seed = seed_of(
-            given["seed"], *(f"{drifts.stage}\n{own.digest}" for drifts, own in together)
-        )
+        names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
+        seed = seed_of(given["seed"], *names)
         epochs = epochs_to_infer(*together[0], given["epochs"])
         mapper = _counting_map("together", progress)
         return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
@@ -177,7 +172,7 @@ def _infer_machines(
         try:
             epochs = epochs_to_infer(drifts, stage, given["epochs"])
             mapper = _counting_map(drifts.stage, progress)
-            found.append(infer_one(drifts, stage, seed, epochs=epochs, mapper=mapper))
+            found.append(infer(drifts, stage, seed, epochs=epochs, mapper=mapper))
         except NotEnoughData as why:
             lost.append(str(why))
     return found, lost
@@ -248,16 +243,17 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     from lmshealth.report.assessment import summarise_life
     from lmshealth.report.tables import prognosis_rows
     from lmshealth.tracking.history import missing_mode_notes
+    from lmshealth.tracking.read_tables import read_machines
 
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
-    machines, notes = _read_machines(table, given)
+    more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
+    machines, notes = read_machines(table, stage, **more)
     print_notes(notes)
     for history, refused in machines:
         print_notes(f"{history.stage}: {note}" for note in missing_mode_notes(history, refused))
     with progress_bars() as progress:
-        histories = [history for history, _ in machines]
-        found, lost = _prognose_machines(histories, given, progress)
+        found, lost = _prognose_machines([history for history, _ in machines], given, progress)
     rows = []
     for prognosis, _ in found:
         life, service, before = summarise_life(prognosis, stage), decide(prognosis, decision), None
@@ -269,12 +265,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             print_notes([f"{note} is given for that day"])
         views.print_life(life, service, before)
         rows += prognosis_rows(life, service, before)
-    _exit_if_none(ctx, found, lost)
-    _write(given["out"], "prognosis", rows)
-    if given["posterior"]:
-        trees = [posterior.to_arviz() for _, posterior in found if posterior is not None]
-        write_draws(given["posterior"], [one.stage for one, _ in found], trees)
-    ctx.exit(options.SOME_REFUSED if lost else 0)
+    _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost)
 
 
 def _decision(described: Decision, risk: float | None, ratio: float | None) -> Decision:
@@ -314,23 +305,21 @@ def _prognose_machines(
     return found, lost
 
 
-def _read_machines(
-    table: Path, given: dict[str, Any]
-) -> tuple[list[tuple[History, list[Refusal]]], list[str]]:
-    from lmshealth.tracking.read_tables import read_machines
-
-    cov, maintenance = given["cov"], given["maintenance"]
-    return read_machines(table, given["stage"], cross_terms=cov, maintenance=maintenance)
-
-
 def _write(target: Path, name: str, rows: list[Row]) -> None:
     from lmshealth.report.tables import COLUMNS, frame
 
     write_text(target, frame(COLUMNS[name], rows).to_csv(index=False))
 
 
-def _exit_if_none(ctx: click.Context, found: Sequence[object], lost: Sequence[str]) -> None:
-    """Print the reasons of machines without a result; exit with status 1 if none has one."""
+def _finish(
+    ctx: click.Context, name: str, rows: list[Row], draws: Mapping[str, Any], lost: Sequence[str]
+) -> None:
+    """Write the table and the draws of each machine, print why others have none, and exit."""
     print_errors(lost)
-    if not found:
+    if not rows:
         ctx.exit(1)
+    _write(ctx.params["out"], name, rows)
+    if ctx.params["posterior"]:
+        trees = [posterior.to_arviz() for posterior in draws.values()]
+        write_draws(ctx.params["posterior"], list(draws), trees)
+    ctx.exit(options.SOME_REFUSED if lost else 0)

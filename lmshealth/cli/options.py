@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 from collections.abc import Callable
 from datetime import date, datetime
 from functools import partial
@@ -55,6 +56,13 @@ def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -
     from lmshealth.io.column_map import load_columns
 
     return None if path is None else load_columns(path)
+
+
+def _processors() -> int:
+    """Return the number of processors that this process may use."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
 
 
 def _band(
@@ -118,6 +126,7 @@ SEED = click.option(
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1),
+    callback=lambda ctx, option, count: count or _processors(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
