@@ -31,7 +31,7 @@ from lmshealth.modal.ambient.cluster_modes import (
     refuse_close_modes,
 )
 from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search, split_groups
-from lmshealth.modal.ambient.wandering import Harmonic, Recording
+from lmshealth.modal.ambient.wandering import Harmonic
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
@@ -40,6 +40,7 @@ from lmshealth.signal.spectra import (
     ANY_RESONANCE,
     LogSpectra,
     ResonanceRange,
+    Spectrum,
     cross_spectra,
     transform_segment,
 )
@@ -279,10 +280,10 @@ def _search(
     ]
     frequencies = [frequency for _, frequency, _ in tested]
     reach = band[1] if band else np.inf
-    transforms = transform_segment(
-        channels, longest, log.sample_rate, reach, ceiling=_CEILING * reach
-    )
-    recording = Recording.of(transforms, frequencies)
+    own = transform_segment(channels, longest, log.sample_rate, reach, ceiling=_CEILING * reach)
+    silent = Spectrum(own.frequency, np.zeros_like(own.frequency), own.duration, np.nan)
+    clear = own.free & silent.clear_of(frequencies)
+    recording = own._replace(transforms=own.transforms * clear[:, None])
     return search(spectra.without(frequencies), recording, low, high, frequencies), tested
 
 

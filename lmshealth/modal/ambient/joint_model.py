@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal.ambient.whittle import receptance, response
@@ -30,40 +32,65 @@ class BandData:
     basis: FloatArray  # of the floors, positive, (n_basis, n)
 
 
+def expectation(
+    data: BandData, b: ComplexArray, s: ComplexArray | FloatArray, floor: FloatArray
+) -> ComplexArray:
+    """Compute E = b S b* + floors + foreign, shape ``(n, n_channels, n_channels)``."""
+    e = b @ s @ np.swapaxes(b.conj(), 1, 2)
+    k = np.arange(e.shape[1])
+    e[:, k, k] += (floor @ data.basis).T
+    return np.asarray(e if data.foreign is None else e + data.foreign)
+
+
+def floor_ratio(data: BandData, g: ComplexArray) -> FloatArray:
+    """Return by how much more power there is than floors explain; G is the inverse of E."""
+    up, down = (
+        (data.count * np.einsum("kaa->ak", x).real) @ data.basis.T for x in (g @ data.matrix @ g, g)
+    )
+    return np.asarray(up / down)
+
+
+@dataclass(frozen=True, eq=False)
 class JointModel:
     """Modes with real shapes and correlated forces, and independent floors.
 
-    E = Σ R_ij b_i b_j* + floors, b_i = φ_i h_i + ρ_i: R has a unit diagonal, φ_i holds the root of
-    the PSD of the modal force in each channel, ρ_i the static response. Modes are refined one after
-    the other by Fisher's scoring with the others fixed, so that the cost of a sweep is linear in
-    their number. It selects modes; published estimates come from the likelihood of `whittle`.
+    E = Σ R_ij b_i b_j* + floors, b_i = φ_i h_i + ρ_i. Modes are refined one after the other by
+    Fisher's scoring with the others fixed, so that the cost of a sweep is linear in their number.
+    It selects modes; published estimates come from the likelihood of `whittle`.
     """
 
-    def __init__(
-        self,
-        data: BandData,
-        floor: FloatArray,
-        f: FloatArray,
-        zeta: FloatArray,
-        phi: FloatArray,
-        r: FloatArray,
-        rho: FloatArray | None = None,
-    ) -> None:
-        self.data, self.floor = data, floor
-        self.f, self.zeta, self.phi, self.r = f, zeta, phi, r
-        self.rho = np.zeros_like(phi) if rho is None else rho
-        self.misfit, self._inverse = self._evaluate()
+    data: BandData
+    floor: FloatArray  # coefficients of the basis, (n_channels, n_basis)
+    f: FloatArray  # in Hz, (n_modes,)
+    zeta: FloatArray
+    phi: FloatArray  # root of the PSD of the modal force in each channel, (n_channels, n_modes)
+    rho: FloatArray  # static response, as phi
+    r: FloatArray  # correlations of the forces, (n_modes, n_modes)
+
+    def subset(self, kept: BoolArray) -> JointModel:
+        """Return the model of some of its modes."""
+        return replace(
+            self,
+            f=self.f[kept],
+            zeta=self.zeta[kept],
+            phi=self.phi[:, kept],
+            rho=self.rho[:, kept],
+            r=self.r[np.ix_(kept, kept)],
+        )
 
     def without(self, i: int) -> JointModel:
         """Return the model without one mode."""
         return self.subset(np.arange(self.f.size) != i)
 
-    def subset(self, kept: BoolArray) -> JointModel:
-        """Return the model of some of its modes."""
-        poles = self.f[kept], self.zeta[kept]
-        r = self.r[np.ix_(kept, kept)]
-        return JointModel(
-            self.data, self.floor.copy(), *poles, self.phi[:, kept], r, self.rho[:, kept]
+    def with_mode(self, f: float, zeta: float, phi: FloatArray) -> JointModel:
+        """Return the model with one mode more, the last one."""
+        return replace(
+            self,
+            f=np.append(self.f, f),
+            zeta=np.append(self.zeta, zeta),
+            phi=np.column_stack([self.phi, phi]),
+            rho=np.column_stack([self.rho, np.zeros_like(phi)]),
+            r=block_diag(self.r, np.eye(1)),
         )
 
     def of_channels(self, kept: list[int]) -> JointModel:
@@ -71,8 +98,34 @@ class JointModel:
         d, block = self.data, np.ix_(range(len(self.data.count)), kept, kept)
         foreign = None if d.foreign is None else d.foreign[block]
         data = replace(d, matrix=d.matrix[block], foreign=foreign, scale=d.scale[kept])
-        poles, rows = (self.f.copy(), self.zeta.copy()), (self.phi[kept], self.r, self.rho[kept])
-        return JointModel(data, self.floor[kept], *poles, *rows)
+        rows = {"floor": self.floor[kept], "phi": self.phi[kept], "rho": self.rho[kept]}
+        return replace(self, data=data, **rows)
+
+    @property
+    def size(self) -> int:
+        """Number of unknowns of the modes."""
+        m, n = self.f.size, len(self.phi)
+        return m * (2 + n) + m * (m - 1) // 2
+
+    def _columns(self, frequency: FloatArray) -> ComplexArray:
+        """Return b, shape ``(n, n_channels, n_modes)``."""
+        h = response(self.f[:, None], self.zeta[:, None], frequency)
+        return np.asarray(self.phi * h.T[:, None, :] + self.rho)
+
+    @cached_property
+    def _b(self) -> ComplexArray:
+        return self._columns(self.data.frequency)
+
+    @cached_property
+    def expected(self) -> ComplexArray:
+        """Compute E, shape ``(n, n_channels, n_channels)``."""
+        return expectation(self.data, self._b, self.r, self.floor)
+
+    def modal(self, kept: BoolArray, frequency: FloatArray) -> ComplexArray:
+        """Return the part of some modes in the expectation, in physical units."""
+        part = self.subset(kept)
+        b = part._columns(frequency) * self.data.scale[:, None]
+        return np.asarray(b @ part.r @ np.swapaxes(b.conj(), 1, 2))
 
     def dispersions(self) -> FloatArray:
         """Return, for each channel given the others, the dispersion of its residual; 1 for noise.
@@ -84,173 +137,126 @@ class JointModel:
         squares = self.data.count[:, None] * (ratio - 1) ** 2
         return np.asarray(np.median(squares, axis=0) / _MEDIAN_SQUARE)
 
-    def with_mode(self, f: float, zeta: float, phi: FloatArray) -> JointModel:
-        """Return the model with one mode more, the last one."""
-        m = self.f.size
-        r = np.eye(m + 1)
-        r[:m, :m] = self.r
-        return JointModel(
-            self.data,
-            self.floor.copy(),
-            np.append(self.f, f),
-            np.append(self.zeta, zeta),
-            np.column_stack([self.phi, phi]),
-            r,
-            np.column_stack([self.rho, np.zeros_like(phi)]),
-        )
+    @cached_property
+    def misfit(self) -> float:
+        """Negative log posterior; infinite where E is singular."""
+        try:
+            root = np.linalg.cholesky(self.expected)
+        except np.linalg.LinAlgError:
+            return np.inf
+        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2).real).sum(axis=1)
+        # tr E⁻¹ W of Hermitian matrices
+        trace = np.sum(self._inverse.conj() * self.data.matrix, axis=(1, 2)).real
+        prior = np.sum(self.rho**2 * self._weak[:, None]) + np.sum(np.tril(self.r, -1) ** 2)
+        return float(self.data.count @ (log_det + trace) + 0.5 * prior)
+
+    @cached_property
+    def _inverse(self) -> ComplexArray:
+        return np.asarray(np.linalg.inv(self.expected), dtype=np.complex128)
 
     @property
-    def size(self) -> int:
-        """Number of unknowns of the modes."""
-        m, n = self.f.size, len(self.phi)
-        return m * (2 + n) + m * (m - 1) // 2
+    def _weak(self) -> FloatArray:
+        """Precision of the prior of the static responses."""
+        return np.asarray(1 / np.mean(self.floor, axis=1))
 
-    def _columns(self) -> ComplexArray:
-        """Return b, shape ``(n, n_channels, n_modes)``."""
-        h = response(self.f[:, None], self.zeta[:, None], self.data.frequency)
-        return np.asarray(self.phi[None] * h.T[:, None, :] + self.rho)
+    def nearest(self, f: float) -> list[int]:
+        """Return the three modes nearest to a frequency in units of their bandwidths."""
+        return [int(i) for i in np.argsort(np.abs(np.log(self.f / f)) / self.zeta)[:3]]
 
-    def expected(self) -> ComplexArray:
-        """Compute E, shape ``(n, n_channels, n_channels)``."""
-        b = self._columns()
-        e = (b @ self.r) @ np.swapaxes(b.conj(), 1, 2)
-        k = np.arange(e.shape[1])
-        e[:, k, k] += (self.floor @ self.data.basis).T
-        return e if self.data.foreign is None else e + self.data.foreign
-
-    def modal(self, kept: BoolArray, frequency: FloatArray) -> ComplexArray:
-        """Return the part of some modes in the expectation, in physical units."""
-        h = response(self.f[kept, None], self.zeta[kept, None], frequency)
-        b = (self.phi[:, kept] * h.T[:, None, :] + self.rho[:, kept]) * self.data.scale[:, None]
-        return np.asarray((b @ self.r[np.ix_(kept, kept)]) @ np.swapaxes(b.conj(), 1, 2))
-
-    def _evaluate(self) -> tuple[float, ComplexArray]:
-        """Return the negative log posterior, infinite where E is singular, and the inverse of E."""
-        e = self.expected()
-        try:
-            root = np.linalg.cholesky(e)
-        except np.linalg.LinAlgError:
-            return np.inf, e
-        log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2).real).sum(axis=1)
-        inverse = np.asarray(np.linalg.inv(e), dtype=np.complex128)
-        # tr E⁻¹ W of Hermitian matrices
-        trace = np.sum(inverse.conj() * self.data.matrix, axis=(1, 2)).real
-        prior = np.sum(self.rho**2 / self._rho_variance()[:, None]) + np.sum(
-            np.tril(self.r, -1) ** 2
-        )
-        return float(self.data.count @ (log_det + trace) + 0.5 * prior), inverse
-
-    def _rho_variance(self) -> FloatArray:
-        return np.asarray(np.mean(self.floor, axis=1))
-
-    def nearest(self, f: float, most: int = 3) -> list[int]:
-        """Return the modes that are nearest to a frequency in units of their bandwidths."""
-        order = np.argsort(np.abs(np.log(self.f / f)) / self.zeta)
-        return [int(i) for i in order[:most]]
-
-    def refine(self, sweeps: int, modes: Sequence[int] | None = None) -> None:
+    def refined(self, sweeps: int, modes: Sequence[int] | None = None) -> JointModel:
         """Improve the modes one after the other, as long as they gain."""
-        active = list(range(self.f.size)) if modes is None else modes
+        model = self
+        active = range(self.f.size) if modes is None else modes
         for _ in range(sweeps):
-            self._refine_floor()
-            gains = []
+            model, gaining = model._with_better_floor(), []
             for i in active:
-                before = self.misfit
-                self._refine_mode(i)
-                gains.append(before - self.misfit)
-            active = [i for i, gain in zip(active, gains, strict=True) if gain > _LEAST_GAIN]
+                before, model = model, model._with_better_mode(i)
+                if before.misfit - model.misfit > _LEAST_GAIN:
+                    gaining.append(i)
+            active = gaining
             if not active:
                 break
+        return model
 
-    def _refine_floor(self) -> None:
+    def _with_better_floor(self) -> JointModel:
+        model = self
         for _ in range(2):
-            g = self._inverse
-            gwg = g @ self.data.matrix @ g
-            up = (self.data.count * np.einsum("kaa->ak", gwg).real) @ self.data.basis.T
-            down = (self.data.count * np.einsum("kaa->ak", g).real) @ self.data.basis.T
-            old = self.floor
-            ratio = np.sqrt((up / down).clip(1e-2, 1e2)) ** 1.8
-            self.floor = np.maximum(self.floor * ratio, LEAST_FLOOR)
-            if not self._improved():
-                self.floor = old
+            ratio = floor_ratio(self.data, model._inverse).clip(1e-2, 1e2) ** 0.9
+            moved = replace(model, floor=np.maximum(model.floor * ratio, LEAST_FLOOR))
+            if not moved.misfit < model.misfit:
                 break
+            model = moved
+        return model
 
-    def _refine_mode(self, i: int) -> None:
+    def _with_better_mode(self, i: int) -> JointModel:
         """Improve pole, shape and static response of a mode, then its share of the forces."""
         n, m = self.phi.shape
-        h = receptance(self.f[i : i + 1, None], self.zeta[i : i + 1, None], self.data.frequency)[
-            :3, 0
-        ]
+        h, *slopes = receptance(self.f[i], self.zeta[i], self.data.frequency)[:3]
         eye = np.eye(n)
         u = np.concatenate(
             [
-                h[1:].T[:, None, :] * self.phi[None, :, i, None],
-                h[0, :, None, None] * eye,
-                np.ones((h.shape[1], 1, 1)) * eye,
+                np.stack(slopes, axis=1)[:, None, :] * self.phi[None, :, i, None],
+                h[:, None, None] * eye,
+                np.ones((h.size, 1, 1)) * eye,
             ],
             axis=2,
         )
-        gradient, fisher = self._score(self._inverse, self._columns() @ self.r[:, i], u)
-        weak = 1 / self._rho_variance()
-        gradient[2 + n :] += weak * self.rho[:, i]
-        step = _solve(gradient, fisher, np.concatenate([np.zeros(2 + n), weak]))
+        gradient, fisher = self._score(self._b @ self.r[:, i], u)
+        gradient[2 + n :] += self._weak * self.rho[:, i]
+        step = _solve(gradient, fisher, np.concatenate([np.zeros(2 + n), self._weak]))
         # At most a bandwidth, and a factor of two of the damping, in one step.
-        step *= min(
-            1.0, 1.5 * self.zeta[i] / max(abs(step[0]), 1e-12), 0.7 / max(abs(step[1]), 1e-12)
-        )
-        state = self.f[i], self.zeta[i], self.phi[:, i].copy(), self.rho[:, i].copy()
-        for _ in range(_HALVINGS):
-            self.f[i], self.zeta[i] = state[0] * np.exp(step[0]), state[1] * np.exp(step[1])
-            self.phi[:, i] = state[2] + step[2 : 2 + n]
-            self.rho[:, i] = state[3] + step[2 + n :]
-            if self._improved():
-                break
-            step = step * 0.3
-        else:
-            self.f[i], self.zeta[i], self.phi[:, i], self.rho[:, i] = state
-        if m > 1:
-            self._refine_forces(i)
+        most = np.array([1.5 * self.zeta[i], 0.7])
+        step *= min(1.0, *(most / np.abs(step[:2]).clip(1e-12)))
+        own = np.arange(m) == i
 
-    def _refine_forces(self, i: int) -> None:
+        def moved(step: FloatArray) -> JointModel:
+            f, zeta = self.f * np.exp(step[0] * own), self.zeta * np.exp(step[1] * own)
+            phi, rho = (np.outer(part, own) for part in np.split(step[2:], 2))
+            return replace(self, f=f, zeta=zeta, phi=self.phi + phi, rho=self.rho + rho)
+
+        better = self._first_better(moved, step)
+        return better._with_better_forces(i) if m > 1 else better
+
+    def _with_better_forces(self, i: int) -> JointModel:
         """Improve the correlations of the force of a mode."""
-        m = self.f.size
-        b = self._columns()
-        others = np.arange(m) != i
-        gradient, fisher = self._score(self._inverse, b[:, :, i], b[:, :, others])
-        step = _solve(gradient + self.r[i, others], fisher, np.ones(m - 1))
-        state = self.r
+        others = np.arange(self.f.size) != i
+        now = self.r[i, others]
+        gradient, fisher = self._score(self._b[:, :, i], self._b[:, :, others])
+
+        def moved(step: FloatArray) -> JointModel:
+            r = self.r.copy()
+            r[i, others] = r[others, i] = np.clip(now + step, -0.999, 0.999)
+            return replace(self, r=r) if np.linalg.eigvalsh(r)[0] > 1e-4 else self
+
+        return self._first_better(moved, _solve(gradient + now, fisher, np.ones(now.size)))
+
+    def _first_better(
+        self, moved: Callable[[FloatArray], JointModel], step: FloatArray
+    ) -> JointModel:
+        """Shorten a step until the misfit decreases; return the model itself if it does not."""
         for _ in range(_HALVINGS):
-            self.r = state.copy()
-            self.r[i, others] = self.r[others, i] = np.clip(state[i, others] + step, -0.999, 0.999)
-            if np.linalg.eigvalsh(self.r)[0] > 1e-4 and self._improved():
-                return
+            model = moved(step)
+            if model.misfit < self.misfit:
+                return model
             step = step * 0.3
-        self.r = state
+        return self
 
-    def _improved(self) -> bool:
-        """Return whether the misfit decreased, and keep it if so."""
-        value, inverse = self._evaluate()
-        better = value < self.misfit
-        if better:
-            self.misfit, self._inverse = value, inverse
-        return better
-
-    def _score(
-        self, g: ComplexArray, v: ComplexArray, u: ComplexArray
-    ) -> tuple[FloatArray, FloatArray]:
+    def _score(self, v: ComplexArray, u: ComplexArray) -> tuple[FloatArray, FloatArray]:
         """Gradient and Fisher information of unknowns by which E changes as u v* + v u*."""
+        g, count = self._inverse, self.data.count
         gv = (g @ v[:, :, None])[:, :, 0]
         size = (gv * v.conj()).sum(axis=1).real
         gu = g @ u
         along = np.einsum("kc,kca->ka", gv.conj(), u)
         excess = gv - (g @ (self.data.matrix @ gv[:, :, None]))[:, :, 0]
-        gradient = 2 * self.data.count @ np.einsum("kc,kca->ka", excess.conj(), u).real
-        across = (u * (self.data.count * size)[:, None, None]).reshape(-1, u.shape[2])
+        gradient = 2 * count @ np.einsum("kc,kca->ka", excess.conj(), u).real
+        across = (u * (count * size)[:, None, None]).reshape(-1, u.shape[2])
         fisher = across.conj().T @ gu.reshape(-1, u.shape[2])
-        fisher = fisher + (along * self.data.count[:, None]).T @ along
+        fisher = fisher + (along * count[:, None]).T @ along
         return gradient, np.asarray(2 * fisher.real)
 
 
 def _solve(gradient: FloatArray, fisher: FloatArray, prior: FloatArray) -> FloatArray:
+    """Return a step of Fisher's scoring."""
     information = fisher + np.diag(prior + 1e-6 * np.diag(fisher) + 1e-12)
     return np.asarray(-np.linalg.solve(information, gradient), dtype=np.float64)

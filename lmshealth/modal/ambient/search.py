@@ -11,19 +11,26 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.special import comb
 
 from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.joint_model import LEAST_FLOOR, BandData, JointModel
+from lmshealth.modal.ambient.joint_model import (
+    LEAST_FLOOR,
+    BandData,
+    JointModel,
+    expectation,
+    floor_ratio,
+)
 from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
-from lmshealth.modal.ambient.wandering import Harmonic, Recording, find_harmonic
+from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
+from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
-from lmshealth.signal.spectra import LogSpectra
+from lmshealth.signal.spectra import LogSpectra, SegmentTransforms
 from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Width of the bins at a resonance in damping ratios, of which the least counts, and the widest as a
@@ -70,14 +77,14 @@ class Found:
 
 def search(
     spectra: LogSpectra,
-    recording: Recording,
+    recording: SegmentTransforms,
     low: float,
     high: float,
     lines: Sequence[float] = (),
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    ``recording`` is the longest segment, to recognise harmonics; ``lines`` are masked. Channels
+    ``recording`` is the longest segment, to recognise harmonics. Lines are masked in both. Channels
     that no common modes explain are left out.
     """
     every = spectra.channels
@@ -86,7 +93,7 @@ def search(
         kept = _consistent(model)
         if len(kept) == len(spectra.channels):
             break
-        recording = replace(recording, transforms=recording.transforms[:, kept])
+        recording = recording._replace(transforms=recording.transforms[:, kept])
         spectra = spectra.select(kept)
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
@@ -109,7 +116,7 @@ def search(
 
 
 def _explain(
-    spectra: LogSpectra, recording: Recording, low: float, high: float
+    spectra: LogSpectra, recording: SegmentTransforms, low: float, high: float
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -133,11 +140,8 @@ def _consistent(model: JointModel) -> list[int]:
     """Return the channels that the modes explain; the others are left out one by one."""
     kept = list(range(model.data.scale.size))
     while len(kept) > 1 and model.dispersions().max() > constants.POOR_FIT:
-        fewer = [
-            model.of_channels([k for k in range(len(kept)) if k != c]) for c in range(len(kept))
-        ]
-        for one in fewer:
-            one.refine(2)
+        n = range(len(kept))
+        fewer = [model.of_channels([k for k in n if k != c]).refined(2) for c in n]
         best = int(np.argmin([np.log(one.dispersions()).mean() for one in fewer]))
         model = fewer[best]
         del kept[best]
@@ -148,19 +152,7 @@ def _select(
     spectra: LogSpectra, candidates: list[Candidate], low: float, high: float
 ) -> JointModel:
     """Select the modes that the cross spectra need, by stepwise maximum likelihood."""
-    data = _bin(spectra, candidates, low, high)
-    start = _StartModel(data, candidates)
-    start.update(10)
-    rest = list(range(len(candidates)))
-    while rest:
-        gains, strength = start.gains(rest)
-        best = int(gains.argmax())
-        if gains[best] < constants.LEAST_START:
-            break
-        start.add(rest.pop(best), float(strength[best]))
-        start.update(8)
-    model = start.joint()
-    model.refine(6)
+    model = _start(_bin(spectra, candidates, low, high), candidates).refined(6)
     for _ in range(_ROUNDS):
         model = _prune(model)
         more = _grow(model)
@@ -182,15 +174,13 @@ def _prune(model: JointModel) -> JointModel:
         worst, least = None, constants.EVIDENCE_MARGIN
         for i in _doubtful(model):
             less = model.without(i)
-            less.refine(2, less.nearest(model.f[i]))
-            less.refine(2)
+            less = less.refined(2, less.nearest(model.f[i])).refined(2)
             evidence = _evidence(model, less)
             if evidence < least:
                 worst, least = less, evidence
         if worst is None:
             break
-        model = worst
-        model.refine(2)
+        model = worst.refined(2)
     return model
 
 
@@ -206,31 +196,24 @@ def _doubtful(model: JointModel) -> list[int]:
 
 def _grow(model: JointModel) -> JointModel | None:
     """Add the mode that the residual shows most clearly; None where there is no evidence."""
-    for excess in _excesses(model)[:2]:
-        if excess.gain < constants.LEAST_EXCESS:
+    for gain, f, zeta, phi in _excesses(model)[:2]:
+        if gain < constants.LEAST_EXCESS:
             break
-        more = model.with_mode(excess.frequency, excess.damping_ratio, excess.amplitude)
-        more.refine(3, more.nearest(excess.frequency))
+        more = model.with_mode(f, zeta, phi)
+        more = more.refined(3, more.nearest(f))
         enough = _evidence(more, model) >= constants.EVIDENCE_MARGIN
         if enough and more.zeta[-1] < constants.MOST_DAMPING:
             return more
     return None
 
 
-class _Excess(NamedTuple):
-    gain: float  # of log likelihood
-    frequency: float
-    damping_ratio: float
-    amplitude: FloatArray  # root of the PSD of the modal force in each channel
-
-
-def _excesses(model: JointModel) -> list[_Excess]:
-    """Return, for each window, where an eigenvalue of the whitened residual is largest.
+def _excesses(model: JointModel) -> list[tuple[float, float, float, FloatArray]]:
+    """Return gain, frequency, damping and amplitude of the largest residual of each window.
 
     Of the mean of n ordinates the eigenvalue λ gains n (λ - 1 - ln λ) in log likelihood.
     """
     data = model.data
-    root = np.linalg.cholesky(model.expected())
+    root = np.linalg.cholesky(model.expected)
     inverse = np.linalg.inv(root)
     white = inverse @ data.matrix @ np.swapaxes(inverse.conj(), 1, 2)
     summed = np.cumsum(white * data.count[:, None, None], axis=0)
@@ -248,8 +231,8 @@ def _excesses(model: JointModel) -> list[_Excess]:
         phi = root[k] @ vector[k, :, -1]
         phi = np.real(phi * np.exp(-0.5j * np.angle(np.sum(phi * phi))))
         strength = 2 * half * np.sqrt(largest[k] - 1)
-        found.append(_Excess(float(gain[k]), float(data.frequency[k]), half, strength * phi))
-    return sorted(found, key=lambda excess: -excess.gain)
+        found.append((float(gain[k]), float(data.frequency[k]), half, strength * phi))
+    return sorted(found, key=lambda excess: -excess[0])
 
 
 def split_groups(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -294,82 +277,62 @@ def neighbourhood(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tup
     return targets[first:last]
 
 
-class _StartModel:
-    """Candidates with fixed poles and shapes, driven by forces of covariance S, and floors.
+def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
+    """Add candidates one by one, by their gain with all else fixed.
 
-    Expectation maximisation of S, a multiplicative update of the floors; candidates are added one
-    by one by their gain with all else fixed.
+    Poles and shapes stay fixed, the covariance S of the forces and the floors are updated.
     """
+    f = np.array([c.frequency for c in candidates])
+    zeta = np.array([c.damping_ratio for c in candidates])
+    phi = np.array([c.shape for c in candidates]).reshape(-1, data.scale.size) / data.scale
+    phi = phi / np.linalg.norm(phi, axis=1, keepdims=True)
+    h = response(f[:, None], zeta[:, None], data.frequency)
+    peak = np.abs(h).max(axis=1, initial=1e-300)
+    b = np.einsum("ic,ik->kci", phi, h / peak[:, None])
+    s, floor = np.zeros((0, 0), dtype=complex), np.full((data.scale.size, len(data.basis)), 0.5)
+    s, floor = _update(data, b[:, :, :0], s, floor, 10)
+    chosen: list[int] = []
+    rest = list(range(len(candidates)))
+    while rest:
+        e = expectation(data, b[:, :, chosen], s, floor)
+        gains, strength = _gains(data, e, b[:, :, rest])
+        best = int(gains.argmax())
+        if gains[best] < constants.LEAST_START:
+            break
+        chosen.append(rest.pop(best))
+        s, floor = _update(data, b[:, :, chosen], block_diag(s, strength[best]), floor, 8)
+    turn = np.exp(-0.5j * np.angle(np.sum(phi[chosen] ** 2, axis=1)))
+    root = np.sqrt(np.diagonal(s).real)
+    r = np.real(s * np.outer(turn.conj(), turn)) / np.outer(root, root)
+    r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
+    real = np.real(phi[chosen] * turn[:, None]).T * (root / peak[chosen])
+    return JointModel(data, floor, f[chosen], zeta[chosen], real, np.zeros_like(real), r)
 
-    def __init__(self, data: BandData, candidates: list[Candidate]) -> None:
-        self._data = data
-        self._floor = np.full((data.scale.size, len(data.basis)), 0.5)
-        self._f = np.array([c.frequency for c in candidates])
-        self._zeta = np.array([c.damping_ratio for c in candidates])
-        phi = np.array([c.shape for c in candidates]).reshape(-1, data.scale.size) / data.scale
-        self._phi = phi / np.linalg.norm(phi, axis=1, keepdims=True)
-        beta = self._f[:, None] / data.frequency
-        h = 1 / (1 - beta**2 - 2j * self._zeta[:, None] * beta)
-        self._peak = np.abs(h).max(axis=1, initial=1e-300)
-        h = h / self._peak[:, None]
-        self._b = np.einsum("ic,ik->kci", self._phi, h)
-        self._s = np.zeros((0, 0), dtype=complex)
-        self._chosen: list[int] = []
 
-    def _inverse(self) -> ComplexArray:
-        b = self._b[:, :, self._chosen]
-        e = b @ self._s @ np.swapaxes(b.conj(), 1, 2)
-        k = np.arange(e.shape[1])
-        e[:, k, k] += (self._floor @ self._data.basis).T
-        if self._data.foreign is not None:
-            e = e + self._data.foreign
-        return np.linalg.inv(e)
+def _update(
+    data: BandData, b: ComplexArray, s: ComplexArray, floor: FloatArray, times: int
+) -> tuple[ComplexArray, FloatArray]:
+    """Improve forces by expectation maximisation, and floors by a multiplicative update."""
+    adjoint = np.swapaxes(b.conj(), 1, 2)
+    for _ in range(times):
+        g = np.asarray(np.linalg.inv(expectation(data, b, s, floor)), dtype=np.complex128)
+        if s.size:
+            lack = np.einsum("k,kij->ij", data.count, adjoint @ (g @ data.matrix @ g - g) @ b)
+            information = np.einsum("k,kii->i", data.count, adjoint @ g @ b).real
+            s = s + _force_step(s, lack, information)
+        floor = np.maximum(floor * floor_ratio(data, g) ** 0.75, LEAST_FLOOR)
+    return s, floor
 
-    def update(self, times: int) -> None:
-        """Improve forces and floors."""
-        count, basis = self._data.count, self._data.basis
-        for _ in range(times):
-            g = self._inverse()
-            gwg = g @ self._data.matrix @ g
-            if self._chosen:
-                b = self._b[:, :, self._chosen]
-                adjoint = np.swapaxes(b.conj(), 1, 2)
-                lack = np.einsum("k,kij->ij", count, adjoint @ (gwg - g) @ b)
-                information = np.einsum("k,kii->i", count, adjoint @ g @ b).real
-                self._s = self._s + _force_step(self._s, lack, information)
-            up = (count * np.einsum("kaa->ak", gwg).real) @ basis.T
-            down = (count * np.einsum("kaa->ak", g).real) @ basis.T
-            self._floor = np.maximum(self._floor * np.sqrt(up / down) ** 1.5, LEAST_FLOOR)
 
-    def gains(self, index: list[int]) -> tuple[FloatArray, FloatArray]:
-        """Return the gain in log likelihood by each candidate, and its strength."""
-        count, b = self._data.count, self._b[:, :, index]
-        gb = self._inverse() @ b
-        r = np.einsum("kac,kac->ck", b.conj(), gb).real
-        q = np.einsum("kac,kab,kbc->ck", gb.conj(), self._data.matrix, gb, optimize=True).real
-        x = 10.0 ** np.arange(-2, 5, 0.25)[:, None, None] / r.max(axis=1)[:, None]
-        gain = (count * (x * q / (1 + x * r) - np.log1p(x * r))).sum(axis=-1)
-        best, k = gain.argmax(axis=0), np.arange(len(index))
-        return gain[best, k], x[best, k, 0]
-
-    def add(self, i: int, strength: float) -> None:
-        """Add a candidate."""
-        m = len(self._chosen)
-        s = np.zeros((m + 1, m + 1), dtype=complex)
-        s[:m, :m], s[m, m] = self._s, strength
-        self._s = s
-        self._chosen.append(i)
-
-    def joint(self) -> JointModel:
-        """Return the chosen candidates as a joint model, with real shapes."""
-        phi = self._phi[self._chosen]
-        turn = np.exp(-0.5j * np.angle(np.sum(phi * phi, axis=1)))
-        root = np.sqrt(np.diagonal(self._s).real)
-        r = np.real(self._s * np.outer(turn.conj(), turn)) / np.outer(root, root)
-        r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
-        real = np.real(phi * turn[:, None]) * (root / self._peak[self._chosen])[:, None]
-        f, zeta = self._f[self._chosen], self._zeta[self._chosen]
-        return JointModel(self._data, self._floor, f, zeta, real.T, r)
+def _gains(data: BandData, e: ComplexArray, b: ComplexArray) -> tuple[FloatArray, FloatArray]:
+    """Return the gain in log likelihood by each candidate, and its strength."""
+    gb = np.linalg.solve(e, b)
+    r = np.einsum("kac,kac->ck", b.conj(), gb).real
+    q = np.einsum("kac,kab,kbc->ck", gb.conj(), data.matrix, gb, optimize=True).real
+    x = 10.0 ** np.arange(-2, 5, 0.25)[:, None, None] / r.max(axis=1)[:, None]
+    gain = (data.count * (x * q / (1 + x * r) - np.log1p(x * r))).sum(axis=-1)
+    best, k = gain.argmax(axis=0), np.arange(b.shape[2])
+    return gain[best, k], x[best, k, 0]
 
 
 def _force_step(s: ComplexArray, lack: ComplexArray, information: FloatArray) -> ComplexArray:

@@ -12,11 +12,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import JointModel
-from lmshealth.signal.spectra import SegmentTransforms, Spectrum
+from lmshealth.signal.spectra import SegmentTransforms
 
 # Half widths of the filter, and the widest search for its edges, as fractions of the frequency.
 _WIDTHS = (0.015, 0.03)
@@ -48,30 +49,13 @@ class Harmonic:
         return np.asarray(within[:, None, None] * self.covariance)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Recording:
-    """Transforms of the longest segment: one-sided, (n_ordinates, n_channels); duration in s."""
-
-    frequency: FloatArray
-    transforms: ComplexArray
-    duration: float
-
-    @classmethod
-    def of(cls, segment: SegmentTransforms, lines: Sequence[float]) -> Recording:
-        """Remove the ordinates of lines."""
-        as_spectrum = Spectrum(
-            segment.frequency, np.empty_like(segment.frequency), segment.duration, np.nan
-        )
-        clear = segment.free & as_spectrum.clear_of(lines)
-        return cls(segment.frequency, segment.transforms * clear[:, None], segment.duration)
-
-
 def find_harmonic(
-    model: JointModel, recording: Recording, known: Sequence[Harmonic] = ()
+    model: JointModel, recording: SegmentTransforms, known: Sequence[Harmonic] = ()
 ) -> Harmonic | None:
     """Return the clearest harmonic that wanders among the modes; None if there is none.
 
-    In the bands of known ones less evidence is needed: their direction may vary.
+    Lines of the recording are masked. In the bands of known harmonics less evidence is needed:
+    their direction may vary.
     """
     found = [one for i in range(model.f.size) if (one := _test(model, i, recording)) is not None]
     for sigmas, harmonic in sorted(found, key=lambda one: one[0]):
@@ -82,58 +66,44 @@ def find_harmonic(
     return None
 
 
-def _test(model: JointModel, i: int, recording: Recording) -> tuple[float, Harmonic] | None:
+def _test(model: JointModel, i: int, recording: SegmentTransforms) -> tuple[float, Harmonic] | None:
     """Return by how many standard deviations the amplitude is too constant for noise."""
     f0 = model.f[i]
     shape = model.phi / np.linalg.norm(model.phi, axis=0)
     own = (np.abs(model.f / f0 - 1) < _CLOSE) & ((shape.T @ shape[:, i]) ** 2 > _ALIKE)
     rest = model.subset(~own)
-    expected = rest.expected()
+    expected = rest.expected
     near = np.abs(model.data.frequency / f0 - 1) < max(0.01, model.zeta[i])
     phi = _direction(model, expected, near, shape[:, i])
-    inverse = np.linalg.inv(expected)
-    gain = inverse @ phi
-    power = np.real(gain @ phi.conj())
-    weight = gain / power[:, None]  # passes the direction unchanged, with the least of the rest
+    gain = np.linalg.inv(expected) @ phi
+    precision = np.real(gain @ phi.conj())
+    weight = gain / precision[:, None]  # passes the direction unchanged, with the least of the rest
     first, last = np.searchsorted(recording.frequency, [f0 * (1 - _WIDEST), f0 * (1 + _WIDEST)])
     frequency = recording.frequency[first:last]
     if frequency.size < _LEAST_ORDINATES:
         return None
-    weights = np.stack(
-        [
-            np.interp(frequency, model.data.frequency, w.real)
-            + 1j * np.interp(frequency, model.data.frequency, w.imag)
-            for w in weight.T
-        ],
-        axis=1,
-    )
+    weights = np.stack([np.interp(frequency, model.data.frequency, w) for w in weight.T], axis=1)
     z = np.sum(weights.conj() * recording.transforms[first:last] / model.data.scale, axis=1)
-    noise = np.interp(frequency, model.data.frequency, 1 / power)
+    noise = np.interp(frequency, model.data.frequency, 1 / precision)
     width = max(5, int(0.5 * model.zeta[i] * f0 * recording.duration) | 1)
     level = np.convolve(np.abs(z) ** 2, np.ones(width) / width, "same")
     within = _around(level > _STANDS_OUT * noise, int(np.argmin(np.abs(frequency - f0))))
-    windows = [within]
-    for half in _WIDTHS:
-        windows.append(slice(*np.searchsorted(frequency, [f0 * (1 - half), f0 * (1 + half)])))
-    sigmas = [_constancy(z[w], level[w]) for w in windows]
-    wide = frequency[within]
+    wide, power = frequency[within], np.abs(z[within]) ** 2
     if wide.size < 2:
         return None
-    mean_square = float(np.sum(np.abs(z[within]) ** 2) / recording.duration)
-    channel = int(np.argmax(np.abs(phi) * model.data.scale))
-    amplitude = np.sqrt(2 * mean_square) * abs(phi[channel]) * model.data.scale[channel]
-    strength = 1e2 * float(level[within].max())
+    windows = [slice(*np.searchsorted(frequency, [f0 * (1 - w), f0 * (1 + w)])) for w in _WIDTHS]
+    sigmas = min(_constancy(z[w], level[w]) for w in (within, *windows))
     physical = phi * model.data.scale
+    channel = int(np.argmax(np.abs(physical)))
     more = _WIDER * float(wide[-1] - wide[0])
-    harmonic = Harmonic(
-        float(np.average(wide, weights=np.abs(z[within]) ** 2)),
+    return sigmas, Harmonic(
+        float(np.average(wide, weights=power)),
         float(wide[0]) - more,
         float(wide[-1]) + more,
-        float(amplitude),
+        float(np.sqrt(2 * power.sum() / recording.duration) * abs(physical[channel])),
         channel,
-        strength * np.outer(physical, physical.conj()),
+        1e2 * float(level[within].max()) * np.outer(physical, physical.conj()),
     )
-    return min(sigmas), harmonic
 
 
 def _direction(
@@ -142,15 +112,10 @@ def _direction(
     """Return the direction that exceeds the rest most, of unit norm."""
     if not near.any():
         return start.astype(complex)
-    root = np.linalg.cholesky(expected[near])
-    inverse = np.linalg.inv(root)
-    white = inverse @ model.data.matrix[near] @ np.swapaxes(inverse.conj(), 1, 2)
-    strongest = int(np.argmax(np.trace(white, axis1=1, axis2=2).real * model.data.count[near]))
-    root = root[strongest]
-    inverse = np.linalg.inv(root)
-    total = np.tensordot(model.data.count[near], model.data.matrix[near], axes=1)
-    vector = np.linalg.eigh(inverse @ total @ inverse.conj().T)[1][:, -1]
-    phi = root @ vector
+    expected, matrix, count = expected[near], model.data.matrix[near], model.data.count[near]
+    white = np.linalg.solve(expected, matrix)
+    strongest = expected[np.argmax(np.trace(white, axis1=1, axis2=2).real * count)]
+    phi = strongest @ eigh(np.tensordot(count, matrix, axes=1), strongest)[1][:, -1]
     return np.asarray(phi / np.linalg.norm(phi))
 
 
