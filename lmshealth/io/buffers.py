@@ -136,6 +136,13 @@ class Spool:
         self._parts.clear()
 
 
+def as_samples(values: np.ndarray) -> Samples:
+    """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
+    spool = Spool(values.size)
+    spool.append(values)
+    return spool.samples()
+
+
 @contextmanager
 def spools(names: Iterable[str], *, expected: int = 0) -> Iterator[dict[str, Spool]]:
     """Make a spool for each column; where reading fails, their files are closed."""

@@ -20,7 +20,7 @@ from typing import IO, NamedTuple
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool
+from lmshealth.io.buffers import Samples, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, check_size, not_numeric
 from lmshealth.io.metadata import KEYS
@@ -100,9 +100,7 @@ def _read(stream: IO[bytes], order: str, columns: ColumnMap, max_memory: float) 
             n_samples += array.values.size
             # MATLAB stores whole numbers in fewer bytes than they take here.
             check_size(8 * n_samples, stored)
-            spool = Spool(array.values.size)
-            spool.append(array.values)
-            read[array.name] = spool.samples()
+            read[array.name] = as_samples(array.values)
         elif array.name in KEYS:
             metadata[array.name] = _text(array)
     present += [name for name in names if name and name not in chosen]

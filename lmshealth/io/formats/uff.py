@@ -17,7 +17,7 @@ from typing import IO, Any, NamedTuple
 import numpy as np
 
 from lmshealth._arrays import ComplexArray, FloatArray
-from lmshealth.io.buffers import Samples, blocks, spools
+from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
 from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
@@ -45,17 +45,9 @@ _SECONDS = ("", "none", "s", "sec", "second", "seconds")
 _UNEVEN, _EVEN = 0, 1
 _LITTLE = 1
 
-# Widths of the numbers in a line, by type of the ordinate and spacing of the abscissa.
-_WIDTHS = {
-    (2, _EVEN): (13,) * 6,
-    (2, _UNEVEN): (13,) * 6,
-    (4, _EVEN): (20,) * 4,
-    (4, _UNEVEN): (13, 20, 13, 20),
-    (5, _EVEN): (13,) * 6,
-    (5, _UNEVEN): (13,) * 6,
-    (6, _EVEN): (20,) * 4,
-    (6, _UNEVEN): (13, 20, 20),
-}
+# Widths of the numbers in a line by type of the ordinate, with and without an abscissa.
+_WIDTHS: dict[int, tuple[int, ...]] = {2: (13,) * 6, 4: (20,) * 4, 5: (13,) * 6, 6: (20,) * 4}
+_UNEVEN_WIDTHS = _WIDTHS | {4: (13, 20, 13, 20), 6: (13, 20, 20)}
 _BINARY = {2: "f4", 4: "f8", 5: "f4", 6: "f8"}
 # Bytes of memory for a byte of ASCII: the text, its lines, the fields of a column, the numbers.
 _ASCII_MEMORY = 4
@@ -68,31 +60,33 @@ Header = dict[str, Any]
 class _DataSet(NamedTuple):
     """A function at nodal degrees of freedom: its place among all data sets, from 1.
 
-    ``header`` are tag, number and eleven records as in the file; ``start`` and ``stop`` the bytes
-    of its numbers.
+    ``head`` are tag, number and eleven records as in the file; ``start`` and ``stop`` the bytes of
+    its numbers; ``header`` is what pyuff reads from the records.
     """
 
     place: int
-    header: bytes
+    head: bytes
     binary: bool
     start: int
     stop: int
+    header: Header
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream:
-        sets = list(_data_sets(stream))
-        headers = _headers(sets)
-        names = _names(headers, sets)
-        described = [_describe(header, name) for header, name in zip(headers, names, strict=True)]
+        sets = _with_headers(list(_data_sets(stream)))
+        described = [_describe(*named) for named in zip(sets, _names(sets), strict=True)]
         chosen = choose(described, columns)
         read: dict[str, Samples] = {}
         stamps: dict[str, Samples] = {}
         for name, k in chosen.columns.items():
-            _check_record(headers[k], sets[k], name, max_memory)
-            x, read[name] = _record(stream, sets[k], headers[k], name)
-            if x is not None:
-                stamps[name] = x
+            if not _is_time_record(sets[k].header):
+                kind = sets[k].header["func_type"]
+                raise not_numeric(name, f"no time record but the function type {kind}")
+            values = _numbers(stream, sets[k], name, max_memory, _SECONDS)
+            read[name] = as_samples(values[:, -1])
+            if values.shape[1] == 2:
+                stamps[name] = as_samples(values[:, 0])
     if stamps:
         first = next(iter(stamps.values()))
         if len(stamps) < len(read) or not all(_equal(x, first) for x in stamps.values()):
@@ -115,23 +109,18 @@ class Function(NamedTuple):
 
 def load_functions(path: Path, max_memory: float) -> list[Function]:
     """Read the frequency responses and coherences of a file; the unit is as the file has it."""
+    functions = []
     with path.open("rb") as stream:
-        sets = list(_data_sets(stream))
-        headers = _headers(sets)
-        kinds = (_RESPONSE, _COHERENCE)
-        used = [k for k, header in enumerate(headers) if header["func_type"] in kinds]
-        names = _names([headers[k] for k in used], [sets[k] for k in used])
-        functions = []
-        for k, name in zip(used, names, strict=True):
-            header = headers[k]
+        sets = _with_headers(list(_data_sets(stream)))
+        used = [one for one in sets if one.header["func_type"] in (_RESPONSE, _COHERENCE)]
+        for one, name in zip(used, _names(used), strict=True):
+            header = one.header
             coherence = header["func_type"] == _COHERENCE
             if header["ord_data_type"] not in (_REAL if coherence else _COMPLEX):
                 raise not_numeric(name, "no complex numbers: export real and imaginary parts")
-            _check(header, sets[k], name, max_memory, _HERTZ)
-            values = _numbers(stream, sets[k], header, name)
-            n = header["num_pts"]
+            values = _numbers(stream, one, name, max_memory, _HERTZ)
             if header["abscissa_spacing"] == _EVEN:
-                axis = header["abscissa_min"] + header["abscissa_inc"] * np.arange(n)
+                axis = header["abscissa_min"] + header["abscissa_inc"] * np.arange(len(values))
                 values = np.column_stack([axis, values])
             complete = values[:, 1].astype(np.complex128)
             if not coherence:
@@ -179,7 +168,7 @@ def _data_sets(stream: IO[bytes]) -> Iterator[_DataSet]:
         if stop is None:
             stream.seek(start)
             stop = _end(stream, binary=binary)
-        yield _DataSet(place, b"".join([tag, number, *records]), binary, start, stop)
+        yield _DataSet(place, b"".join([tag, number, *records]), binary, start, stop, {})
 
 
 def _malformed(place: int) -> Unusable:
@@ -215,41 +204,37 @@ def _end(stream: IO[bytes], *, binary: bool = False) -> int:
     raise corrupt(_CUT_OFF)
 
 
-def _headers(sets: Sequence[_DataSet]) -> list[Header]:
+def _with_headers(sets: Sequence[_DataSet]) -> list[_DataSet]:
     """Read the headers with pyuff, which gets a file without the samples."""
     with library("UFF58", "pyuff"):
         import pyuff
     with tempfile.TemporaryDirectory(prefix="lmshealth-") as folder:
         path = Path(folder) / "headers.uff"
-        path.write_bytes(b"".join(found.header + _TAG + b"\n" for found in sets))
+        path.write_bytes(b"".join(found.head + _TAG + b"\n" for found in sets))
         file = pyuff.UFF(str(path))
         if file.get_n_sets() != len(sets):
             raise Unusable("corrupt", "a header contains the tag of a data set; export it again")
-        headers: list[Header] = []
+        read: list[_DataSet] = []
         for k, found in enumerate(sets):
             try:
-                headers.append(dict(file.read_sets(k, header_only=True)))
+                read.append(found._replace(header=file.read_sets(k, header_only=True)))
             except Exception as error:  # pyuff raises nothing more specific
                 raise _malformed(found.place) from error
-        return headers
+        return read
 
 
-def _names(headers: Sequence[Header], sets: Sequence[_DataSet]) -> list[str]:
+def _names(sets: Sequence[_DataSet]) -> list[str]:
     """Name the data sets by the first entry of their headers that distinguishes all of them."""
-    for entry in (
-        lambda header: header["id1"],
-        lambda header: header["rsp_ent_name"],
-        lambda header: header["ordinate_axis_lab"],
-        lambda header: f"{header['rsp_node']}{header['rsp_dir']:+d}",
-    ):
-        names = [str(entry(header)).strip() for header in headers]
+    for entry in ("{id1}", "{rsp_ent_name}", "{ordinate_axis_lab}", "{rsp_node}{rsp_dir:+d}"):
+        names = [entry.format(**found.header).strip() for found in sets]
         if len(set(names)) == len(names) and not {"", "NONE"} & set(names):
             return names
     return [f"set {found.place}" for found in sets]
 
 
-def _describe(header: Header, name: str) -> Described:
+def _describe(found: _DataSet, name: str) -> Described:
     """Describe a data set; all but time records of real numbers have no unit of a signal."""
+    header = found.header
     unit = header["ordinate_axis_units_lab"].strip()
     unit = "" if unit == "NONE" else unit
     if not _is_time_record(header):
@@ -269,44 +254,25 @@ def _is_time_record(header: Header) -> bool:
     return (kind == _TIME_RESPONSE or of_unknown) and header["ord_data_type"] in _REAL
 
 
-def _check_record(header: Header, found: _DataSet, name: str, max_memory: float) -> None:
-    """Check that a data set is a time record in s, before it is read."""
-    if not _is_time_record(header):
-        raise not_numeric(name, f"no time record but the function type {header['func_type']}")
-    _check(header, found, name, max_memory, _SECONDS)
+def _numbers(
+    stream: IO[bytes], found: _DataSet, name: str, max_memory: float, units: Sequence[str]
+) -> FloatArray:
+    """Read the numbers of a data set, a row per point: abscissa (if uneven), then the ordinate.
 
-
-def _check(
-    header: Header, found: _DataSet, name: str, max_memory: float, units: Sequence[str]
-) -> None:
-    """Check unit, spacing and size of a data set; the third of the units is quoted."""
+    The abscissa must be in one of the units, of which the third is quoted.
+    """
+    header = found.header
     unit = header["abscissa_axis_units_lab"].strip()
     if unit.lower() not in units:
         raise Unusable("unit", f"the abscissa of {name!r} is in {unit!r}; needed {units[2]}")
-    if header["abscissa_spacing"] not in (_UNEVEN, _EVEN):
-        raise _malformed(found.place)
-    needed = (found.stop - found.start) * (1 if found.binary else _ASCII_MEMORY)
-    check_memory(f"data set {name[:80]!r}", needed, max_memory)
-
-
-def _record(
-    stream: IO[bytes], found: _DataSet, header: Header, name: str
-) -> tuple[Samples | None, Samples]:
-    """Read the abscissa, where it is stored, and the ordinate of a time record, ``(n,)`` each."""
-    values = _numbers(stream, found, header, name)
-    uneven = values.shape[1] == 2
-    with spools("xy", expected=len(values)) as taken:
-        if uneven:
-            taken["x"].append(values[:, 0])
-        taken["y"].append(values[:, -1])
-        return taken["x"].samples() if uneven else None, taken["y"].samples()
-
-
-def _numbers(stream: IO[bytes], found: _DataSet, header: Header, name: str) -> FloatArray:
-    """Read the numbers of a data set, a row per point: abscissa (if uneven), then the ordinate."""
     ordinate, spacing, n = header["ord_data_type"], header["abscissa_spacing"], header["num_pts"]
+    if spacing not in (_UNEVEN, _EVEN):
+        raise _malformed(found.place)
+    size = found.stop - found.start
+    needed = size * (1 if found.binary else _ASCII_MEMORY)
+    check_memory(f"data set {name[:80]!r}", needed, max_memory)
     stream.seek(found.start)
-    body = stream.read(found.stop - found.start)
+    body = stream.read(size)
     if found.binary:
         order = "<" if header.get("byte_ordering") == _LITTLE else ">"
         dtype = np.dtype(order + _BINARY[ordinate])
@@ -314,7 +280,7 @@ def _numbers(stream: IO[bytes], found: _DataSet, header: Header, name: str) -> F
         values: np.ndarray = np.frombuffer(body, dtype, count=len(body) // dtype.itemsize)
     else:
         try:
-            values = _fields(body, _WIDTHS[ordinate, spacing])
+            values = _fields(body, (_UNEVEN_WIDTHS if spacing == _UNEVEN else _WIDTHS)[ordinate])
         except ValueError as error:
             raise _malformed(found.place) from error
     width = (spacing == _UNEVEN) + (2 if ordinate in _COMPLEX else 1)
