@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -31,7 +32,6 @@ from lmshealth.modal.ambient.cluster_modes import (
     refuse_close_modes,
 )
 from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search, split_groups
-from lmshealth.modal.ambient.wandering import Harmonic
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
@@ -53,9 +53,13 @@ _CEILING = 4.0
 # Without a description fits reach so many damping ratios from the outer modes: floors of real
 # machines are not simple.
 _REACH = 6.0
+# A band whose ends have a larger ratio than the first is searched in parts up to the second, as no
+# simple floors hold over it; each is searched up to the third ratio beyond its ends, and modes are
+# published up to the fourth.
+_WIDE, _PART, _BEYOND, _OVERLAP = 30.0, 4.0, 1.15, 1.01
 _UNLIKE = (
-    "no modes in common with the other channels explain it, which are used without it: check "
-    "whether it was recorded at the same time, or identify it by itself"
+    "from {:.4g} to {:.4g} Hz no modes in common with the other channels explain it, which are "
+    "used without it: check whether it was recorded at the same time, or identify it by itself"
 )
 # A cluster is fitted below this share of the sample rate.
 _TOP = 0.49
@@ -70,7 +74,7 @@ class AmbientReading:
     fitted: tuple[FittedSpectrum, ...] = ()  # of each cluster, ascending in frequency
     # Everything that was rejected; without a description modes.refused does not list it.
     rejected: tuple[Refusal, ...] = ()
-    sought: Found | None = None  # of the search without a description
+    sought: tuple[Found, ...] = ()  # of the search without a description, parts of the band
 
 
 def identify(
@@ -141,44 +145,46 @@ def read_ambient(
     used = choose_channels(log, channels)
     targets = () if stage is None else choose_targets(stage, band)
     stretches, whole = _transform(log, used, targets, band)
-    spectra = whole
     tested: list[tuple[str, float, float]] = []
-    harmonics: tuple[Harmonic, ...] = ()
-    unlike: tuple[str, ...] = ()
-    sought: Found | None = None
+    sought: tuple[Found, ...] = ()
     top = _TOP * log.sample_rate
     fits: list[ClusterFit] = []
     if stage is None:
-        progress("searching", 0, 1)
-        sought, tested = _search(log, used, stretches, spectra, band)
-        progress("searching", 1, 1)
-        harmonics, spectra, unlike = sought.harmonics, sought.spectra, sought.left_out
-        groups: dict[tuple[Target, ...], tuple[Target, ...]] = {}  # by their neighbourhoods
-        for group in split_groups(sought.modes):
-            near = neighbourhood(group, sought.modes)
-            groups[near] = (*groups.get(near, ()), *group)
-        for k, (near, group) in enumerate(groups.items()):
+        sought, tested = _search(log, used, stretches, whole, band, progress)
+        groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
+        for part in sought:
+            for group in split_groups(part.modes):
+                near = neighbourhood(group, part.modes)
+                groups[near] = part, (*groups.get(near, (part, ()))[1], *group)
+        for k, (near, (part, group)) in enumerate(groups.items()):
             progress("fitting", k, len(groups))
-            fits += _fit_group(sought, group, near, top)
+            fits += _fit_group(part, group, near, top)
         progress("fitting", len(groups), len(groups))
     else:
-        fits, known, more = _fit_described(spectra, targets, top)
+        fits, known, more = _fit_described(whole, targets, top)
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
-    left_out = [Refusal(log.name, "unlike-others", _UNLIKE, channel=c) for c in unlike]
+    left_out = [
+        Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
+        for part in sought
+        for name in part.left_out
+    ]
     rejected, found = refused, [fit.modes for fit in fits if fit.modes is not None]
     fitted = tuple(one.fitted for one in found)
     masked = [line for one in found for line in one.lines]
-    seen = [*tested, *spectra.removed_lines, *masked]
-    lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / spectra.duration)
+    seen = [*tested, *whole.removed_lines, *masked]
+    lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / whole.duration)
     lines += tuple(
-        Line(h.frequency, h.amplitude, "m/s²", "wandering", spectra.channels[h.channel])
-        for h in harmonics
+        Line(h.frequency, h.amplitude, "m/s²", "wandering", part.spectra.channels[h.channel])
+        for part in sought
+        for h in part.harmonics
     )
     if stage is None:
         found = drop_duplicates(found)
         anything = any(one.names for one in found)
         refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
-    modes = merge([one.modes for one in found], lines, (*log.refused, *refused), spectra.channels)
+    used_ones = {name for part in sought for name in part.spectra.channels}
+    shown = tuple(name for name in whole.channels if stage is not None or name in used_ones)
+    modes = merge([one.modes for one in found], lines, (*log.refused, *refused), shown)
     modes = numbered(modes) if stage is None else modes
     reading = AmbientReading(modes, whole, fitted, tuple(rejected), sought)
     if stage is None or not more:
@@ -259,8 +265,9 @@ def _search(
     stretches: Sequence[Segment],
     spectra: LogSpectra,
     band: tuple[float, float] | None,
-) -> tuple[Found, list[tuple[str, float, float]]]:
-    """Search the band for modes, and for the lines that Thomson's test shows."""
+    progress: Callable[[str, int, int], None],
+) -> tuple[tuple[Found, ...], list[tuple[str, float, float]]]:
+    """Search the parts of the band for modes, and the band for the lines of Thomson's test."""
     duration, usable = spectra.duration, constants.USABLE * log.sample_rate
     low, high = band or (20 / duration, usable)
     low, high = max(low, 2 / duration), min(high, usable)
@@ -284,7 +291,23 @@ def _search(
     silent = Spectrum(own.frequency, np.zeros_like(own.frequency), own.duration, np.nan)
     clear = own.free & silent.clear_of(frequencies)
     recording = own._replace(transforms=own.transforms * clear[:, None])
-    return search(spectra.without(frequencies), recording, low, high, frequencies), tested
+    cut = spectra.without(frequencies)
+    parts: list[Found] = []
+    n_parts = int(np.ceil(np.log(high / low) / np.log(_PART))) if high > _WIDE * low else 1
+    edges = np.geomspace(low, high, n_parts + 1).tolist()
+    for k, (first, last) in enumerate(pairwise(edges)):
+        progress("searching", k, len(edges) - 1)
+        ends = max(low, first / _BEYOND), min(high, last * _BEYOND)
+        if (ends[1] - ends[0]) * duration < constants.LEAST_FREQUENCIES:
+            continue
+        part = search(cut, recording, *ends, frequencies)
+        first_number = 1 + sum(len(one.modes) for one in parts)
+        modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, first_number)]
+        # A mode between two parts may be found by both, but must not be lost.
+        within = max(low, first / _OVERLAP), min(high, last * _OVERLAP)
+        parts.append(replace(part, band=within, modes=tuple(modes)))
+    progress("searching", len(edges) - 1, len(edges) - 1)
+    return tuple(parts), tested
 
 
 def _fit_described(

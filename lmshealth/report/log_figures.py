@@ -42,6 +42,8 @@ _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
 _PANEL, _FRAME, _LETTERS, _NOTE = 1.15, 1.75, 1.1, 0.16
 _BINS, _SINGULAR = 480, 4  # of a spectrum, and singular values, at most
+# Of the largest singular value; smaller ones are rounding where bins have too few ordinates.
+_RANK = 1e-9
 # Drawings of shapes in a row, their height in inches, the largest motion over the extent of the
 # sensors, and the projection of x, y and z.
 _DRAWN_BESIDE, _DRAWING, _MOVED = 4, 1.8, 0.25
@@ -97,13 +99,15 @@ def modes_figure(
 
 def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSpectrum:
     """Subtract what stands for harmonics that wander: the expectation of modes and floors."""
-    if reading.sought is None or len(reading.sought.spectra.channels) == 1:
-        return fit  # in a single channel their bands are left out
-    expected, names = fit.expected, reading.sought.spectra.channels
-    rows = [names.index(name) for name in fit.channels]
-    for one in reading.sought.harmonics:
-        there = one.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
-        expected = expected - there / np.outer(fit.unit, fit.unit)
+    expected = fit.expected
+    for part in reading.sought:
+        names = part.spectra.channels
+        if len(names) == 1 or not set(fit.channels) <= set(names):
+            continue  # in a single channel their bands are left out
+        rows = [names.index(name) for name in fit.channels]
+        for one in part.harmonics:
+            there = one.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
+            expected = expected - there / np.outer(fit.unit, fit.unit)
     return replace(fit, expected=expected)
 
 
@@ -150,14 +154,14 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
 
 
 def spectra_size(
-    summary: SpectraSummary, modes: Modes, sought: Found | None = None
+    summary: SpectraSummary, modes: Modes, sought: Sequence[Found] = ()
 ) -> tuple[float, float]:
     """Return the size of `plot_spectra` in inches."""
     return _size(_n_panels(summary, sought), modes)
 
 
-def _n_panels(summary: SpectraSummary, sought: Found | None) -> int:
-    return len(summary.channels) + bool(len(summary.singular)) + (sought is not None)
+def _n_panels(summary: SpectraSummary, sought: Sequence[Found]) -> int:
+    return len(summary.channels) + bool(len(summary.singular)) + bool(sought)
 
 
 def plot_spectra(
@@ -165,7 +169,7 @@ def plot_spectra(
     summary: SpectraSummary,
     modes: Modes,
     stage: Stage | None,
-    sought: Found | None = None,
+    sought: Sequence[Found] = (),
 ) -> Figure:
     """Plot the spectrum of each channel with its fit, lines, modes and what was refused."""
     middle = (summary.edges[1:] + summary.edges[:-1]) / 2
@@ -194,14 +198,17 @@ def plot_spectra(
         _mark_lines(ax, modes, name, middle, density)
     for k, values in enumerate(singular):
         style = {"lw": 0.9 if k == 0 else 0.6, "color": figures.MUTED if k else figures.INK}
-        panels[len(level)].plot(middle, values, **style)
+        shown = np.where(values > _RANK * singular[0], values, np.nan)
+        panels[len(level)].plot(middle, shown, **style)
     if singular.size:
         _name_panel(panels[len(level)], "singular values\nof all channels")
     for ax in panels[: len(level) + bool(singular.size)]:
         ax.set_yscale("log")
         ax.margins(y=0.08)  # room for markers
-    if sought is not None:
-        _plot_search(panels, sought)
+    for part in sought:
+        _plot_search(panels, part)
+    if sought:
+        _name_panel(panels[-1], "order of the\nsubspace model")
     figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
     _annotate(figure, panels, (summary.low, summary.high), modes, stage)
     return figure
@@ -219,7 +226,6 @@ def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
         label = f"{'stable' if stable else 'other'} pole of the search"
         place = poles.frequency[own], poles.order[own]
         ax.plot(*place, "o", ms=2.5, color=figures.INK, label=label, **style)
-    _name_panel(ax, "order of the\nsubspace model")
     for line in sought.harmonics:
         for panel in panels:
             span: Any = {"color": figures.RED, "alpha": 0.15, "lw": 0}

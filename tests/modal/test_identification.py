@@ -790,3 +790,18 @@ def test_a_record_in_parts_is_as_sure_as_the_whole(monkeypatch: pytest.MonkeyPat
     assert np.abs((cut / std).mean(axis=0) - 1).max() < 0.02
     assert apart.std(axis=0).max() < 0.25
     assert np.abs(apart.mean(axis=0)).max() < 0.1
+
+
+def test_a_wide_band_is_searched_in_parts() -> None:
+    """Modes over three decades are found without a band, each once and none lost between parts."""
+    rate, seconds = 2000.0, 60.0
+    truth = [(6.0, 0.03), (60.0, 0.02), (120.0, 0.015), (126.0, 0.012), (640.0, 0.01)]
+    rng = np.random.default_rng(3)
+    signal = 0.05 * rng.standard_normal(round(rate * seconds))
+    for f, zeta in truth:
+        pole = np.exp(2 * np.pi * f / rate * (-zeta + 1j * np.sqrt(1 - zeta**2)))
+        force = rng.standard_normal(signal.size)
+        moved = lfilter([1, -2, 1], np.poly([pole, pole.conj()]), force)
+        signal += moved / moved.std()
+    modes = identify(make_log({"acc_0": signal}, rate))
+    assert modes.frequency == pytest.approx([f for f, _ in truth], rel=0.01)

@@ -151,7 +151,7 @@ def test_shapes_are_drawn_where_the_description_places_the_sensors() -> None:
 def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -> None:
     """Stable poles stand at the mode; the fit is that of the modes in the band of such a line."""
     reading = read_ambient(log, band=(40.0, 90.0))
-    assert reading.sought is not None
+    (part,) = reading.sought
     whole = draw(modes_figure(log, reading, band=(40.0, 90.0)))
     marks = {str(line.get_label()): line for line in whole.axes[-1].lines}
     stable: Any = marks["stable pole of the search"].get_xydata()
@@ -162,7 +162,7 @@ def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -
         rows = [reading.spectra.channels.index(name) for name in fit.channels]
         added = line.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
         fitted.append(replace(fit, expected=fit.expected + added / np.outer(fit.unit, fit.unit)))
-    sought = replace(reading.sought, harmonics=(line,))
+    sought = (replace(part, harmonics=(line,)),)
     other = replace(reading, fitted=tuple(fitted), sought=sought)
     again = draw(modes_figure(log, other, band=(40.0, 90.0)))
     (first,), (second,) = (

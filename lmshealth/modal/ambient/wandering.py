@@ -85,7 +85,8 @@ def _test(model: JointModel, i: int, recording: SegmentTransforms) -> tuple[floa
     weights = np.stack([np.interp(frequency, model.data.frequency, w) for w in weight.T], axis=1)
     z = np.sum(weights.conj() * recording.transforms[first:last] / model.data.scale, axis=1)
     noise = np.interp(frequency, model.data.frequency, 1 / precision)
-    width = max(5, int(0.5 * model.zeta[i] * f0 * recording.duration) | 1)
+    width = int(0.5 * model.zeta[i] * f0 * recording.duration) | 1
+    width = min(max(5, width), (z.size - 1) | 1)
     level = np.convolve(np.abs(z) ** 2, np.ones(width) / width, "same")
     within = _around(level > _STANDS_OUT * noise, int(np.argmin(np.abs(frequency - f0))))
     wide, power = frequency[within], np.abs(z[within]) ** 2
