@@ -67,10 +67,8 @@ def print_text(text: str, mark: str = "") -> None:
 
 def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons."""
-    logs = short_names([row["log"] for row in rows])
     if rows:
-        shown = [row | {"log": logs[row["log"]]} for row in rows]
-        print_table("Refused", cells(_REFUSED, shown), 5)
+        print_table("Refused", cells(_REFUSED, short_names(rows)), 5)
 
 
 class _Numbers(Formatter):
@@ -115,8 +113,9 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
     Console(markup=False, emoji=False, highlight=False).print(table)
 
 
-def short_names(logs: Sequence[str]) -> dict[str, str]:
-    """Return the name of each log without its folder where that is unique."""
-    names = {log: Path(log).name for log in logs}
+def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
+    """Copy rows with the name of each log without its folder, where that is unique in all rows."""
+    names = {row["log"]: Path(row["log"]).name for row in (*rows, *others)}
     shared = Counter(names.values())
-    return {log: name if shared[name] == 1 else log for log, name in names.items()}
+    names = {log: name if shared[name] == 1 else log for log, name in names.items()}
+    return [row | {"log": names[row["log"]]} for row in rows]

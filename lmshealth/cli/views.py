@@ -66,6 +66,7 @@ _OFF = (
     "off % {off} | declared damping % {declared_damping_ratio:.2p} | "
     "found damping % {found_damping_ratio:.2p}"
 )
+_SHAPES = "log {log} | mode {mode} | channel {channel} | amplitude {size:.3f} | phase ° {phase}"
 _ERROR = (
     "mm/s {velocity_mm_s:.3n} | s {duration_s:.3n} | min {min_um:.3n} | max {max_um:.3n} | "
     "std {std_um:.3n} | mean {mean_um:.3n}"
@@ -112,25 +113,22 @@ _HEALTH = (
 
 def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] = ()) -> None:
     """Print modes with their standard deviations, and logs that differ from the description."""
-    logs = short_names([row["log"] for row in rows])
-    shown = []
-    for row in rows:
+    shown = short_names(rows)
+    for row in shown:
         frequency, std = row["frequency_hz"], row["frequency_std_hz"]
-        text = f"{fixed(frequency, 3)} ± {fixed(std, 3)}"
+        row["frequency"] = f"{fixed(frequency, 3)} ± {fixed(std, 3)}"
         if std >= 1:
-            text = f"{number(frequency, 4)} ± {number(std, 2)}"
-        shown.append(row | {"log": logs[row["log"]], "frequency": text})
+            row["frequency"] = f"{number(frequency, 4)} ± {number(std, 2)}"
     if rows:
         print_table("Modes (± one standard deviation)", cells(_MODES, shown), 3)
         for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
             print_text(f"{flag}: {_FLAGS[flag]}")
     else:
         print_text("No modes found.")
-    shown = []
-    for row in off:
-        percents = signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1)
-        shown.append(row | {"log": logs[row["log"]], "off": percents})
-    if shown:
+    shown = short_names(off, rows)
+    for row in shown:
+        row["off"] = signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1)
+    if off:
         title = "Warning: the description differs; a mode may have a wrong name"
         print_table(title, cells(_OFF, shown), 2)
         print_text(
@@ -144,34 +142,30 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
     """Print complex mode shapes, their collinearity and the MAC of the modes of each log."""
     if not rows:
         print_text("No mode shapes: they need the fit of segments of constant velocity.")
-    logs = short_names([row["log"] for row in rows])
-    shapes = [
-        {
-            "log": logs[row["log"]],
-            "mode": row["mode"],
-            "channel": key.removeprefix("amplitude_"),
-            "amplitude": f"{amplitude:.3f}",
-            "phase °": f"{round(row[key.replace('amplitude', 'phase_deg', 1)])}",
-        }
-        for row in rows
-        for key, amplitude in row.items()
-        if key.startswith("amplitude_") and amplitude is not None
-    ]
+    rows, pairs = short_names(rows), short_names(pairs, rows)
+    shapes = []
+    for row in rows:
+        for key, amplitude in row.items():
+            if key.startswith("amplitude_") and amplitude is not None:
+                channel = key.removeprefix("amplitude_")
+                phase = row[f"phase_deg_{channel}"]
+                shapes.append(row | {"channel": channel, "size": amplitude, "phase": round(phase)})
     if shapes:
-        print_table("Mode shapes (accelerations relative to the largest)", shapes, 3)
+        title = "Mode shapes (accelerations relative to the largest)"
+        print_table(title, cells(_SHAPES, shapes), 3)
     mac = {
         (pair["log"], *modes): pair["mac"]
         for pair in pairs
         for modes in permutations((pair["mode_a"], pair["mode_b"]))
     }
     title = "Phase collinearity (MPC) and modal assurance criterion (MAC)"
-    for log in logs:
+    for log in dict.fromkeys(row["log"] for row in rows):
         own = [row for row in rows if row["log"] == log]
         names = [row["mode"] for row in own]
         for first in range(0, len(own), _MATRIX):
             matrix = []
             for row in own:
-                cell = {"log": logs[log], "mode": row["mode"], "MPC": _criterion(row["mpc"])}
+                cell = {"log": log, "mode": row["mode"], "MPC": _criterion(row["mpc"])}
                 for name in names[first : first + _MATRIX]:
                     cell[name] = _criterion(mac.get((log, row["mode"], name), 1.0))
                 matrix.append(cell)
@@ -195,12 +189,11 @@ def print_frf(
 
 def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // constants.TERMINAL_LINES))
+    gain = "gain" if fit["method"] == "measured" else "gain (SI)"
     lines = [
         {
             "Hz": f"{row['frequency_hz']:.5g}",
-            "gain"
-            if fit["method"] == "measured"
-            else "gain (SI)": f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
+            gain: f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
             "phase °": f"{math.degrees(row['phase_rad']):.1f}",
             "coherence": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
             "fit": f"{row['fit_gain']:.4g}",
@@ -236,8 +229,7 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
 def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence[Row]) -> None:
     """Print the following error: statistics and strongest harmonics."""
     if rows:
-        logs = short_names([row["log"] for row in rows])
-        shown = [row | {"log": logs[row["log"]]} for row in rows]
+        rows, harmonics = short_names(rows), short_names(harmonics, rows)
         several = len({row["channel"] for row in rows}) > 1
         names = "log {log} | channel {channel} | " if several else "log {log} | "
         for title, columns in (
@@ -245,7 +237,7 @@ def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence
             ("Strongest harmonics", _STRONGEST),
             (f"Those above {rows[0]['floor_nm']:g} nm", _ABOVE_FLOOR),
         ):
-            print_table(title, cells(names + columns, shown), 2 if several else 1)
+            print_table(title, cells(names + columns, rows), 2 if several else 1)
         print_text(
             "bandwidth: highest minus lowest frequency; share: of the variance they explain."
         )
@@ -256,17 +248,14 @@ def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence
 
 def _print_harmonics(rows: Sequence[Row], harmonics: Sequence[Row]) -> None:
     """Print harmonics, strongest first: all of a single channel, else the first of each."""
-    logs = short_names([row["log"] for row in rows])
     most = constants.TERMINAL_HARMONICS if len(rows) > 1 else len(harmonics)
     print_text("Strongest harmonics, Hz (amplitude in µm):")
     for row in rows:
         own = [h for h in harmonics if (h["log"], h["channel"]) == (row["log"], row["channel"])]
-        listed = ", ".join(
-            f"{h['frequency_hz']:.5g}{GAP}({number(h['amplitude_um'])})" for h in own[:most]
-        )
+        texts = [f"{h['frequency_hz']:.5g}{GAP}({number(h['amplitude_um'])})" for h in own[:most]]
         more = f" and {len(own) - most} more (see --format json)" if len(own) > most else ""
         if own:
-            print_text(f"{logs[row['log']]}, {row['channel']}: {listed}{more}.")
+            print_text(f"{row['log']}, {row['channel']}: {', '.join(texts)}{more}.")
 
 
 def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequence[Row]) -> None:
@@ -539,8 +528,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
             if one.life is not None:
                 print_life(one.life, one.service)
         return
-    shown = summaries[: constants.TERMINAL_ROWS]
-    cells = [
+    shown = [
         {
             "stage": one.identity,
             "verdict": one.verdict + in_brackets(one.probability),
@@ -548,12 +536,11 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
             "km left": _travel_left(one.life),
             "service": service_text(one.service),
         }
-        for one in shown
+        for one in summaries[: constants.TERMINAL_ROWS]
     ]
     title = f"{len(summaries)} stages, most urgent first (medians with 90 % intervals)"
-    print_table(title, cells, 5)
-    if len(summaries) > len(shown):
-        rest = len(summaries) - len(shown)
+    print_table(title, shown, 5)
+    if rest := len(summaries) - len(shown):
         click.echo(f"{rest} more stages; verdict.csv and prognosis.csv list all.")
 
 

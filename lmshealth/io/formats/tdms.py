@@ -94,15 +94,10 @@ def _segments(path: Path) -> list[int]:
 
 def _check_sizes(channels: Sequence[Any], n_bytes: int) -> None:
     """Refuse channels that claim another number of samples than the segments hold."""
-    claimed = 0
-    for channel in channels:
-        if not len(channel):
-            continue
-        size: int | None = getattr(channel.data_type, "size", None)
-        if size is None:
-            return  # Text, and raw counts of several channels in one, have no size of their own.
-        claimed += size * len(channel)
-    if claimed != n_bytes:
+    sizes = [(getattr(one.data_type, "size", None), len(one)) for one in channels if len(one)]
+    # Text, and raw counts of several channels in one, have no size of their own.
+    claimed = sum(size * n for size, n in sizes if size is not None)
+    if claimed != n_bytes and all(size is not None for size, _ in sizes):
         raise Unusable("corrupt", f"channels of {claimed} bytes in {n_bytes} bytes of samples")
 
 
