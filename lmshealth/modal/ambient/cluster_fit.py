@@ -39,6 +39,8 @@ _UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
 # Ordinates over which the level near a line is taken, and that it covers to either side.
 _LINE_NEIGHBOURS, _LINE_BINS = 41, 2
 _MOST_LINE_ROUNDS = 4
+# Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
+_DOUBTFUL = 200.0
 # The sign of a shape starts as that of the cross spectrum within so many damping ratios.
 _SIGN_BAND = 1.5
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
@@ -238,48 +240,29 @@ def locate(
 def fit_cluster(
     spectra: LogSpectra, binned: BinnedSpectra, targets: tuple[Target, ...]
 ) -> ClusterFit:
-    """Fit the modes of a cluster to all channels that show any of them.
+    """Fit the modes of a cluster, at their start values, to all channels that show any of them.
 
-    Parameters
-    ----------
-    spectra : LogSpectra
-        All channels.
-    binned : BinnedSpectra
-        Of the same channels around the cluster, with its neighbours.
-    targets : tuple of Target
-        The modes at their start values.
+    The spectra binned around the cluster hold its neighbours.
     """
     present, gains = screen(binned, targets)
-    names = {target.name for target in present}
-    absent = [target for target in targets if target.name not in names]
-    if not present:
-        return ClusterFit(None, _not_excited(absent, gains))
-    low = min(target.band(BAND_HALF_WIDTH)[0] for target in present)
-    high = max(target.band(BAND_HALF_WIDTH)[1] for target in present)
-    data = prepare(spectra, binned, present, (low, high))
-    n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(present))
-    if n < needed:
-        detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
-        short = {t.name: Rejection("too-short", detail, t.frequency) for t in present}
-        return ClusterFit(None, _not_excited(absent, gains) | short)
-    data = mask_prominent_lines(data)
-    for _ in range(_MOST_LINE_ROUNDS):
-        optimum, pruned = _fit_and_prune(data, present, gains)
-        present, absent = optimum.targets, [*absent, *pruned]
-        if not present:
-            return ClusterFit(None, _not_excited(absent, gains))
-        expected = _expected(data, optimum)
-        before, data = data, mask_residual_lines(data, expected)
-        if data is before:
-            break
-    rejected = _not_excited(absent, gains)
-    fit = _conclude(data, optimum, expected, gains)
-    return ClusterFit(fit.modes, rejected | fit.rejected)
-
-
-def needed_ordinates(n_modes: int) -> int:
-    """Return the least number of Fourier frequencies of a fit."""
-    return 10 + 6 * n_modes
+    modes, rejected = None, {}
+    if present:
+        low = min(target.band(BAND_HALF_WIDTH)[0] for target in present)
+        high = max(target.band(BAND_HALF_WIDTH)[1] for target in present)
+        fit = _fit(prepare(spectra, binned, present, (low, high)), present, gains)
+        modes, rejected = fit.modes, fit.rejected
+    names = {*rejected, *(() if modes is None else modes.names)}
+    absent = {
+        target.name: Rejection(
+            "not-excited",
+            f"no resonance near {target.frequency:.4g} Hz in any channel: it would improve the log "
+            f"likelihood by {max(gains[target.name], 0):.1f}; excite it more or record longer",
+            target.frequency,
+        )
+        for target in targets
+        if target.name not in names
+    }
+    return ClusterFit(modes, absent | rejected)
 
 
 def fit_found(
@@ -289,7 +272,18 @@ def fit_found(
     band: tuple[float, float],
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz, and drop those without evidence."""
-    data = prepare(spectra, binned, targets, band)
+    return _fit(prepare(spectra, binned, targets, band), targets)
+
+
+def needed_ordinates(n_modes: int) -> int:
+    """Return the least number of Fourier frequencies of a fit."""
+    return 10 + 6 * n_modes
+
+
+def _fit(
+    data: ClusterData, targets: tuple[Target, ...], gains: dict[str, float] | None = None
+) -> ClusterFit:
+    """Mask lines, fit, and drop modes without evidence; ``gains`` as in `_fit_and_prune`."""
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -297,52 +291,59 @@ def fit_found(
         return ClusterFit(None, short)
     data = mask_prominent_lines(data)
     for _ in range(_MOST_LINE_ROUNDS):
-        optimum, gains = _prune(data, targets)
+        optimum = _fit_and_prune(data, targets, gains)
         targets = optimum.targets
-        optimum = _refined(data, optimum)
+        if not targets:
+            return ClusterFit(None, {})
         expected = _expected(data, optimum)
         before, data = data, mask_residual_lines(data, expected)
         if data is before:
             break
-    return _conclude(data, optimum, expected, gains)
+    return _conclude(data, optimum, expected)
 
 
-def _prune(data: ClusterData, targets: tuple[Target, ...]) -> tuple[_Optimum, dict[str, float]]:
+def _fit_and_prune(
+    data: ClusterData, targets: tuple[Target, ...], gains: dict[str, float] | None
+) -> _Optimum:
     """Fit all modes, and drop those without evidence, the least likely first.
 
-    Returns the loss of log likelihood without each, the others fixed, too.
+    Modes of small gain are tried without. Without ``gains``, by name, modes that a search found are
+    tried whose loss, all others fixed, is small; one that left its start is dropped, and one stays.
     """
+
+    def blocks_for(some: tuple[Target, ...]) -> tuple[MeanOrdinates, ...]:
+        widths = [2 * t.frequency * t.damping_ratio for t in some]
+        bandwidth = min(widths)
+        if gains is None:  # a pole that is narrow by error would need the finest bins
+            bandwidth = max(bandwidth, float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
+        return make_blocks(data, bandwidth, [target.frequency for target in some])
+
     pairs = zip(data.spectra.spectra, data.masks, strict=True)
     n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
-
-    def solve(some: tuple[Target, ...]) -> _Optimum:
-        # A pole that is narrow by error would need the finest bins.
-        widths = [2 * t.frequency * t.damping_ratio for t in some]
-        bandwidth = max(min(widths), float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
-        blocks = make_blocks(data, bandwidth, [target.frequency for target in some])
-        return _solve(data, blocks, some)
-
-    optimum = solve(targets)
-    while True:
-        fixed = removal_losses(optimum)
-        gains = {t.name: loss for t, loss in zip(optimum.targets, fixed, strict=True)}
-        if len(fixed) == 1:
-            return optimum, gains
-        lost = _escaped(optimum)
-        doubtful = lost or [i for i, loss in enumerate(fixed) if loss < _DOUBTFUL]
+    blocks = blocks_for(targets)
+    optimum = _solve(data, blocks, targets)
+    while targets := optimum.targets:
+        lost: list[int] = []
+        if gains is not None:
+            doubtful = [i for i, t in enumerate(targets) if gains[t.name] < constants.PRESENT]
+        elif len(targets) == 1:
+            break
+        else:
+            lost = _escaped(optimum)
+            doubtful = lost or [i for i, x in enumerate(_losses(optimum)) if x < _DOUBTFUL]
         worst, least = None, constants.EVIDENCE_MARGIN
         for i in doubtful:
-            less = solve(optimum.targets[:i] + optimum.targets[i + 1 :])
+            others = targets[:i] + targets[i + 1 :]
+            less = _solve(data, blocks_for(others) if gains is None else blocks, others)
+            # Twice the log evidence (BIC) for the mode.
             extra = optimum.p.size - less.p.size
             evidence = 2 * (less.misfit - optimum.misfit) - extra * np.log(n_ordinates)
             if lost or evidence < least:
                 worst, least = less, evidence
         if worst is None:
-            return optimum, gains
+            break
         optimum = worst
-
-
-_DOUBTFUL = 200.0
+    return _refined(data, optimum) if targets else optimum
 
 
 def _escaped(optimum: _Optimum) -> list[int]:
@@ -355,7 +356,7 @@ def _escaped(optimum: _Optimum) -> list[int]:
     return [int(left.argmax())] if left.max() > 3 else []
 
 
-def removal_losses(optimum: _Optimum) -> list[float]:
+def _losses(optimum: _Optimum) -> list[float]:
     """Loss of log likelihood without each mode, all others fixed."""
     lay = optimum.likelihood.layout
     losses = []
@@ -428,18 +429,6 @@ def prepare(
     return ClusterData(chosen, unit, whitened, tuple(s.free for s in scaled), tuple(index))
 
 
-def _not_excited(targets: Sequence[Target], gains: dict[str, float]) -> dict[str, Rejection]:
-    return {
-        target.name: Rejection(
-            "not-excited",
-            f"no resonance near {target.frequency:.4g} Hz in any channel: it would improve the log "
-            f"likelihood by {max(gains[target.name], 0):.1f}; excite it more or record longer",
-            target.frequency,
-        )
-        for target in targets
-    }
-
-
 def mask_prominent_lines(data: ClusterData) -> ClusterData:
     """Mask lines far above the binned level, before a mode can settle on one.
 
@@ -510,35 +499,6 @@ def make_blocks(
     )
 
 
-def _fit_and_prune(
-    data: ClusterData, present: tuple[Target, ...], gains: dict[str, float]
-) -> tuple[_Optimum, list[Target]]:
-    """Fit all modes, and drop, one by one, those without evidence; return these, too."""
-
-    def evidence(full: _Optimum, less: _Optimum) -> float:
-        """Twice the log evidence (BIC) for the modes that one has and the other has not."""
-        extra = full.p.size - less.p.size
-        return float(2 * (less.misfit - full.misfit) - extra * np.log(n_ordinates))
-
-    pairs = zip(data.spectra.spectra, data.masks, strict=True)
-    n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
-    bandwidth = min(2 * t.frequency * t.damping_ratio for t in present)
-    blocks = make_blocks(data, bandwidth, [target.frequency for target in present])
-    optimum = _solve(data, blocks, present)
-    pruned: list[Target] = []
-    while present:
-        doubtful = [i for i, t in enumerate(present) if gains[t.name] < constants.PRESENT]
-        less = {i: _solve(data, blocks, present[:i] + present[i + 1 :]) for i in doubtful}
-        margin = {i: evidence(optimum, one) - constants.EVIDENCE_MARGIN for i, one in less.items()}
-        worst = min(margin, key=lambda i: margin[i], default=None)
-        if worst is None or margin[worst] >= 0:
-            return _refined(data, optimum), pruned
-        pruned.append(present[worst])
-        optimum = less[worst]
-        present = optimum.targets
-    return optimum, pruned
-
-
 def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
     """Repeat the fit with finer bins where resonances are narrower or elsewhere than expected."""
     m = len(optimum.targets)
@@ -566,18 +526,16 @@ def _solve(
     strength, _ = fit_strengths(data.binned, targets)
     amplitude = np.sqrt(np.maximum(strength[:, : len(targets)], least))
     reference = amplitude.argmax(axis=0).tolist()
-    near = [target.band(_SIGN_BAND) for target in targets]
     sign = np.ones_like(amplitude)
     for i, target in enumerate(targets):
-        if target.amplitude is not None:
-            own = target.amplitude[list(data.index)] / data.unit
-            own = own * np.exp(-1j * np.angle(own[np.abs(own).argmax()]))
-            amplitude[:, i] = np.maximum(np.abs(own), np.sqrt(least[:, i]))
-            sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
-            reference[i] = int(amplitude[:, i].argmax())
-        else:
-            for c in range(n_channels):
-                sign[c, i] = relative_sign(blocks, near[i], c, reference[i])
+        if target.amplitude is None:
+            sign[:, i] = relative_signs(blocks, target.band(_SIGN_BAND), reference[i])
+            continue
+        own = target.amplitude[list(data.index)] / data.unit
+        own = own * np.exp(-1j * np.angle(own[np.abs(own).argmax()]))
+        amplitude[:, i] = np.maximum(np.abs(own), np.sqrt(least[:, i]))
+        sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
+        reference[i] = int(amplitude[:, i].argmax())
     scale = amplitude.max(axis=0)
     has_static = all(target.amplitude is not None for target in targets)
     layout = lay_out(reference, n_channels, has_static=has_static)
@@ -604,16 +562,16 @@ def _solve(
     return _Optimum(targets, likelihood, p, likelihood.data_value(p))
 
 
-def relative_sign(
-    blocks: tuple[MeanOrdinates, ...], band: tuple[float, float], channel: int, reference: int
-) -> float:
-    """Return the sign of the cross spectrum of two channels in a band in Hz."""
+def relative_signs(
+    blocks: tuple[MeanOrdinates, ...], band: tuple[float, float], reference: int
+) -> FloatArray:
+    """Return the signs of the cross spectra with a channel in a band in Hz, ``(n_channels,)``."""
     low, high = band
-    total = 0.0
+    total = np.zeros(blocks[0].matrix.shape[1])
     for block in blocks:
         near = (block.frequency >= low) & (block.frequency <= high)
-        total += float(block.count[near] @ block.matrix[near, channel, reference].real)
-    return 1.0 if total >= 0 else -1.0
+        total += block.count[near] @ block.matrix[near, :, reference].real
+    return np.where(total >= 0, 1.0, -1.0)
 
 
 def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
@@ -631,9 +589,7 @@ def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
     return full
 
 
-def _conclude(
-    data: ClusterData, optimum: _Optimum, expected: list[ComplexArray], gains: dict[str, float]
-) -> ClusterFit:
+def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]) -> ClusterFit:
     """Marginalise the posterior, and publish the modes whose estimates are credible."""
     targets, likelihood, p = optimum.targets, optimum.likelihood, optimum.p
     names = tuple(target.name for target in targets)
@@ -674,11 +630,10 @@ def _conclude(
     ordinates = masked_ordinates(data)
     for k in np.searchsorted(residual.frequency, f[narrow]).tolist():
         ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
-    clarity = np.array([gains[name] for name in names])
     lines = tuple(read_line(data, first, last) for first, last in ordinates)
     longest = data.longest
     fitted = FittedSpectrum(channels, data.unit, data.spectra.spectra[longest], expected[longest])
-    found = ClusterModes(modes, data.unit, clarity, lines, residual, fitted)
+    found = ClusterModes(modes, lines, residual, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
 
 

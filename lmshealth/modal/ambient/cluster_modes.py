@@ -29,7 +29,7 @@ class FittedSpectrum:
     """Cross spectrum of the longest observation that a cluster was fitted to."""
 
     channels: tuple[str, ...]
-    unit: FloatArray  # of the channels in (m/s²)/Hz^½, (n_channels,)
+    unit: FloatArray  # root of the noise of the channels in (m/s²)/Hz^½, (n_channels,)
     spectrum: CrossSpectrum  # in these units
     expected: ComplexArray  # of its matrix, by the fit; infinite at lines
 
@@ -39,8 +39,6 @@ class ClusterModes:
     """Estimates of the modes of a cluster."""
 
     modes: Modes  # with shapes over the channels that show any of them
-    unit: FloatArray  # root of the noise of these channels in (m/s²)/Hz^½
-    clarity: FloatArray  # gain in log likelihood of the binned spectra by each mode, (n_modes,)
     lines: tuple[LineEstimate, ...]  # excluded from the fit
     # ordinates of the longest observation over their expectation, mean over channels
     residual: Spectrum
@@ -55,7 +53,7 @@ class ClusterModes:
         """Keep the named modes; the others are marginalised."""
         kept = set(names)
         index = [i for i, name in enumerate(self.names) if name in kept]
-        return replace(self, modes=self.modes.select(index), clarity=self.clarity[index])
+        return replace(self, modes=self.modes.select(index))
 
     def rename(self, names: dict[str, str]) -> ClusterModes:
         """Keep the modes that get a new name."""
@@ -118,7 +116,7 @@ def merge_close_modes(modes: ClusterModes) -> ClusterModes:
 def _closest(found: ClusterModes) -> tuple[int, int] | None:
     """Return a pair of modes that are too close; None where there is none."""
     f, zeta = found.modes.frequency, found.modes.damping_ratio
-    shapes = found.modes.shapes / found.unit
+    shapes = found.modes.shapes / found.fitted.unit
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
     for i, j in combinations(range(f.size), 2):
         apart = abs(f[i] - f[j]) / (zeta[i] * f[i] + zeta[j] * f[j])
@@ -142,19 +140,3 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     flags = [f"{flag} cluster".strip() if k == i else flag for k, flag in enumerate(modes.flags)]
     common = replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, flags=tuple(flags))
     return replace(found, modes=common)
-
-
-def drop_duplicates(found: list[ClusterModes]) -> list[ClusterModes]:
-    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
-    rows = [
-        (float(clarity), float(ln_f), float(zeta), name)
-        for one in found
-        for clarity, ln_f, zeta, name in zip(
-            one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
-        )
-    ]
-    kept: list[tuple[float, float, float, str]] = []
-    for row in sorted(rows, reverse=True):
-        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
-            kept.append(row)
-    return [one.keep(row[3] for row in kept) for one in found]

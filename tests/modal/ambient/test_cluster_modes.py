@@ -32,7 +32,7 @@ def brought_to(apart: float, fit: ClusterModes, shapes: list[list[float]]) -> Cl
         fit.modes,
         ln_frequency=estimate[:2],
         ln_damping=estimate[2:],
-        shapes=np.array(shapes) * fit.unit,
+        shapes=np.array(shapes) * fit.fitted.unit,
     )
     return replace(fit, modes=moved)
 
