@@ -412,36 +412,31 @@ def prepare(
     level = binned.level[index]
     noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
     unit = np.sqrt(noise)
-    rows, columns = np.ix_(index, index)
     whiten = np.outer(unit, unit)
+    cut = tuple(s for spectrum in spectra.spectra if (s := spectrum.band(*band)).frequency.size)
+    chosen = replace(spectra, spectra=cut).select(index)
     scaled = tuple(
         replace(
-            s,
-            matrix=s.matrix[:, rows, columns] / whiten,
-            foreign=None if s.foreign is None else s.foreign[:, rows, columns] / whiten,
+            s, matrix=s.matrix / whiten, foreign=None if s.foreign is None else s.foreign / whiten
         )
-        for s in (spectrum.band(*band) for spectrum in spectra.spectra)
-        if s.frequency.size
+        for s in chosen.spectra
     )
-    channels = tuple(spectra.channels[c] for c in index)
-    chosen = LogSpectra(channels, tuple(spectra.sources[c] for c in index), scaled)
+    masks = tuple(s.free for s in scaled)
     whitened = replace(binned, level=level / noise[:, None])
-    return ClusterData(chosen, unit, whitened, tuple(s.free for s in scaled), tuple(index))
+    return ClusterData(replace(chosen, spectra=scaled), unit, whitened, masks, tuple(index))
 
 
 def mask_prominent_lines(data: ClusterData) -> ClusterData:
     """Mask lines far above the binned level, before a mode can settle on one.
 
-    A mode that takes a line for its resonance leaves its own to its neighbour, which then gets the
-    wrong name. Twice the threshold leaves room for what the bins do not resolve. A single mode
-    whose damping is below about 1/15 of the described one is as narrow as a line, and may lose its
-    own peak.
+    Twice the threshold leaves room for what the bins do not resolve. A single mode whose damping is
+    below about 1/15 of the described one is as narrow as a line, and may lose its own peak.
     """
-    levels = [
-        np.stack([np.interp(s.frequency, data.binned.frequency, x) for x in data.binned.level], -1)
-        for s in data.spectra.spectra
-    ]
-    return _mask_above(data, [2 * level for level in levels])
+    f, levels = data.binned.frequency, 2 * data.binned.level
+    spectra = data.spectra.spectra
+    return _mask_above(
+        data, [np.stack([np.interp(s.frequency, f, x) for x in levels], -1) for s in spectra]
+    )
 
 
 def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> ClusterData:

@@ -237,20 +237,17 @@ def _excesses(model: JointModel) -> list[tuple[float, float, float, FloatArray]]
 
 def split_groups(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
     """Group neighbours whose bands overlap; groups of too many are split at the widest gap."""
-    groups: list[tuple[Target, ...]] = []
-    for target in targets:
-        if groups and target.band(BAND_HALF_WIDTH)[0] < groups[-1][-1].band(BAND_HALF_WIDTH)[1]:
-            groups[-1] = (*groups[-1], target)
-        else:
-            groups.append((target,))
-    done = []
-    while groups:
-        group = groups.pop(0)
-        if len(group) <= constants.MOST_FOUND:
-            done.append(group)
-        else:
-            groups[:0] = halves(group)
-    return done
+    bands = [target.band(BAND_HALF_WIDTH) for target in targets]
+    apart = [upper[0] >= lower[1] for lower, upper in pairwise(bands)]
+    edges = [0, *(1 + np.flatnonzero(apart)).tolist(), len(targets)]
+    return [small for a, b in pairwise(edges) for small in _small(targets[a:b])]
+
+
+def _small(group: tuple[Target, ...]) -> list[tuple[Target, ...]]:
+    """Split a group of too many."""
+    if len(group) <= constants.MOST_FOUND:
+        return [group] if group else []
+    return [small for half in halves(group) for small in _small(half)]
 
 
 def halves(group: tuple[Target, ...]) -> list[tuple[Target, ...]]:
@@ -363,32 +360,25 @@ def _bin(spectra: LogSpectra, candidates: list[Candidate], low: float, high: flo
     edges = np.interp(np.arange(0, place[-1] + 1), place, fine)
     edges[-1] = high
     n, n_bins = len(spectra.channels), edges.size - 1
-    total = np.zeros((n_bins, n, n), dtype=complex)
-    foreign = np.zeros_like(total)
-    count, mean = np.zeros(n_bins), np.zeros(n_bins)
+    matrix, foreign = np.zeros((2, n_bins, n, n), dtype=complex)
+    count, frequency = np.zeros((2, n_bins))
     for s in spectra.spectra:
         number = np.searchsorted(edges, s.frequency) - 1
         within = s.free & (number >= 0) & (number < n_bins)
         at = number[within]
-        np.add.at(total, at, s.count * s.matrix[within])
+        np.add.at(count, at, s.count)
+        np.add.at(frequency, at, s.count * s.frequency[within])
+        np.add.at(matrix, at, s.count * s.matrix[within])
         if s.foreign is not None:
             np.add.at(foreign, at, s.count * s.foreign[within])
-        count += np.bincount(at, minlength=n_bins) * s.count
-        mean += np.bincount(at, weights=s.frequency[within], minlength=n_bins) * s.count
     kept = count > 0
-    weight = count[kept][:, None, None]
-    matrix = np.asarray(total[kept] / weight)
+    count, frequency = count[kept], frequency[kept] / count[kept]
+    matrix, foreign = matrix[kept] / count[:, None, None], foreign[kept] / count[:, None, None]
     scale = np.sqrt(np.median(np.diagonal(matrix, axis1=1, axis2=2).real, axis=0).clip(1e-300))
     whole = np.outer(scale, scale)
-    frequency = mean[kept] / count[kept]
     u = np.log(frequency / frequency[0]) / np.log(frequency[-1] / frequency[0])
     degree = 2 + round(2 * np.log(high / low))
     basis = [comb(degree, k) * u**k * (1 - u) ** (degree - k) for k in range(degree + 1)]
-    return BandData(
-        frequency,
-        count[kept],
-        np.asarray(matrix / whole, dtype=np.complex128),
-        np.asarray(foreign[kept] / weight / whole, dtype=np.complex128) if foreign.any() else None,
-        scale,
-        np.stack(basis) + 1e-3,
-    )
+    matrix, foreign = (np.asarray(x / whole, dtype=np.complex128) for x in (matrix, foreign))
+    there = foreign if foreign.any() else None
+    return BandData(frequency, count, matrix, there, scale, np.stack(basis) + 1e-3)

@@ -61,15 +61,13 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[
     top = min(high + margin, min(float(s.frequency[-1]) for s in spectra.spectra))
     poles = _solve(_correlate(spectra, bottom, top), bottom, top - bottom)
     longest = max(spectra.spectra, key=lambda s: s.observed).band(bottom, top)
-    level = _level(longest.matrix)
-
-    def physical(one: Candidate) -> ComplexArray:
-        place = min(int(np.searchsorted(longest.frequency, one.frequency)), len(level) - 1)
-        return np.asarray(one.shape * level[place])
-
     candidates, poles = _cluster(poles)
     stable = [one for one in _merge(candidates) if low <= one.frequency <= high]
-    return [replace(one, shape=physical(one)) for one in stable], poles
+    place = np.searchsorted(longest.frequency[:-1], [one.frequency for one in stable])
+    levels = _level(longest.matrix)[place]
+    # From whitened to physical channels.
+    rows = zip(stable, levels, strict=True)
+    return [replace(one, shape=one.shape * level) for one, level in rows], poles
 
 
 def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
@@ -142,21 +140,20 @@ def _solve(lags: ComplexArray, low: float, rate: float) -> Poles:
     u, s, vh = u[:, :most], s[:most], vh[:most]
     transition = (u.conj().T @ hankel[:, n:] @ vh.conj().T) / np.sqrt(s[:, None] * s)
     output = u[:n] * np.sqrt(s)
-    orders, poles, shapes = [], [], []
-    for order in range(_ORDERS.start, most + 1):
+    orders = np.arange(_ORDERS.start, most + 1)
+    values, shapes = [], []
+    for order in orders:
         value, vector = np.linalg.eig(transition[:order, :order])
-        exponent = np.log(value) * rate
-        turned = exponent.imag % (2 * np.pi * rate)
-        orders.append(np.full(order, float(order)))
-        poles.append(exponent.real + 1j * (2 * np.pi * low + turned))
+        values.append(value)
         shapes.append((output[:, :order] @ vector).T)
-    pole, shape = np.concatenate(poles), np.concatenate(shapes)
+    exponent, shape = np.log(np.concatenate(values)) * rate, np.concatenate(shapes)
+    pole = exponent.real + 1j * (2 * np.pi * low + exponent.imag % (2 * np.pi * rate))
     zeta = -pole.real / np.abs(pole)
     kept = (zeta > _LEAST_DAMPING) & (zeta < constants.MOST_DAMPING)
     shape = shape / np.linalg.norm(shape, axis=1, keepdims=True)
-    frequency = np.abs(pole) / (2 * np.pi)
-    order, stable = np.concatenate(orders)[kept], np.zeros(int(kept.sum()), dtype=bool)
-    return Poles(order, frequency[kept], zeta[kept], shape[kept], stable)
+    order = np.repeat(orders, orders).astype(float)[kept]
+    frequency = np.abs(pole[kept]) / (2 * np.pi)
+    return Poles(order, frequency, zeta[kept], shape[kept], np.zeros(order.size, dtype=bool))
 
 
 def _cluster(poles: Poles) -> tuple[list[Candidate], Poles]:
@@ -174,12 +171,11 @@ def _cluster(poles: Poles) -> tuple[list[Candidate], Poles]:
     for number in np.unique(label):
         members = np.flatnonzero(label == number)
         stability = np.unique(poles.order[members]).size / n_orders
-        if stability < constants.STABLE:
-            continue
-        stable[members] = True
-        centre = members[distance[np.ix_(members, members)].sum(axis=1).argmin()]
-        pole = float(np.median(f[members])), float(np.median(zeta[members]))
-        found.append(Candidate(*pole, shape[centre], stability))
+        if stability >= constants.STABLE:
+            stable[members] = True
+            centre = members[distance[np.ix_(members, members)].sum(axis=1).argmin()]
+            pole = float(np.median(f[members])), float(np.median(zeta[members]))
+            found.append(Candidate(*pole, shape[centre], stability))
     return found, replace(poles, stable=stable)
 
 
@@ -189,12 +185,12 @@ def _merge(candidates: list[Candidate]) -> list[Candidate]:
     merged = []
     while rest:
         first = rest[0]
-        group = [c for c in rest if c is first or _is_split(c, first)]
-        rest = [c for c in rest if not any(c is member for member in group)]
-        weight = np.array([c.stability for c in group]) ** 4
-        weight /= weight.sum()
-        f = np.array([c.frequency for c in group])
-        zeta = np.array([c.damping_ratio for c in group])
+        group = [c for c in rest if _is_split(c, first)]
+        rest = [c for c in rest if c not in group]
+        f, zeta, stability = np.array(
+            [(c.frequency, c.damping_ratio, c.stability) for c in group]
+        ).T
+        weight = stability**4 / np.sum(stability**4)
         mean = float(weight @ f)
         damping = float(np.sqrt(weight @ (zeta**2 + (f / mean - 1) ** 2)))
         merged.append(replace(first, frequency=mean, damping_ratio=damping))
@@ -202,6 +198,7 @@ def _merge(candidates: list[Candidate]) -> list[Candidate]:
 
 
 def _is_split(one: Candidate, other: Candidate) -> bool:
+    """Return whether noise may have split one pole into two."""
     width = one.frequency * one.damping_ratio + other.frequency * other.damping_ratio
     alike = abs(one.shape.conj() @ other.shape) ** 2 > _SPLIT_ALIKE
     return bool(alike and abs(one.frequency - other.frequency) < _SPLIT * width)
