@@ -116,15 +116,11 @@ def response(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> ComplexA
     return np.asarray(1 / (1 - beta**2 - 2j * zeta * beta))
 
 
-def floor_response(p: FloatArray, u: FloatArray) -> FloatArray:
-    """Return the response exp((e + d u + b u²) / 2) of floors, shape ``(n_floors, n)``."""
-    return np.asarray(np.exp(p @ np.stack([np.ones_like(u), u, u * u]) / 2))
-
-
 def floors(p: FloatArray, u: FloatArray) -> ComplexArray:
-    """Return `floor_response` with its derivatives, in the layout of `receptance`.
+    """Return the response exp((e + d u + b u²) / 2) of floors with its derivatives.
 
-    ``p`` holds e, d and b of each floor, ``(n_floors, 3)``; u runs from -1 to 1 over the band.
+    ``p`` holds e, d and b of each floor, ``(n_floors, 3)``; u runs from -1 to 1 over the band. The
+    layout is that of `receptance`.
     """
     basis = np.stack([np.ones_like(u), u, u * u]) / 2
     h = np.exp(p @ basis)
@@ -286,34 +282,16 @@ class _Point:
         for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
             self._root[i, j] = self._scale[i] * value
         self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
-        self._poles = p[:m, None], p[m : 2 * m, None]
-        first = lay.n_poles - 3 * lay.n_channels
-        self._tilts = p[first : lay.n_poles].reshape(-1, 3)
-        self._static = p[2 * m : 3 * m, None] if lay.has_static else None
-        self._u = np.log(block.grid / likelihood.centre) / likelihood.spread
-
-    @cached_property
-    def _response(self) -> ComplexArray:
-        """Responses h of all components, shape ``(components, grid)``."""
-        ln_f, ln_zeta = self._poles
-        modes = response(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
-        if self._static is not None:
-            modes = modes + self._static
-        return np.concatenate([modes, floor_response(self._tilts, self._u)])
-
-    @cached_property
-    def _h(self) -> ComplexArray:
-        """The same with its derivatives, shape ``(10, components, grid)``."""
-        ln_f, ln_zeta = self._poles
-        modes = receptance(np.exp(ln_f), np.exp(ln_zeta), self._block.grid)
-        if self._static is not None:
-            modes[0] += self._static
+        self._s = np.asarray(self._root @ self._root.T)
+        f, zeta = np.exp(p[: 2 * m].reshape(2, m, 1))
+        modes = receptance(f, zeta, block.grid)
+        if lay.has_static:
+            modes[0] += p[2 * m : 3 * m, None]
             modes[3] = 1.0
-        return np.concatenate([modes, floors(self._tilts, self._u)], axis=1)
-
-    @cached_property
-    def _s(self) -> FloatArray:
-        return np.asarray(self._root @ self._root.T)
+        tilts = p[lay.n_poles - 3 * lay.n_channels : lay.n_poles].reshape(-1, 3)
+        u = np.log(block.grid / likelihood.centre) / likelihood.spread
+        # Responses h of all components and their derivatives, (10, components, grid).
+        self._h = np.concatenate([modes, floors(tilts, u)], axis=1)
 
     @property
     def strength(self) -> FloatArray:
@@ -326,12 +304,12 @@ class _Point:
         """PSD of the part of each floor incoherent with modes, shape ``(channels, grid)``."""
         m = self._layout.n_modes
         own = np.sum(self._root[m:, m:] ** 2, axis=1)
-        return np.asarray(np.abs(self._response[m:]) ** 2 * own[:, None])
+        return np.asarray(np.abs(self._h[0, m:]) ** 2 * own[:, None])
 
     @cached_property
     def _modal(self) -> ComplexArray:
         """D, shape ``(components, components, n)``."""
-        h = self._response
+        h = self._h[0]
         return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
 
     @cached_property
@@ -348,11 +326,7 @@ class _Point:
         return float(self._block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
 
     def derivatives(self) -> tuple[FloatArray, FloatArray]:
-        """Gradient and Hessian of the misfit.
-
-        With E = C Cᴴ, T_a = C⁻¹ E_a C⁻ᴴ and V = C⁻¹ W C⁻ᴴ the gradient is Σ n tr (1 - V) T_a and
-        the Hessian Σ n (tr T_a T_b (2V - 1) + tr G E_ab), G = C⁻ᴴ (1 - V) C⁻¹.
-        """
+        """Gradient and Hessian of the misfit (README.md)."""
         count, eye = self._block.count, np.eye(self._layout.n_channels)
         whiten = np.linalg.inv(np.linalg.cholesky(self.expected))
         adjoint = whiten.conj().swapaxes(1, 2)
@@ -486,11 +460,9 @@ def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
 def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, FloatArray, float]:
     """Return mean and covariance of ``[ln f, ln ζ]`` by Laplace's approximation.
 
-    One log hardly constrains how coherent a floor is with modes and other floors, or how it bends;
-    neglected, these shift the estimates by up to two standard deviations, and without a prior they
-    cost a third of the information. They get a normal prior of unknown width, and the posterior is
-    averaged over the widths, weighted by their evidence. ``p`` is near the posterior mode; returned
-    last is the Newton decrement g H⁻¹ g there, infinite where there is no maximum.
+    The posterior is averaged over the widths of the priors of coherence and bends of floors,
+    weighted by their evidence (README.md). ``p`` is near the posterior mode; returned last is the
+    Newton decrement g H⁻¹ g there, infinite where there is no maximum.
     """
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
     gradient, hessian = likelihood.derivatives(p)
