@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -164,29 +165,27 @@ def _infer_machines(
         names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
         seed = seed_of(given["seed"], *names)
         epochs = epochs_to_infer(*together[0], given["epochs"])
-        mapper = _counting_map("together", progress)
+        mapper = partial(_counting_map, "together", progress)
         return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
     found, lost = [], []
     for drifts in machines:
         seed = seed_of(given["seed"], drifts.stage, stage.digest)
         try:
             epochs = epochs_to_infer(drifts, stage, given["epochs"])
-            mapper = _counting_map(drifts.stage, progress)
+            mapper = partial(_counting_map, drifts.stage, progress)
             found.append(infer(drifts, stage, seed, epochs=epochs, mapper=mapper))
         except NotEnoughData as why:
             lost.append(str(why))
     return found, lost
 
 
-def _counting_map(name: str, progress: Progress) -> Callable[..., Iterator[Any]]:
-    """Return a ``map`` that reports its progress."""
-
-    def mapper(function: Callable[..., Any], *columns: Sequence[Any]) -> Iterator[Any]:
-        for k, result in enumerate(map(function, *columns)):
-            progress(name, k + 1, len(columns[0]))
-            yield result
-
-    return mapper
+def _counting_map(
+    name: str, progress: Progress, function: Callable[..., Any], *columns: Sequence[Any]
+) -> Iterator[Any]:
+    """Map a function as ``map`` does, and report the progress."""
+    for k, result in enumerate(map(function, *columns)):
+        progress(name, k + 1, len(columns[0]))
+        yield result
 
 
 def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
@@ -200,10 +199,8 @@ def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
 
 def _single(table: Path, machines: list[Drifts]) -> Drifts:
     if len(machines) > 1:
-        raise BadTable(
-            f"{table}: {len(machines)} machines ({', '.join(m.stage for m in machines)}); needed "
-            "is a table of the one that shares a part"
-        )
+        found = f"{len(machines)} machines ({', '.join(m.stage for m in machines)})"
+        raise BadTable(f"{table}: {found}; needed is a table of the one that shares a part")
     return machines[0]
 
 

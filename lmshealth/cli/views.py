@@ -79,6 +79,10 @@ _ABOVE_FLOOR = (
     "number {n_above_floor} | bandwidth Hz {bandwidth_above_floor_hz:.4n} | "
     "share {share_explained_above_floor:.1%}"
 )
+_LINES = (
+    "channel {channel} | kind {kind} | Hz {frequency_hz:.2f} | largest mm/s² {largest:.3n} | "
+    "in logs {n_logs}"
+)
 _STAGE_MODES = (
     "mode {mode} | tracked {answer} | Hz {frequency_hz:.1f} | "
     "search band {searched_low_hz:.0f}-{searched_high_hz:.0f} | map Hz {map_hz:.1f} | "
@@ -270,8 +274,16 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
             "– fewer than two velocities or three logs: no slope;\n"
             "~ the strongest harmonic is a spectral line, not a mode. RMS: of a band, in Hz."
         )
-    if lines:
-        _print_lines(lines)
+    groups: dict[tuple[str, str, float], list[Row]] = {}
+    for row in lines:  # each spectral line once for all logs
+        groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
+    shown = []
+    for _, of_line in sorted(groups.items()):
+        largest = 1e3 * max(row["amplitude"] for row in of_line)
+        n_logs = len({row["log"] for row in of_line})
+        shown.append(of_line[0] | {"largest": largest, "n_logs": n_logs})
+    if shown:
+        print_table("Lines", cells(_LINES, shown), 2)
     print_refused(refused)
 
 
@@ -329,24 +341,6 @@ def _range(values: Sequence[float]) -> str:
 def _mean(values: Sequence[float]) -> str:
     mean = sum(values) / len(values) if values else 0.0
     return number(mean, 3 if mean >= 0.1 else 2) if values else ""
-
-
-def _print_lines(lines: Sequence[Row]) -> None:
-    """Print each spectral line once for all logs."""
-    groups: dict[tuple[str, str, float], list[Row]] = {}
-    for row in lines:
-        groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
-    shown = [
-        {
-            "channel": channel,
-            "kind": kind,
-            "Hz": f"{rows[0]['frequency_hz']:.2f}",
-            "largest mm/s²": number(1e3 * max(row["amplitude"] for row in rows)),
-            "in logs": str(len({row["log"] for row in rows})),
-        }
-        for (channel, kind, _), rows in sorted(groups.items())
-    ]
-    print_table("Lines", shown, 2)
 
 
 # --- Stage descriptions and plans ---
