@@ -15,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, MINUTE, Spool, spools
+from lmshealth.io.buffers import BLOCK, MINUTE, spools
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.metadata import KEYS, as_text
@@ -99,7 +99,13 @@ def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
     stream.now = "samples"
     with spools(chosen) as taken:
         for name, dataset in chosen.items():
-            _read(dataset, taken[name])
+            # Beyond a minute in parts of whole chunks: each is unpacked only once.
+            step = max(1, dataset.size)
+            if dataset.size > MINUTE:
+                chunk = dataset.chunks[0] if dataset.chunks else 1
+                step = -(-BLOCK // chunk) * chunk
+            for start in range(0, dataset.size, step):
+                taken[name].append(dataset[start : start + step])
     read = {name: spool.samples() for name, spool in taken.items()}
     return Content(read, metadata, tuple(names))
 
@@ -125,14 +131,6 @@ def _dataset(file: Any, name: str) -> Any:
     if found < needed:
         raise Unusable("corrupt", f"column {name!r}: {found} of {needed} blocks were ever written")
     return item
-
-
-def _read(dataset: Any, spool: Spool) -> None:
-    """Read a column, beyond a minute in parts of whole chunks: each is unpacked only once."""
-    chunk = 1 if dataset.chunks is None else dataset.chunks[0]
-    step = max(1, dataset.size) if dataset.size <= MINUTE else -(-BLOCK // chunk) * chunk
-    for start in range(0, dataset.size, step):
-        spool.append(dataset[start : start + step])
 
 
 def _attribute(file: Any, key: str) -> str:

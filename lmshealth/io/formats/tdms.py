@@ -27,7 +27,7 @@ from lmshealth.io.formats.content import (
     library,
     not_numeric,
 )
-from lmshealth.io.formats.unit_channels import Chosen, Described, choose, present, rate_of
+from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
 from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
@@ -55,13 +55,15 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream, TdmsFile.open(stream) as file:
         channels = [channel for group in file.groups() for channel in group.channels()]
         _check_sizes(channels, sum(segments))
-        _check_scales([file.properties, *(group.properties for group in file.groups())])
-        _check_scales([channel.properties for channel in channels])
+        _check_scales(one.properties for one in (file, *file.groups(), *channels))
         described = _described(channels)
         chosen = choose(described, columns)
         wanted = {name: channels[k] for name, k in chosen.columns.items()}
         read = _read(file, wanted, path.stat().st_size)
-        metadata = _metadata(file.properties, wanted.values(), chosen)
+        starts = [channel.properties.get("wf_start_time") for channel in wanted.values()]
+        own = {key: as_text(file.properties[key]) for key in KEYS if key in file.properties}
+    start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
+    metadata = ({} if start is None else {"recorded_at": as_text(start)}) | chosen.metadata | own
     return Content(read, metadata, present(described), chosen.refused)
 
 
@@ -144,14 +146,6 @@ def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
                 found = f"{taken[name].size} of {len(channel)} samples are there"
                 raise Unusable("corrupt", f"{name}: {found}")
         return {name: spool.samples() for name, spool in taken.items()}
-
-
-def _metadata(properties: dict[str, Any], wanted: Iterable[Any], chosen: Chosen) -> dict[str, str]:
-    """Read properties of the file under the keys of the contract, and the start of its channels."""
-    starts = [channel.properties.get("wf_start_time") for channel in wanted]
-    start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
-    own = {key: as_text(properties[key]) for key in KEYS if key in properties}
-    return ({} if start is None else {"recorded_at": as_text(start)}) | chosen.metadata | own
 
 
 TDMS = Format("TDMS", (".tdms",), lambda head: head.startswith(_MAGIC), _load)
