@@ -14,7 +14,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
 from lmshealth.modal import constants
 
 # A transient is smooth over a band: powers of s.
@@ -30,7 +30,7 @@ _RELOCATIONS, _LEAST_ERROR = 12, 0.01
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Ordinates:
+class Ordinates(ReadOnly):
     """Spectra of an input and an output at the lines of a band, arrays ``(n_lines,)``."""
 
     frequency: FloatArray  # in Hz, ascending
@@ -40,9 +40,6 @@ class Ordinates:
     freedom: float  # complex degrees of freedom of each variance; 0 where it is unknown
     periodic: bool  # means over whole periods or blows: no transient, noise from their scatter
     at_rest: bool = False  # at both ends of the record: no transient
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
     @property
     def transient(self) -> bool:
@@ -61,13 +58,8 @@ class Ordinates:
 
     def only(self, keep: BoolArray) -> Ordinates:
         """Keep some of the lines."""
-        return replace(
-            self,
-            frequency=self.frequency[keep],
-            given=self.given[keep],
-            answer=self.answer[keep],
-            noise=self.noise[keep],
-        )
+        lines = ("frequency", "given", "answer", "noise")
+        return replace(self, **{name: getattr(self, name)[keep] for name in lines})
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,8 +89,7 @@ class Order:
     def with_mode(self, f: float, zeta: float) -> Order:
         """Add a mode at a frequency in Hz."""
         ln_f, ln_zeta = np.split(self.theta, 2)
-        theta = np.concatenate([ln_f, [np.log(f)], ln_zeta, [np.log(zeta)]])
-        return replace(self, theta=theta)
+        return replace(self, theta=np.concatenate([ln_f, [np.log(f)], ln_zeta, [np.log(zeta)]]))
 
     def without_mode(self, i: int) -> Order:
         """Remove a mode."""
@@ -157,14 +148,9 @@ def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
     parts = parts[:, order.modes[1] <= constants.FRF_MOST_DAMPING]
     rest = fitted - parts.sum(axis=1)
     swing = _residues(weights[n:], m) if ordinates.transient else np.zeros(m, dtype=complex)
-    return Solution(
-        basis=basis,
-        residues=_residues(weights, m),
-        swing=swing,
-        error=ordinates.answer - columns @ weights,
-        response=fitted,
-        parts=np.sum(np.abs(parts) ** 2, axis=1) + np.abs(rest) ** 2,
-    )
+    power = np.sum(np.abs(parts) ** 2, axis=1) + np.abs(rest) ** 2
+    error = ordinates.answer - columns @ weights
+    return Solution(basis, _residues(weights, m), swing, error, fitted, power)
 
 
 def _residues(weights: FloatArray, n_modes: int) -> ComplexArray:
@@ -184,9 +170,8 @@ def slopes(
     by_zeta = np.abs(pole) * (-zeta - 1j * zeta**2 / np.sqrt(1 - zeta**2))
     given = ordinates.given[:, None]
     upper = (given * solution.residues + solution.swing) / (s[:, None] - pole) ** 2
-    lower = (given * solution.residues.conj() + solution.swing.conj()) / (
-        s[:, None] - pole.conj()
-    ) ** 2
+    lower = given * solution.residues.conj() + solution.swing.conj()
+    lower = lower / (s[:, None] - pole.conj()) ** 2
     moved = np.hstack([upper * move + lower * move.conj() for move in (pole, by_zeta)])
     slope = -stack(moved * np.sqrt(2 / variance)[:, None])
     return np.asarray(slope - solution.basis @ (solution.basis.T @ slope))
@@ -194,8 +179,7 @@ def slopes(
 
 def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
     """Maximise the likelihood over the poles by a trust-region method."""
-    m = order.n_modes
-    if m == 0:
+    if (m := order.n_modes) == 0:
         return order
     whiten = np.sqrt(2 / variance)
 
@@ -252,8 +236,7 @@ def vector_fit(ordinates: Ordinates, order: Order, n_modes: int) -> Order:
         if pole.size == 0:
             break
     damping = np.maximum(-pole.real / np.abs(pole), LEAST_DAMPING)
-    theta = np.log(np.concatenate([np.abs(pole) * centre, damping]))
-    return replace(order, theta=theta)
+    return replace(order, theta=np.log(np.concatenate([np.abs(pole) * centre, damping])))
 
 
 def best_place(
@@ -285,5 +268,5 @@ def _explained(columns: FloatArray, error: FloatArray, basis: FloatArray) -> Flo
     b = np.sum(first * second, axis=0) - np.sum(known_first * known_second, axis=0)
     c = np.sum(second**2, axis=0) - np.sum(known_second**2, axis=0)
     u, v = error @ first, error @ second
-    gain = (c * u**2 - 2 * b * u * v + a * v**2) / np.maximum(a * c - b**2, 1e-9 * a * c)
-    return np.asarray(gain)
+    found = (c * u**2 - 2 * b * u * v + a * v**2) / np.maximum(a * c - b**2, 1e-9 * a * c)
+    return np.asarray(found)

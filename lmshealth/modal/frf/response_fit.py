@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
 from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import (
     Order,
@@ -20,6 +20,7 @@ from lmshealth.modal.frf.rational import (
     vector_fit,
 )
 from lmshealth.modal.frf.responses import smooth_noise
+from lmshealth.modal.modes import paired
 
 # Powers of s, downwards and upwards. Modes outside the band, too weak for a power to be
 # significant, bias those inside by up to one standard deviation with four powers, by half of one
@@ -35,14 +36,12 @@ _WORTH = 2.0
 # Lines of an end of the band.
 _END = 3
 _ROUNDS = 4
-# Amplitude of a fitted response over the answer from which on it cancels a transient.
-_CANCELS = 2.0
 # Standard deviation of the prior of ln f and ln ζ: directions without data stay this uncertain.
 _PRIOR_STD = 10.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class ResponseFit:
+class ResponseFit(ReadOnly):
     """A rational transfer function with its uncertainty, modes ascending in frequency.
 
     ``chi_square`` is the mean squared error over the variance of the noise, per degree of freedom:
@@ -64,9 +63,6 @@ class ResponseFit:
     distortion: float  # error beyond noise over the response: nonlinear, or a missing term
     colour: float  # correlation of errors of neighbouring lines, where it is significant
 
-    def __post_init__(self) -> None:
-        freeze(self)
-
     @property
     def missed(self) -> float:
         """Error beyond the noise of periods as a share of the answer, at most 1."""
@@ -75,37 +71,23 @@ class ResponseFit:
         share = float(beyond / np.sum(np.abs(o.answer) ** 2))
         return float(np.sqrt(np.clip(share, 0, 1)))
 
-    @property
-    def excess(self) -> float:
-        """Amplitude of the fitted response to the input over that of the answer."""
-        o = self.ordinates
-        return float(np.linalg.norm(o.given * self.response) / np.linalg.norm(o.answer))
-
 
 def fit_response(ordinates: Ordinates) -> ResponseFit:
     """Fit poles, residues and residual terms to the response of a band.
 
-    Modes enter one by one where they reduce the error most, powers of s at either end, while an
-    information criterion improves; a mode that others have made superfluous is removed. Where an
-    error beyond the noise is left, vector fits of every order are further starts: a resonance
-    narrower than the distance of the lines is not found one by one.
-
-    With periods the noise is their scatter. An error beyond it is modelled as a share of each part
-    of the response with random phase, as of a weak nonlinearity under a random multisine; the
-    share is estimated by maximum likelihood. Without periods the noise is the residual, averaged
-    over neighbouring lines.
-
-    The covariance is the inverse of the Fisher information, widened where errors of neighbouring
-    lines correlate; those of a distortion count as one within a half-power bandwidth
-    [Pintelon2012].
-
-    After a blow a transient cannot be separated from the response, and both may cancel; then the
-    record is fitted as one that begins and ends at rest.
+    Order, noise, distortion and covariance are those of the section Model in the README of the
+    folder [Pintelon2012].
     """
-    fit = _fit(ordinates)
-    if ordinates.transient and fit.excess > _CANCELS:
-        fit = _fit(replace(ordinates, at_rest=True))
-    return fit
+    start = Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
+    state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
+    for _ in range(_ROUNDS):
+        keep = _inliers(state)
+        if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
+            break
+        state = _grow(_without_lines(state, keep))
+    state = _shrink(state)
+    state = _settle(state.ordinates, state.order, state.variance, _ROUNDS)
+    return _conclude(state, ordinates)
 
 
 def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
@@ -126,19 +108,6 @@ def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
         cov=turn @ fit.cov @ turn.T,
         noise_cov=turn @ fit.noise_cov @ turn.T,
     )
-
-
-def _fit(ordinates: Ordinates) -> ResponseFit:
-    start = Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
-    state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
-    for _ in range(_ROUNDS):
-        keep = _inliers(state)
-        if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
-            break
-        state = _grow(_without_lines(state, keep))
-    state = _shrink(state)
-    state = _settle(state.ordinates, state.order, state.variance, _ROUNDS)
-    return _conclude(state, ordinates)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -179,8 +148,7 @@ class _State:
     @property
     def penalty(self) -> float:
         """Gain that modes and background need."""
-        order = self.order
-        each = 6 if self.ordinates.transient else 4
+        order, each = self.order, 6 if self.ordinates.transient else 4
         heavy = int(np.count_nonzero(order.modes[1] > constants.FRF_MOST_DAMPING))
         modes = each * np.log(2 * self.variance.size) + constants.FRF_EVIDENCE_MARGIN
         background = constants.FRF_BACKGROUND_COST * (each * heavy + order.high - order.low)
@@ -318,17 +286,14 @@ def _larger(state: _State) -> list[Order]:
 
 
 def _is_admissible(trial: _State, before: _State) -> bool:
-    """Return whether modes are not one distorted resonance, and not an end of the band.
-
-    Modes within a half-power bandwidth must reduce the distortion. A mode narrower than a line at
-    an end of the band represents one outside.
-    """
+    """Return whether modes are not one distorted resonance, and not an end of the band."""
     narrow = ~_wide_enough(trial)
+    # A mode narrower than a line at an end of the band represents one outside.
     if narrow[:_END].any() or narrow[-_END:].any():
         return False
     f, zeta = trial.order.modes
-    half = zeta * f
-    near = np.abs(f[:, None] - f) < np.maximum(half[:, None], half)
+    near = np.abs(f[:, None] - f) < np.maximum.outer(zeta * f, zeta * f)
+    # Modes within a half-power bandwidth must reduce the distortion.
     if near.sum() == f.size:
         return True
     return trial.distortion <= constants.LESS_DISTORTED * before.distortion
@@ -355,13 +320,13 @@ def _shrink(state: _State) -> _State:
             _settle(state.ordinates, state.order.without_mode(i), state.variance)
             for i in range(state.order.n_modes)
         ]
-        gains = [
+        losses = [
             (t.cost - state.cost) / state.dependent_lines - state.penalty + t.penalty
             for t in trials
         ]
-        if min(gains) > 0:
+        if min(losses) > 0:
             break
-        state = trials[int(np.argmin(gains))]
+        state = trials[int(np.argmin(losses))]
     return state
 
 
@@ -370,7 +335,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     ordinates, order, solution = state.ordinates, state.order, state.solution
     m, n = order.n_modes, state.variance.size
     rank = np.argsort(order.theta[:m], kind="stable")
-    both = np.concatenate([rank, rank + m])
+    both = paired(rank, m)
     noise_cov, cov = _covariances(state)
     f, zeta = order.modes
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
@@ -401,13 +366,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
 
 
 def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of ``[ln f, ln ζ]`` by noise, and by noise and distortion.
-
-    Weights from variances of ν degrees of freedom cost (ν - 1)/(ν - 2). Correlated errors of
-    neighbouring lines count as fewer. Distortion is never independent from line to line: it may
-    bend a whole resonance, as a position-dependent spring does, so that its lines within a
-    half-power bandwidth count as one.
-    """
+    """Return the covariance of ``[ln f, ln ζ]`` by noise, and by noise and distortion."""
     ordinates = state.ordinates
     slope = slopes(ordinates, state.order, state.variance, state.solution)
     prior = np.eye(slope.shape[1]) / _PRIOR_STD**2

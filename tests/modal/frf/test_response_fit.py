@@ -167,14 +167,3 @@ def test_a_record_that_does_not_repeat_tells_its_own_noise() -> None:
     assert fit.estimate.size == 4
     assert np.abs((fit.estimate - truth) / np.sqrt(np.diag(fit.cov))).max() < 4
     assert np.isnan(fit.chi_square)
-
-
-def test_the_transient_of_a_blow_does_not_cancel_its_response() -> None:
-    """A blow 1 ms after the start: the gain of the fit is that of the machine, not 10⁸ times it."""
-    rng = np.random.default_rng(7)
-    given, scatter = np.exp(-2e-3j * np.pi * LINES), rng.standard_normal((2, LINES.size))
-    answer = respond(TWO) * given + 1e-3 * (scatter[0] + 1j * scatter[1])
-    fit = fit_response(Ordinates(LINES, given, answer, np.ones(LINES.size), 10.0, periodic=False))
-    assert fit.ordinates.at_rest
-    assert np.abs(fit.response) == pytest.approx(np.abs(respond(TWO)), rel=0.01)
-    assert frequencies(fit)[:2] == pytest.approx([62, 90], abs=1e-3)
