@@ -27,6 +27,7 @@ from lmshealth.modal.ambient.cluster_fit import (
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     FittedSpectrum,
+    drop_duplicates,
     merge_close_modes,
     refuse_close_modes,
 )
@@ -178,6 +179,7 @@ def read_ambient(
         for h in part.harmonics
     )
     if stage is None:
+        found = drop_duplicates(found)
         anything = any(one.names for one in found)
         refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
     used_ones = {name for part in sought for name in part.spectra.channels}

@@ -628,7 +628,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     lines = tuple(read_line(data, first, last) for first, last in ordinates)
     longest = data.longest
     fitted = FittedSpectrum(channels, data.unit, data.spectra.spectra[longest], expected[longest])
-    found = ClusterModes(modes, lines, residual, fitted)
+    found = ClusterModes(modes, np.array(_losses(optimum)), lines, residual, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
 
 

@@ -39,6 +39,7 @@ class ClusterModes:
     """Estimates of the modes of a cluster."""
 
     modes: Modes  # with shapes over the channels that show any of them
+    clarity: FloatArray  # loss of log likelihood without each, the others fixed, (n_modes,)
     lines: tuple[LineEstimate, ...]  # excluded from the fit
     # ordinates of the longest observation over their expectation, mean over channels
     residual: Spectrum
@@ -53,7 +54,7 @@ class ClusterModes:
         """Keep the named modes; the others are marginalised."""
         kept = set(names)
         index = [i for i, name in enumerate(self.names) if name in kept]
-        return replace(self, modes=self.modes.select(index))
+        return replace(self, modes=self.modes.select(index), clarity=self.clarity[index])
 
     def rename(self, names: dict[str, str]) -> ClusterModes:
         """Keep the modes that get a new name."""
@@ -140,3 +141,19 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     flags = [f"{flag} cluster".strip() if k == i else flag for k, flag in enumerate(modes.flags)]
     common = replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, flags=tuple(flags))
     return replace(found, modes=common)
+
+
+def drop_duplicates(found: list[ClusterModes]) -> list[ClusterModes]:
+    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
+    rows = [
+        (float(clarity), float(ln_f), float(zeta), name)
+        for one in found
+        for clarity, ln_f, zeta, name in zip(
+            one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
+        )
+    ]
+    kept: list[tuple[float, float, float, str]] = []
+    for row in sorted(rows, reverse=True):
+        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
+            kept.append(row)
+    return [one.keep(row[3] for row in kept) for one in found]

@@ -216,6 +216,16 @@ def test_keeping_some_modes_marginalises_the_others() -> None:
     assert kept.modes.channels == ("acc_1",)
 
 
+def test_the_clearer_record_has_the_higher_clarity() -> None:
+    """The log likelihood a mode gains is larger where its noise is lower."""
+    modes = [Mode(105.0, 0.015)]
+    clear, blurred = (
+        found(accelerations(np.random.default_rng(5), modes, 60_000, RATE, noise), (ROLL,))
+        for noise in (0.1, 10.0)
+    )
+    assert clear.clarity[0] > blurred.clarity[0] > 0
+
+
 def test_the_following_error_and_an_accelerometer_are_one_source_together() -> None:
     """Spectra of both kinds are joint; each alone keeps its own source."""
     mode = [Mode(105.0, 0.015)]
