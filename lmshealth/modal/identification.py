@@ -54,9 +54,9 @@ _CEILING = 4.0
 # machines are not simple.
 _REACH = 6.0
 # A band whose ends have a larger ratio than the first is searched in parts up to the second, as no
-# simple floors hold over it; each is searched up to the third ratio beyond its ends, and modes are
-# published up to the fourth.
-_WIDE, _PART, _BEYOND, _OVERLAP = 30.0, 4.0, 1.15, 1.01
+# simple floors hold over it; each is searched up to the third ratio beyond its ends, and the edges
+# are shifted up to the fourth where no mode is.
+_WIDE, _PART, _BEYOND, _SHIFT = 30.0, 4.0, 1.15, 1.07
 _UNLIKE = (
     "from {:.4g} to {:.4g} Hz no modes in common with the other channels explain it, which are "
     "used without it: check whether it was recorded at the same time, or identify it by itself"
@@ -292,22 +292,37 @@ def _search(
     clear = own.free & silent.clear_of(frequencies)
     recording = own._replace(transforms=own.transforms * clear[:, None])
     cut = spectra.without(frequencies)
+    edges = _edges(low, high, 20 / duration)
     parts: list[Found] = []
-    n_parts = int(np.ceil(np.log(high / low) / np.log(_PART))) if high > _WIDE * low else 1
-    edges = np.geomspace(low, high, n_parts + 1).tolist()
     for k, (first, last) in enumerate(pairwise(edges)):
         progress("searching", k, len(edges) - 1)
         ends = max(low, first / _BEYOND), min(high, last * _BEYOND)
-        if (ends[1] - ends[0]) * duration < constants.LEAST_FREQUENCIES:
-            continue
         part = search(cut, recording, *ends, frequencies)
-        first_number = 1 + sum(len(one.modes) for one in parts)
-        modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, first_number)]
-        # A mode between two parts may be found by both, but must not be lost.
-        within = max(low, first / _OVERLAP), min(high, last * _OVERLAP)
-        parts.append(replace(part, band=within, modes=tuple(modes)))
+        number = 1 + sum(len(one.modes) for one in parts)
+        modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, number)]
+        if parts:
+            first = _between((*parts[-1].modes, *modes), first)
+            parts[-1] = replace(parts[-1], band=(parts[-1].band[0], first))
+        parts.append(replace(part, band=(first, last), modes=tuple(modes)))
     progress("searching", len(edges) - 1, len(edges) - 1)
     return tuple(parts), tested
+
+
+def _edges(low: float, high: float, least: float) -> list[float]:
+    """Return the edges of the parts in which a band is searched."""
+    if high <= _WIDE * low:
+        return [low, high]
+    start = min(max(low, least), high / _PART)
+    inner = np.geomspace(start, high, int(np.ceil(np.log(high / start) / np.log(_PART))) + 1)
+    return [low, *inner[1:].tolist()]
+
+
+def _between(modes: Sequence[Target], edge: float) -> float:
+    """Return a frequency near an edge between parts, as far as possible from the modes of both."""
+    near = np.geomspace(edge / _SHIFT, edge * _SHIFT, 41)
+    f = np.array([mode.frequency for mode in modes])
+    distance = np.abs(np.log(f / near[:, None])).min(axis=1, initial=_BEYOND)
+    return float(near[distance.argmax()]) if f.size else edge
 
 
 def _fit_described(
