@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.ndimage import binary_dilation, median_filter, uniform_filter1d
+from scipy.ndimage import binary_dilation, find_objects, label, median_filter, uniform_filter1d
 from scipy.stats import gamma
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
@@ -85,6 +85,12 @@ class _Optimum:
     p: FloatArray
     misfit: float
 
+    @property
+    def poles(self) -> FloatArray:
+        """Natural frequencies in Hz and damping ratios, shape ``(2, n_modes)``."""
+        m = len(self.targets)
+        return np.asarray(np.exp(self.p[: 2 * m].reshape(2, m)))
+
 
 def bin_cluster(
     spectra: LogSpectra,
@@ -120,16 +126,19 @@ def bin_spectra(
     size, n_larger = divmod(frequency.size, n_bins)
     larger, smaller = np.split(order, [n_larger * (size + 1)])
     parts = [larger.reshape(n_larger, size + 1), smaller.reshape(n_bins - n_larger, size)]
-    levels = []
-    for c in range(len(spectra.channels)):
-        ordinates = np.concatenate([s.matrix[:, c, c].real / median_ordinate(s.count) for s in cut])
-        levels.append(np.concatenate([np.median(ordinates[part], axis=1) for part in parts]))
+    ordinates = np.concatenate([_powers(s) / median_ordinate(s.count) for s in cut])
+    level = np.concatenate([np.median(ordinates[part], axis=1) for part in parts])
     return BinnedSpectra(
         np.concatenate([frequency[part].mean(axis=1) for part in parts]),
-        np.array(levels).clip(1e-300),
+        np.ascontiguousarray(level.T).clip(1e-300),
         np.concatenate([count[part].sum(axis=1) for part in parts]),
         neighbours,
     )
+
+
+def _powers(spectrum: CrossSpectrum) -> FloatArray:
+    """Return the periodograms of all channels, shape ``(n_ordinates, n_channels)``."""
+    return np.asarray(np.diagonal(spectrum.matrix, axis1=1, axis2=2).real)
 
 
 def fit_strengths(
@@ -203,12 +212,10 @@ def shows_more(binned: BinnedSpectra, known: Sequence[Target], targets: Sequence
 def locate(
     binned: BinnedSpectra, targets: tuple[Target, ...]
 ) -> tuple[BinnedSpectra, tuple[Target, ...]]:
-    """Shift the targets to where all channels show them.
+    """Shift the targets to where all channels show them: together, then each one by a little.
 
-    Wear moves all modes of a guide together, so that one mode may reach the described frequency of
-    another: a common shift is searched first, then a small one of each mode. Returns the binned
-    spectra with neighbours at the common shift, and the targets at their start values; ``nominal``
-    holds the described frequency.
+    Returns the binned spectra with neighbours at the common shift, and the targets at their start
+    values; ``nominal`` holds the described frequency.
     """
     own = len(targets)
     modes = (*targets, *binned.neighbours)
@@ -348,8 +355,7 @@ def _fit_and_prune(
 
 def _escaped(optimum: _Optimum) -> list[int]:
     """Return the mode that left its start furthest, if one did by more than three bandwidths."""
-    m = len(optimum.targets)
-    f, zeta = np.exp(optimum.p[:m]), np.exp(optimum.p[m : 2 * m])
+    f, zeta = optimum.poles
     start = np.array([[t.frequency, t.damping_ratio] for t in optimum.targets]).T
     left = np.abs(np.log(f / start[0])) / np.maximum(2 * start[1], 2e-3)
     left[zeta > constants.MOST_DAMPING] = np.inf
@@ -372,11 +378,7 @@ def _losses(optimum: _Optimum) -> list[float]:
 def screen(
     binned: BinnedSpectra, targets: tuple[Target, ...]
 ) -> tuple[tuple[Target, ...], dict[str, float]]:
-    """Drop modes that the binned spectra do not need.
-
-    Returns those that remain, with refined start dampings, and the gain in log likelihood by each
-    mode, by name.
-    """
+    """Return the modes that the binned spectra need, with refined dampings, and gains by name."""
 
     def misfit(some: tuple[Target, ...]) -> float:
         return float(fit_strengths(binned, some)[1].sum())
@@ -447,25 +449,20 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
         if spectrum.count > 1:
-            ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
-            ratio = ordinates / level / median_ordinate(spectrum.count)
+            ratio = _powers(spectrum) / level / median_ordinate(spectrum.count)
             level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
         levels.append(level)
     return _mask_above(data, levels)
 
 
 def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
-    """Mask lines with their neighbours wherever any channel shows one.
-
-    ``levels`` holds the mean level of each spectrum, shape ``(n_ordinates, n_channels)``.
-    """
+    """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``."""
     n_free = sum(int(mask.sum()) for mask in data.masks)
     false_alarm = constants.LINE_FALSE_ALARM / (data.unit.size * n_free)
     masks = []
     for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
         highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
-        ordinates = np.diagonal(spectrum.matrix, axis1=1, axis2=2).real
-        lines = mask & (ordinates > highest * level).any(axis=1)
+        lines = mask & (_powers(spectrum) > highest * level).any(axis=1)
         reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
         masks.append(mask & ~reached)
     # A band that would lose more than half of its ordinates holds no lines.
@@ -496,8 +493,7 @@ def make_blocks(
 
 def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
     """Repeat the fit with finer bins where resonances are narrower or elsewhere than expected."""
-    m = len(optimum.targets)
-    f, zeta = np.exp(optimum.p[:m]), np.exp(optimum.p[m : 2 * m])
+    f, zeta = optimum.poles
     bandwidth, expected = 2 * zeta * f, [2 * t.frequency * t.damping_ratio for t in optimum.targets]
     apart = np.abs(f - [target.frequency for target in optimum.targets])
     if (apart < bandwidth / 2).all() and bandwidth.min() > _NARROWER * min(expected):
@@ -571,8 +567,7 @@ def relative_signs(
 
 def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
     """Return the expectation of each spectrum over the band; infinite where it is masked."""
-    m = optimum.likelihood.layout.n_modes
-    bandwidth = float(np.min(2 * np.exp(optimum.p[:m] + optimum.p[m : 2 * m])))
+    bandwidth = float(np.min(2 * np.prod(optimum.poles, axis=0)))
     likelihood = replace(optimum.likelihood, blocks=make_blocks(data, bandwidth))
     masked = np.diag(np.full(data.unit.size, np.inf)).astype(complex)
     full = [np.tile(masked, (mask.size, 1, 1)) for mask in data.masks]
@@ -680,15 +675,13 @@ def _damping_bounds(target: Target) -> tuple[float, float]:
 def masked_ordinates(data: ClusterData) -> list[tuple[int, int]]:
     """Return the half-open ranges of masked ordinates of the longest observation."""
     masked = data.spectra.spectra[data.longest].free & ~data.masks[data.longest]
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], masked.astype(int), [0]])))
-    return [(int(a), int(b)) for a, b in edges.reshape(-1, 2)]
+    return [(run.start, run.stop) for (run,) in find_objects(label(masked)[0])]
 
 
 def read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
     """Read a line within some ordinates of the longest observation, in its strongest channel."""
     spectrum = data.spectra.spectra[data.longest]
-    power = np.diagonal(spectrum.matrix[first:last], axis1=1, axis2=2).real.sum(axis=0)
-    c = int(np.argmax(power))
+    c = int(np.argmax(_powers(spectrum)[first:last].sum(axis=0)))
     frequency, amplitude = spectrum.channel(c).sine(first, last)
     return LineEstimate(data.spectra.channels[c], frequency, amplitude * float(data.unit[c]))
 

@@ -149,11 +149,8 @@ def average_ordinates(
 def _bins(
     frequency: FloatArray, near: Sequence[float], bandwidth: float, fine: float
 ) -> NDArray[np.intp]:
-    """Return the bin of each ordinate; ``fine`` bins per Hz at a resonance.
-
-    At x half bandwidths from a resonance the logarithm of the density varies over x half
-    bandwidths: bins widen in proportion.
-    """
+    """Return the bin of each ordinate; ``fine`` bins per Hz at a resonance."""
+    # At x half bandwidths from a resonance the logarithm of the density varies over x of them.
     distance = np.min([np.abs(frequency - f) for f in near], axis=0) / (bandwidth / 2)
     step = frequency[1] - frequency[0]
     return np.asarray(np.cumsum(fine * step / np.hypot(1.0, distance)), dtype=np.intp)

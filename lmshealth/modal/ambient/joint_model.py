@@ -128,10 +128,7 @@ class JointModel:
         return np.asarray(b @ part.r @ np.swapaxes(b.conj(), 1, 2))
 
     def dispersions(self) -> FloatArray:
-        """Return, for each channel given the others, the dispersion of its residual; 1 for noise.
-
-        The median square of the residual is resistant to lines.
-        """
+        """Return the dispersion of the residual of each channel given the others; 1 for noise."""
         g = self._inverse
         ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / np.einsum("kaa->ka", g).real
         squares = self.data.count[:, None] * (ratio - 1) ** 2

@@ -333,11 +333,8 @@ def _gains(data: BandData, e: ComplexArray, b: ComplexArray) -> tuple[FloatArray
 
 
 def _force_step(s: ComplexArray, lack: ComplexArray, information: FloatArray) -> ComplexArray:
-    """Return a step of the forces by expectation maximisation.
-
-    The information takes the place of the number of ordinates; the step is shortened until S stays
-    positive.
-    """
+    """Return a step of the forces by expectation maximisation that keeps S positive."""
+    # The information takes the place of the number of ordinates.
     n = (np.diagonal(s).real * information).clip(1e-12)
     step = s @ lack @ s / np.sqrt(n[:, None] * n)
     least = 1e-3 * np.linalg.eigvalsh(s).min().clip(0)

@@ -228,10 +228,7 @@ class Likelihood:
         return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
 
     def minimise(self, start: FloatArray) -> FloatArray:
-        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
-
-        The Newton decrement at the result shows whether the search converged.
-        """
+        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""
         # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
         # the point before where a step was too long.
         points = lru_cache(maxsize=1)(lambda raw: self._at(np.frombuffer(raw)))

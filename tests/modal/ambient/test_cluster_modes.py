@@ -12,6 +12,7 @@ from lmshealth.modal.ambient.cluster_fit import _dispersion, _flags, _incredible
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     ClusterModes,
+    drop_duplicates,
     merge_close_modes,
     refuse_close_modes,
 )
@@ -71,6 +72,18 @@ def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     own = (fit.modes.cov[0, 0] + fit.modes.cov[1, 1] + 2 * fit.modes.cov[0, 1]) / 4
     assert kept.modes.cov[0, 0] == pytest.approx(own + half**2)
     assert kept.modes.cov.shape == (2, 2)
+
+
+def test_of_a_mode_that_two_parts_of_a_band_find_the_clearer_is_kept() -> None:
+    """The same fit twice, once less clear: its modes are dropped; modes elsewhere are kept."""
+    clear = found(both()).rename({"roll": "mode_1", "pitch": "mode_2"})
+    again = replace(clear, clarity=clear.clarity / 2).rename(
+        {"mode_1": "mode_3", "mode_2": "mode_4"}
+    )
+    far = again.rename({"mode_3": "mode_5", "mode_4": "mode_6"})
+    far = replace(far, modes=replace(far.modes, ln_frequency=far.modes.ln_frequency + 1))
+    kept = [one.names for one in drop_duplicates([again, clear, far])]
+    assert kept == [(), ("mode_1", "mode_2"), ("mode_5", "mode_6")]
 
 
 @pytest.mark.slow
