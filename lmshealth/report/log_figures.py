@@ -374,8 +374,9 @@ def _annotate(
             ax.axvline(f, color=figures.BLUE, lw=0.6)
         name = spell(modes.names[k] or "unnamed")
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
+    sought = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
     for refusal in modes.refused:
-        at = _place(refusal, stage)
+        at = refusal.frequency or sought.get(refusal.mode)
         if at is not None and band[0] <= at <= band[1]:
             style: Any = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
@@ -425,16 +426,6 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
         text = figures.plain_label(text.replace("\n", "  ") if upright else text)
         arrow = {"arrowstyle": "-", "color": colour, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
         ax.annotate(text, (f, 1), (x, 16), color=colour, arrowprops=arrow, **style)
-
-
-def _place(refusal: Refusal, stage: Stage | None) -> float | None:
-    """Return the frequency in Hz at which a refused candidate was sought; None if unknown."""
-    if refusal.frequency is not None:
-        return refusal.frequency
-    if refusal.mode.endswith(" Hz"):
-        return float(refusal.mode.removesuffix(" Hz"))
-    named = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
-    return named.get(refusal.mode)
 
 
 def _notes(modes: Modes) -> list[str]:

@@ -43,7 +43,7 @@ def some_modes(ln_f_std: float, *frequencies: float) -> Modes:
     estimate = np.log([*frequencies, *[0.02] * n])
     cov = np.diag([ln_f_std**2] * n + [0.1**2] * n)
     found = estimates_only(estimate, cov, np.full(n, 100.0), "acc", ["acc_$s"] * n)
-    refused = Refusal("log", "too-uncertain", "a $ and a $", mode="80.5 Hz")
+    refused = Refusal("log", "too-uncertain", "a $ and a $", mode="80.5 Hz", frequency=80.5)
     return numbered(merge([found], [Line(50.0, 10.0, "m/s²", "mains", "acc_n")], [refused]))
 
 

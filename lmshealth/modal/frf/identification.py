@@ -105,44 +105,34 @@ def read_frf(
     source, response = _channel(log, input), _channel(log, output)
     if input == output:
         raise BadLog(log.name, "channel", f"{input} is both input and output; needed are two")
-    start, stop = _longest_segment(log)
-    top = constants.USABLE * log.sample_rate
+    pair = _longest_segment(log, (source, response))
+    rate, top = log.sample_rate, constants.USABLE * log.sample_rate
     low, high = band or (0.0, top)
     if low >= top:
-        raise BadLog(
-            log.name,
-            "sample-rate",
-            f"{log.sample_rate:g} Hz shows nothing above {top:.4g} Hz; the band begins at {low:g}",
-        )
-    pair = _signals(log, (source, response), start, stop)
+        detail = f"{rate:g} Hz shows nothing above {top:.4g} Hz; the band begins at {low:g}"
+        raise BadLog(log.name, "sample-rate", detail)
     if impact or (impact is None and period is None):
-        blows = find_hits(pair[0], log.sample_rate, certain=not impact)
+        blows = find_hits(pair[0], rate, certain=not impact)
         if blows:
             measured = Pair(log, (input, output), pair, 0)
             frf, ordinates, refused = from_blows(measured, blows, (low, min(high, top)))
             return _identify(log.name, frf, ordinates, (*log.refused, *refused))
         if impact:
-            raise BadLog(
-                log.name,
-                "not-excited",
-                f"no blow: no pulse of {input} exceeds {constants.TRIGGER_SIGMAS:g} times its "
-                "noise; strike harder, or read it without --impact",
-            )
+            detail = f"no pulse of {input} exceeds {constants.TRIGGER_SIGMAS:g} times its noise"
+            step = "strike harder, or read it without --impact"
+            raise BadLog(log.name, "not-excited", f"no blow: {detail}; {step}")
     samples = _period(log, pair[0], period)
-    band = _excited_band(pair[0], log.sample_rate, (low, min(high, top)), samples)
+    band = _excited_band(pair[0], rate, (low, min(high, top)), samples)
     lag = 0
     if response.kind == "displacement":
-        lag = max(1, int(log.sample_rate / (_LAG_PERIODS * band[1])))
+        lag = max(1, int(rate / (_LAG_PERIODS * band[1])))
         pair = _differenced(pair, lag, samples)
     measured = Pair(log, (input, output), pair, lag)
     if samples is None:
         frf, ordinates = from_record(measured, band)
     else:
         frf, ordinates = from_periods(measured, band, samples)
-    _check_coherence(log.name, frf)
-    fit = fit_response(ordinates)
-    modes = _modes(log.name, frf, fit, log.refused, _lines(log, response, fit))
-    return FrfReading(frf, fit, modes)
+    return _identify(log.name, frf, ordinates, log.refused, output=response)
 
 
 def read_measured(
@@ -180,18 +170,21 @@ def _identify(
     frf: Frf,
     ordinates: Ordinates,
     before: tuple[Refusal, ...] = (),
+    *,
+    output: Channel | None = None,
     window: float | None = None,
 ) -> FrfReading:
-    """Identify the modes of blows or of a measured response, whose noise may be unknown."""
-    if ordinates.scatter:
-        _check_coherence(log, frf)
+    """Identify the modes of a response; outliers of its fit are the lines of an ``output``."""
+    _check_coherence(log, frf)
     fit = fit_response(ordinates)
     if window is not None:
         fit = without_window(fit, window)
-    if not ordinates.scatter:
+    if not (ordinates.scatter or ordinates.transient):
+        # The noise of one blow, or of a response without averages, is that of the residual.
         std = np.sqrt(fit.ordinates.noise) / np.abs(fit.ordinates.given)
         frf = replace(frf, std=np.interp(frf.frequency, fit.ordinates.frequency, std))
-    return FrfReading(frf, fit, _modes(log, frf, fit, before))
+    lines = () if output is None else _lines(output, fit)
+    return FrfReading(frf, fit, _modes(log, frf, fit, before, lines))
 
 
 def _channel(log: Log, name: str) -> Channel:
@@ -203,53 +196,43 @@ def _channel(log: Log, name: str) -> Channel:
     raise BadLog(log.name, "channel", f"no usable channel {name!r}; available {available}{why}")
 
 
-def _longest_segment(log: Log) -> tuple[int, int]:
-    """Return the longest segment of constant velocity, or of rest in a log that never moves."""
+def _longest_segment(log: Log, channels: tuple[Channel, Channel]) -> tuple[FloatArray, FloatArray]:
+    """Cut out the longest segment of constant velocity, or of rest in a log that never moves."""
     phases = find_phases(log)
     rests = all(phase.kind == "idle" for phase in phases)
     usable = [phase for phase in phases if rests or phase.kind in ("constant", "whole")]
-    longest = max(usable, key=lambda phase: phase.stop - phase.start, default=None)
-    if longest is None or longest.stop - longest.start < constants.FRF_SAMPLES:
-        n = 0 if longest is None else longest.stop - longest.start
+    ranges = [(phase.start, phase.stop) for phase in usable]
+    start, stop = max(ranges, key=lambda ends: ends[1] - ends[0], default=(0, 0))
+    if stop - start < constants.FRF_SAMPLES:
         raise BadLog(
             log.name,
             "too-short",
-            f"the longest segment of constant velocity without gaps has {n} samples, "
-            f"{n / log.sample_rate:.3g} s; needed are at least {constants.FRF_SAMPLES}",
+            f"the longest segment of constant velocity without gaps has {stop - start} samples, "
+            f"{(stop - start) / log.sample_rate:.3g} s; needed are at least "
+            f"{constants.FRF_SAMPLES}",
         )
-    return longest.start, longest.stop
-
-
-def _signals(
-    log: Log, channels: tuple[Channel, Channel], start: int, stop: int
-) -> tuple[FloatArray, FloatArray]:
     first, second = (channel.values[start:stop] for channel in channels)
     for channel, values in zip(channels, (first, second), strict=True):
-        if values.size and values.max() == values.min():
-            raise BadLog(
-                log.name, "constant", f"{channel.name} is {values[0]:g} throughout the segment used"
-            )
+        if values.max() == values.min():
+            detail = f"{channel.name} is {values[0]:g} throughout the segment used"
+            raise BadLog(log.name, "constant", detail)
     return first, second
 
 
 def _period(log: Log, values: FloatArray, stated: float | None) -> float | None:
     """Return the period of the excitation in samples; None where it is not periodic."""
-    duration = values.size / log.sample_rate
-    if stated is not None and stated * log.sample_rate < constants.FRF_PERIOD_SAMPLES:
-        raise BadLog(
-            log.name,
-            "period",
-            f"a period of {stated:g} s has {stated * log.sample_rate:.3g} samples, needed are at "
-            f"least {constants.FRF_PERIOD_SAMPLES}; it is stated in seconds",
-        )
-    if stated is not None and stated > duration / 2:
-        raise BadLog(
-            log.name,
-            "period",
-            f"a period of {stated:g} s does not fit twice into the {duration:.4g} s of constant "
-            "velocity without gaps; record longer",
-        )
-    return find_period(values, None if stated is None else stated * log.sample_rate)
+    if stated is None:
+        return find_period(values)
+    duration, samples = values.size / log.sample_rate, stated * log.sample_rate
+    if samples < constants.FRF_PERIOD_SAMPLES:
+        found = f"has {samples:.3g} samples, needed are at least {constants.FRF_PERIOD_SAMPLES}"
+        step = "it is stated in seconds"
+    elif stated > duration / 2:
+        found = f"does not fit twice into the {duration:.4g} s of constant velocity without gaps"
+        step = "record longer"
+    else:
+        return find_period(values, samples)
+    raise BadLog(log.name, "period", f"a period of {stated:g} s {found}; {step}")
 
 
 def _excited_band(
@@ -271,12 +254,9 @@ def _excited_band(
 def _differenced(
     pair: tuple[FloatArray, FloatArray], lag: int, period: float | None
 ) -> tuple[FloatArray, FloatArray]:
-    """Take second differences of both signals over ``lag`` samples; the response is unchanged.
-
-    The slow part of a displacement exceeds that of the modes by orders of magnitude and would leak
-    from the ends of each period. The lag is as long as the band allows: differences of neighbours
-    would amplify fast noise until this leaks instead.
-    """
+    """Take second differences of both signals over ``lag`` samples; the response is unchanged."""
+    # The slow part of a displacement would leak from the ends of each period; differences over a
+    # shorter lag than the band allows would amplify fast noise until this leaks instead.
     first, second = (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag] for x in pair)
     if period is None:
         return first, second
@@ -287,26 +267,23 @@ def _differenced(
 
 
 def _check_coherence(name: str, frf: Frf) -> None:
-    """Require a coherence above that of noise, 1/n on average."""
+    """Require a coherence above that of noise, 1/n on average; NaN where there is none."""
     n = frf.n_averages
     mean, least = float(frf.coherence.mean()), 1 / n
     # Neighbouring lines of a Hann window share half of their information.
     chance = np.sqrt((n - 1) / (n + 1) / frf.coherence.size * 2) / n
     if mean < least + constants.COHERENT_SIGMAS * chance:
-        raise BadLog(
-            name,
-            "coherence",
-            f"{frf.output} does not respond to {frf.input}: mean coherence {mean:.3f}, that "
-            f"of noise {least:.3f}; excite more, or record longer",
-        )
+        found = f"mean coherence {mean:.3f}, that of noise {least:.3f}"
+        detail = f"{frf.output} does not respond to {frf.input}: {found}"
+        raise BadLog(name, "coherence", f"{detail}; excite more, or record longer")
 
 
 def _modes(
     log: str,
     frf: Frf,
     fit: ResponseFit,
-    before: tuple[Refusal, ...] = (),
-    lines: tuple[Line, ...] = (),
+    before: tuple[Refusal, ...],
+    lines: tuple[Line, ...],
 ) -> Modes:
     """Return the credible modes; the others are refused."""
     m = fit.estimate.size // 2
@@ -318,8 +295,8 @@ def _modes(
     elif len(why) == m and {one.reason for one in why.values()} <= _NO_RESONANCE:
         nothing = _why_none(frf, fit)
     refused = [
-        Refusal(log, *one[:2], frf.output, f"{np.exp(fit.estimate[i]):.5g} Hz", "frf")
-        for i, one in why.items()
+        Refusal(log, *one[:2], frf.output, f"{f:.5g} Hz", "frf", frequency=f)
+        for one, f in ((one, float(np.exp(fit.estimate[i]))) for i, one in why.items())
     ]
     if nothing is not None:
         refused.append(Refusal(log, *nothing[:2], frf.output, source="frf"))
@@ -330,12 +307,10 @@ def _modes(
 
 def _why_missed(frf: Frf, fit: ResponseFit) -> Rejection:
     """Return why no rational response fits: lines too few for what there is, or no linear one."""
-    misses = (
-        f"the fit misses {100 * fit.missed:.0f} % of the response, allowed are "
-        f"{100 * constants.FRF_MISSED:.0f} %, and periods scatter by "
-        f"{100 * _noise_share(fit):.2g} %: "
-    )
     few, n, top = _too_few(frf, fit)
+    misses = f"the fit misses {100 * fit.missed:.0f} % of the response, allowed are "
+    misses += f"{100 * constants.FRF_MISSED:.0f} %, and periods scatter by "
+    misses += f"{100 * _noise_share(fit):.2g} %: "
     if few and not frf.stray > constants.NONLINEAR_OUTPUT:
         return Rejection("too-few-lines", misses + few)
     return Rejection(
@@ -352,9 +327,9 @@ def _too_few(frf: Frf, fit: ResponseFit) -> tuple[str, int, float]:
     gain, frequency = np.abs(frf.response), frf.frequency
     top = int(np.argmax(gain))
     # A resonance falls to 1/√10 over three half-power bandwidths.
-    low = np.flatnonzero(gain[:top] ** 2 < gain[top] ** 2 / 10).max(initial=-1)
-    high = top + np.flatnonzero(gain[top:] ** 2 < gain[top] ** 2 / 10).min(initial=gain.size - top)
-    n = int(high - low - 1)
+    outside = np.flatnonzero(gain**2 < gain[top] ** 2 / 10)
+    low = outside[outside < top].max(initial=-1)
+    n = int(outside[outside > top].min(initial=gain.size) - low - 1)
     needed = 4 * constants.FRF_MOST_MODES + 2 * FEWEST_POWERS + 2
     spacing = fit.ordinates.spacing
     few = (
@@ -403,10 +378,8 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
         most = constants.FRF_MOST_DAMPING
         return Rejection("overdamped", f"damping {zeta:.2g}, at most {most:g}: background, no mode")
     if zeta < LEAST_DAMPING:
-        return Rejection(
-            "too-uncertain",
-            "all of its damping is that of the exponential window; choose a longer window",
-        )
+        detail = "all of its damping is that of the exponential window; choose a longer window"
+        return Rejection("too-uncertain", detail)
     if unresolved := _unresolved(frf, fit.ordinates, f, zeta):
         return unresolved
     if fit.over_distortion[i] < constants.OVER_DISTORTION:
@@ -416,11 +389,8 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
             f"needed {constants.OVER_DISTORTION:g}: a nonlinearity may look the same; excite less",
         )
     if std_f > constants.WORST_STD_LN_F or std_zeta > constants.WORST_STD_LN_ZETA:
-        return Rejection(
-            "too-uncertain",
-            f"standard deviation {100 * std_f:.2g} %, damping {100 * std_zeta:.0f} %; record "
-            "longer or excite more",
-        )
+        found = f"standard deviation {100 * std_f:.2g} %, damping {100 * std_zeta:.0f} %"
+        return Rejection("too-uncertain", f"{found}; record longer or excite more")
     return None
 
 
@@ -440,6 +410,10 @@ def _unresolved(frf: Frf, ordinates: Ordinates, f: float, zeta: float) -> Reject
     if ordinates.periodic:
         reach = constants.BANDWIDTHS_OF_LINES * zeta * f
         n = int(np.count_nonzero(np.abs(ordinates.frequency - f) <= reach))
+        if n < constants.LINES_OF_MODE and zeta < 2 * LEAST_DAMPING:
+            detail = f"damping {zeta:.1g}, the least of the fit: it may be a line, as of mains"
+            step = "choose a period of the excitation that is no multiple of that of the line"
+            return Rejection("line-not-mode", f"{detail}; {step}")
         if n < constants.LINES_OF_MODE:
             most = 2 * reach / constants.LINES_OF_MODE
             return Rejection(
@@ -450,14 +424,12 @@ def _unresolved(frf: Frf, ordinates: Ordinates, f: float, zeta: float) -> Reject
                 f"of at least {1 / most:.2g} s",
             )
     elif 2 * zeta * f < spacing:
-        return Rejection(
-            "line-not-mode",
-            f"{2 * zeta * f:.2g} Hz wide, but lines are {spacing:.2g} Hz apart; record longer",
-        )
+        detail = f"{2 * zeta * f:.2g} Hz wide, but lines are {spacing:.2g} Hz apart; record longer"
+        return Rejection("line-not-mode", detail)
     return None
 
 
-def _lines(log: Log, output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
+def _lines(output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
     """Classify the outliers of the fit, which are no response to the input."""
     frequency, amplitude = fit.outliers.T
     if output.kind == "displacement":

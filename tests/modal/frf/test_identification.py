@@ -434,14 +434,26 @@ def test_a_gap_leaves_the_longest_piece() -> None:
     assert np.abs(off(reading)).max() < 4
 
 
+def with_sine(frequency: float, share: float) -> tuple[FrfReading, float]:
+    """Read a response with a sine of the excitation's period; return the amplitude of this, too."""
+    given, answer = periodic(np.random.default_rng(4), Machine(), SIZE, 6)
+    size = share * answer.std()
+    answer = answer + size * np.sin(2 * np.pi * frequency * np.arange(answer.size) / RATE)
+    log = make_log({"current": given, "acc_x": answer}, RATE)
+    return read_frf(log, "current", "acc_x", band=BAND), size
+
+
+def test_a_strong_sine_is_refused_as_a_line() -> None:
+    """75 Hz as strong as the answer: a pole of no damping, for which no period is advised."""
+    reading, _ = with_sine(75, 1.0)
+    (refused,) = reading.modes.refused
+    assert (refused.reason, refused.mode) == ("line-not-mode", "75 Hz")
+    assert np.abs(off(reading)).max() < 4
+
+
 def test_mains_on_a_harmonic_is_a_line_and_no_mode() -> None:
     """50 Hz synchronous with the excitation is listed as mains with its amplitude."""
-    rng = np.random.default_rng(4)
-    given, answer = periodic(rng, Machine(), SIZE, 6)
-    size = 0.2 * answer.std()
-    answer = answer + size * np.sin(2 * np.pi * 50 * np.arange(answer.size) / RATE)
-    reading = read_frf(make_log({"current": given, "acc_x": answer}, RATE), "current", "acc_x",
-                       band=BAND)  # fmt: skip
+    reading, size = with_sine(50, 0.2)
     (line,) = reading.modes.lines
     assert (line.kind, line.channel) == ("mains", "acc_x")
     assert line.frequency == pytest.approx(50)
