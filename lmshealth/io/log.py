@@ -12,6 +12,7 @@ from lmshealth._arrays import expect_shape, freeze
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
+SI_UNITS = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from scipy.stats import gamma
 from lmshealth._arrays import FloatArray
 from lmshealth._files import write_bytes, write_text
 from lmshealth.errors import BadLog
-from lmshealth.io.log import Log, Refusal
+from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.search import Found
 from lmshealth.modal.frf.identification import FrfReading
@@ -269,10 +269,9 @@ def response_figure(
 ) -> LogFigure:
     """Return a figure of a frequency response with its fit, and the modes with their names."""
     frf, fit = reading.frf, reading.fit
-    units = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
     if isinstance(log, Log):
         kinds = {channel.name: channel.kind for channel in log.channels}
-        unit = f"({units[kinds[frf.output]]})/{units[kinds[frf.input]]}"
+        unit = f"({SI_UNITS[kinds[frf.output]]})/{SI_UNITS[kinds[frf.input]]}"
     else:
         unit = log.unit or "unit of the file"
 

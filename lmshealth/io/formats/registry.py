@@ -50,16 +50,7 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
     `Unusable`: ``format`` for an unknown suffix or another format's content, ``empty`` for 0 bytes,
     ``corrupt`` for content that cannot be read, and the reasons of the formats.
     """
-    form = format_of(path)
-    if form is None:
-        known = (*SUFFIXES, *TEXT_SUFFIXES)
-        raise Unusable("format", f"unknown suffix; needed one of {listed(known)}")
-    with path.open("rb") as stream:
-        head = stream.read(_HEAD)
-    if not head:
-        raise Unusable("empty", "0 bytes; copy the file again")
-    if not form.sniff(head):
-        raise _mismatch(form, head)
+    form = confirm(path)
     try:
         return form.load(path, columns, max_memory)
     except Unusable:
@@ -71,9 +62,20 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
         raise Unusable("corrupt", detail) from error
 
 
-def _mismatch(form: Format, head: bytes) -> Unusable:
+def confirm(path: Path) -> Format:
+    """Return the format of a file's suffix, which its first bytes must confirm."""
+    form = format_of(path)
+    if form is None:
+        known = (*SUFFIXES, *TEXT_SUFFIXES)
+        raise Unusable("format", f"unknown suffix; needed one of {listed(known)}")
+    with path.open("rb") as stream:
+        head = stream.read(_HEAD)
+    if not head:
+        raise Unusable("empty", "0 bytes; copy the file again")
+    if form.sniff(head):
+        return form
     actual = next((other for other in FORMATS if other.sniff(head)), None)
     if actual is None:
-        return corrupt(f"does not start as {form.name} does")
+        raise corrupt(f"does not start as {form.name} does")
     found = f"the suffix is that of {form.name}, the content is {actual.name}"
-    return Unusable("format", f"{found}; rename the file to {actual.suffixes[0]}")
+    raise Unusable("format", f"{found}; rename the file to {actual.suffixes[0]}")

@@ -70,15 +70,9 @@ def from_blows(
 ) -> tuple[Frf, Ordinates, list[Refusal]]:
     """Average usable blows; the others are refused by number and time.
 
-    The joint likelihood of blows b with Y_b = H U_b and noise of one power depends on the data by
-    Σ Y_b U_b* / √Σ|U_b|² alone (H1), and by the scatter around it, which is the noise. One blow
-    has the noise of the residual of the fit. Force outside the pulse is set to zero. The output is
-    not windowed: a decay that is cut off after T keeps its pole at the lines k/T.
-
-    Raises
-    ------
-    BadLog
-        If no blow can be used, or they excite too few lines of the band.
+    H1 and the scatter around it contain all that the likelihood needs (README of the folder); one
+    blow has the noise of the residual of the fit. `BadLog` if no blow can be used, or they excite
+    too few lines of the band.
     """
     rate = pair.log.sample_rate
     used, refused = _usable(pair, blows)
@@ -134,44 +128,30 @@ def _usable(
     for number, (blow, end) in enumerate(zip(blows, ends, strict=True), start=1):
         main, stop = max(blow, key=lambda hit: hit.peak), end - (margin if end < force.size else 0)
         others = [h for h in blow if h != main and h.peak >= constants.SECOND_HIT * main.peak]
-        why: tuple[str, str] | None = None
         if others:
-            why = (
-                "double-hit",
-                (
-                    f"a second hit of {100 * others[0].peak / main.peak:.0f} %, "
-                    f"{1e3 * abs(others[0].start - main.start) / rate:.3g} ms apart; strike again"
-                ),
-            )
+            share, apart = others[0].peak / main.peak, abs(others[0].start - main.start) / rate
+            reason, step = "double-hit", "strike again"
+            found = f"a second hit of {100 * share:.0f} %, {1e3 * apart:.3g} ms apart"
         elif main.peak < constants.WEAK_BLOW * strongest:
-            why = (
-                "weak-blow",
-                (
-                    f"{100 * main.peak / strongest:.2g} % of the strongest, needed "
-                    f"{100 * constants.WEAK_BLOW:.0f} %; strike harder"
-                ),
-            )
+            reason, step = "weak-blow", "strike harder"
+            found = f"{100 * main.peak / strongest:.2g} % of the strongest, needed "
+            found += f"{100 * constants.WEAK_BLOW:.0f} %"
         elif any(_overloaded(x[main.start : stop]) for x in (force, output, -force, -output)):
-            why = "overload", "force or output stays at its largest value; raise the range"
+            reason, step = "overload", "raise the range"
+            found = "force or output stays at its largest value"
         elif stop - main.start < min(length, force.size) / 2:
-            why = (
-                "too-short",
-                (
-                    f"{(stop - main.start) / rate:.3g} s until the next blow or the end, half the "
-                    f"others have {length / rate:.3g} s; wait longer"
-                ),
-            )
-        if why is None:
-            used.append((main, stop))
+            reason, step = "too-short", "wait longer"
+            found = f"{(stop - main.start) / rate:.3g} s until the next blow or the end, half the "
+            found += f"others have {length / rate:.3g} s"
         else:
-            detail = f"blow {number} at {main.start / rate:.4g} s: {why[1]}"
-            refused.append(Refusal(log.name, why[0], detail, pair.names[0], source="frf"))
+            used.append((main, stop))
+            continue
+        detail = f"blow {number} at {main.start / rate:.4g} s: {found}; {step}"
+        refused.append(Refusal(log.name, reason, detail, pair.names[0], source="frf"))
     if not used:
-        raise BadLog(
-            log.name,
-            refused[0].reason,
-            f"none of {len(blows)} blows can be used: " + "; ".join(r.detail for r in refused),
-        )
+        detail = "; ".join(one.detail for one in refused)
+        none = f"none of {len(blows)} blows can be used: {detail}"
+        raise BadLog(log.name, refused[0].reason, none)
     return used, refused
 
 

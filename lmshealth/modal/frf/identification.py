@@ -144,22 +144,10 @@ def read_measured(
 ) -> FrfReading:
     """Identify the modes of a frequency response that was measured before.
 
-    Parameters
-    ----------
-    response : MeasuredResponse
-    band : (float, float), optional
-        In Hz; by default all lines.
-    averages : int, optional
-        Number of independent averages; with the coherence it gives the noise, which otherwise is
-        that of the residual of the fit.
-    window : float, optional
-        Time constant in s of the exponential window that the analyser applied to the response; the
-        damping that it adds, 1/(2πfτ), is removed.
-
-    Raises
-    ------
-    BadLog
-        If there are too few lines, too many, or the output does not respond.
+    The band is in Hz, by default all lines. The number of independent averages gives the noise with
+    the coherence; otherwise it is that of the residual of the fit. The damping 1/(2πfτ) of an
+    exponential window with the time constant ``window`` in s is removed. `BadLog` if there are too
+    few lines, too many, or the output does not respond.
     """
     frf, ordinates = from_measured(response, band or (0.0, np.inf), averages)
     return _identify(response.name, frf, ordinates, window=window)
@@ -313,13 +301,11 @@ def _why_missed(frf: Frf, fit: ResponseFit) -> Rejection:
     misses += f"{100 * _noise_share(fit):.2g} %: "
     if few and not frf.stray > constants.NONLINEAR_OUTPUT:
         return Rejection("too-few-lines", misses + few)
-    return Rejection(
-        "nonlinear",
-        f"{misses}a nonlinearity: {n} lines around the peak at {top:.4g} Hz and "
-        f"{100 * frf.stray:.2g} % of the answer at harmonics without input; excite less, and if "
-        f"that changes nothing choose a narrower band (at most {constants.FRF_MOST_MODES} modes "
-        "are fitted)",
-    )
+    found = f"a nonlinearity: {n} lines around the peak at {top:.4g} Hz and {100 * frf.stray:.2g} %"
+    found += " of the answer at harmonics without input"
+    step = "excite less, and if that changes nothing choose a narrower band (at most "
+    step += f"{constants.FRF_MOST_MODES} modes are fitted)"
+    return Rejection("nonlinear", f"{misses}{found}; {step}")
 
 
 def _too_few(frf: Frf, fit: ResponseFit) -> tuple[str, int, float]:
@@ -332,14 +318,13 @@ def _too_few(frf: Frf, fit: ResponseFit) -> tuple[str, int, float]:
     n = int(outside[outside > top].min(initial=gain.size) - low - 1)
     needed = 4 * constants.FRF_MOST_MODES + 2 * FEWEST_POWERS + 2
     spacing = fit.ordinates.spacing
-    few = (
-        f"{n} excited lines within three half-power bandwidths of the peak at "
-        f"{frequency[top]:.4g} Hz, needed {constants.LINES_OF_MODE}, and {gain.size} in all, "
-        f"needed {needed} for {constants.FRF_MOST_MODES} modes; excite lines closer than "
-        f"the {spacing:.3g} Hz of now, with a period longer than {1 / spacing:.2g} s"
-    )
-    enough = n >= constants.LINES_OF_MODE and gain.size >= needed
-    return "" if enough else few, n, float(frequency[top])
+    if n >= constants.LINES_OF_MODE and gain.size >= needed:
+        return "", n, float(frequency[top])
+    few = f"{n} excited lines within three half-power bandwidths of the peak at "
+    few += f"{frequency[top]:.4g} Hz, needed {constants.LINES_OF_MODE}, and {gain.size} in all, "
+    few += f"needed {needed} for {constants.FRF_MOST_MODES} modes; excite lines closer than "
+    few += f"the {spacing:.3g} Hz of now, with a period longer than {1 / spacing:.2g} s"
+    return few, n, float(frequency[top])
 
 
 def _why_none(frf: Frf, fit: ResponseFit) -> Rejection:

@@ -1,9 +1,6 @@
 """Frequency responses that an analyser has measured: UFF58 of function type 4, tables of lines.
 
-A table has the column ``frequency_hz`` (or ``_khz``, ``_rad_s``) and for each response ``real`` and
-``imag``, or ``magnitude`` (``db``) and ``phase_deg`` (``phase_rad``), and perhaps ``coherence``.
-Where there are several, or with a name, they are ``<name>_real`` and so on; the name may end in
-units as ``acc_x_g_per_n``.
+The README of the folder lists the columns of a table.
 """
 
 from __future__ import annotations
@@ -14,15 +11,15 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray, freeze
+from lmshealth._arrays import ComplexArray, FloatArray, ReadOnly
 from lmshealth.errors import BadLog
 from lmshealth.io import constants as limits
 from lmshealth.io.column_map import RESPONSE_COLUMN, ColumnMap, parse_column, role_of
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.csv import CSV, CSV_GZ
-from lmshealth.io.formats.registry import format_name, load
+from lmshealth.io.formats.registry import confirm, format_name, load
 from lmshealth.io.formats.uff import UFF, Function, load_functions
-from lmshealth.io.log import Metadata
+from lmshealth.io.log import SI_UNITS, Metadata
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
@@ -34,13 +31,13 @@ FORMATS = (CSV.name, CSV_GZ.name, UFF.name)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
 _PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
-_ROUNDING, _HEAD = 1e-9, 4096
+_ROUNDING = 1e-9
 # Variance of unknown noise from which a fit starts, over the power of the response.
 _START = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class MeasuredResponse:
+class MeasuredResponse(ReadOnly):
     """A frequency response from a file, arrays ``(n_lines,)``."""
 
     name: str  # of the file, with that of the output where the file holds several
@@ -52,9 +49,6 @@ class MeasuredResponse:
     values: ComplexArray  # output per input
     coherence: FloatArray  # NaN where the file has none
     unit: str  # of the values; empty where it is unknown
-
-    def __post_init__(self) -> None:
-        freeze(self)
 
 
 class _ResponseColumns(ColumnMap, frozen=True, dict=True):
@@ -75,38 +69,32 @@ def read_responses(
 ) -> tuple[MeasuredResponse, ...]:
     """Read the frequency responses of a file; none from a log, which holds time records.
 
-    Raises
-    ------
-    BadLog
-        If a response lacks a part, or its lines are not finite and ascending.
+    `BadLog` if a response lacks a part, or its lines are not finite and ascending.
     """
     given = columns or ColumnMap()
     label, digest = shown(path), content_digest(path)
+    if (form := format_name(path)) not in FORMATS:
+        return ()
     try:
-        content = Content({}, {}, ())
-        functions: list[Function] = []
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD)
-        if format_name(path) == UFF.name and UFF.sniff(head):
+        stated: dict[str, str] = {}
+        if form == UFF.name:
+            confirm(path)
             functions = load_functions(path, max_memory)
-        elif format_name(path) in FORMATS:
+        else:
             own = _ResponseColumns(columns=given.columns, csv=given.csv)
             content = load(path, own, max_memory)
-            functions = _tabulated(content, own)
-        metadata, _ = parse_metadata(content.metadata | given.constants() | dict(overrides or {}))
+            functions, stated = _tabulated(content, own), content.metadata
+        metadata, _ = parse_metadata(stated | given.constants() | dict(overrides or {}))
         coherences = {f[:2]: f.values.real for f in functions if f.coherence}
-        responses = [f for f in functions if not f.coherence]
-        return tuple(
-            _checked(
-                MeasuredResponse(
-                    f"{label}:{f.output}" if len(responses) > 1 else label,
-                    *(digest, metadata, f.input or "input", f.output, f.frequency, f.values),
-                    coherences.get(f[:2], np.full(f.frequency.size, np.nan)),
-                    f.unit,
-                )
-            )
-            for f in responses
-        )
+        responses = []
+        for f in (f for f in functions if not f.coherence):
+            coherence = coherences.get(f[:2], np.full(f.frequency.size, np.nan))
+            place = label, digest, metadata, f.input or "input", f.output
+            one = MeasuredResponse(*place, f.frequency, f.values, coherence, f.unit)
+            responses.append(_checked(one))
+        if len(responses) > 1:
+            responses = [replace(r, name=f"{label}:{r.output}") for r in responses]
+        return tuple(responses)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
     except Exception as error:
@@ -156,15 +144,12 @@ def _unit(column: str) -> tuple[str, float, str]:
     if per and by not in _PER:
         raise Unusable("unit", f"{column!r} is per {by!r}; needed one of {listed(_PER)}")
     name, factor, unit = of or "response", 1.0, ""
-    if role_of(of) is not None:
-        try:
-            signal = parse_column(of)
-        except Unusable:
-            if per:
-                raise
-        else:
-            units = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
-            name, factor, unit = signal.name, signal.factor, units.get(signal.role, "")
+    try:
+        signal = parse_column(of)
+        name, factor, unit = signal.name, signal.factor, SI_UNITS.get(signal.role, "")
+    except Unusable:
+        if per and role_of(of) is not None:
+            raise
     return name, factor / _PER.get(by, 1.0), f"({unit})/{by[-1].upper()}" if per else unit
 
 
@@ -188,27 +173,20 @@ def from_measured(
 ) -> tuple[Frf, Ordinates]:
     """Return the lines of a band; their noise follows from coherence and number of averages.
 
-    From n averages the variance of H is |H|² (1 - γ²) / ((n - 1) γ²) [Pintelon2012]. Without them
-    it is unknown (zero degrees of freedom), and is that of the residual of the fit.
-
-    Raises
-    ------
-    BadLog
-        If the band holds too few lines, or too many.
+    Without these it is unknown (zero degrees of freedom), and is that of the residual of the fit
+    [Pintelon2012]. `BadLog` if the band holds too few lines, or too many.
     """
     use = (response.frequency >= band[0]) & (response.frequency <= band[1])
-    f, h = response.frequency[use], response.values[use]
-    coherence = response.coherence[use]
+    f, h, coherence = response.frequency[use], response.values[use], response.coherence[use]
     known = averages is not None and bool(np.isfinite(coherence).all())
     fewest = constants.FRF_LINES if known else constants.FRF_LINES_OF_UNKNOWN_NOISE
     if not fewest <= f.size <= constants.FRF_MOST_LINES:
-        hint = "" if known else f" ({constants.FRF_LINES} suffice with coherence and --averages)"
-        raise BadLog(
-            response.name,
-            "band-too-narrow" if f.size < fewest else "band-too-wide",
-            f"{response.output} has {f.size} lines in the band, {use.size} in all; needed {fewest} "
-            f"to {constants.FRF_MOST_LINES}{hint}: choose another band, or measure more lines",
-        )
+        reason = "band-too-narrow" if f.size < fewest else "band-too-wide"
+        needed = f"needed {fewest} to {constants.FRF_MOST_LINES}"
+        if not known:
+            needed += f" ({constants.FRF_LINES} suffice with coherence and --averages)"
+        found = f"{response.output} has {f.size} lines in the band, {use.size} in all; {needed}"
+        raise BadLog(response.name, reason, f"{found}: choose another band, or measure more lines")
     noise, freedom = np.full(f.size, _START * np.mean(np.abs(h) ** 2)), 0.0
     if known and averages is not None:
         at = np.clip(coherence, _ROUNDING, 1 - _ROUNDING)

@@ -28,9 +28,9 @@ _BLOCK = 1 << 14
 def find_period(values: FloatArray, stated: float | None = None) -> float | None:
     """Estimate the period of a signal in samples, in general no whole number; None without one.
 
-    The autocorrelation has a peak at the period and at each multiple. The last one determines the
-    period to a small fraction of a sample. The peak is searched for within 1 % of a stated period,
-    at most half the record; where there is none this is returned.
+    The last peak of the autocorrelation determines it to a small fraction of a sample. The peak is
+    searched for within 1 % of a stated period, at most half the record; where there is none this is
+    returned.
     """
     correlation = _autocorrelation(values)
     n = values.size
@@ -101,11 +101,9 @@ def _refine(correlation: FloatArray, period: int) -> float:
 def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexArray, float]:
     """Transform a record period by period; return harmonics and the period as used, in samples.
 
-    The last period ends with the record. A drift is removed first by the slope between the means of
-    periods, which hold no harmonic; a line fitted to a period would remove part of every harmonic.
-    A period that is no whole number of samples is interpolated onto a grid with a whole number: cut
-    at the nearest sample, every period would leak differently. Amplitudes of the harmonics 0, 1, …
-    have shape ``(n_signals, n_periods, n_harmonics)``: a sine of amplitude A has modulus A.
+    The last period ends with the record. A period that is no whole number of samples is
+    interpolated onto a grid with a whole number. Amplitudes of the harmonics 0, 1, … have shape
+    ``(n_signals, n_periods, n_harmonics)``: a sine of amplitude A has modulus A.
     """
     n = signals[0].size
     whole = round(period)
@@ -124,6 +122,7 @@ def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexAr
 
 
 def _without_drift(periods: FloatArray) -> FloatArray:
+    # A line fitted to a period would remove part of every harmonic; their means hold none.
     n_periods, size = periods.shape
     mean = periods.mean(axis=1)
     slope = np.gradient(mean) if n_periods > 1 else np.zeros(1)

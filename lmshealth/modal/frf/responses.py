@@ -27,8 +27,7 @@ _LEAST_RATIO, _LARGEST_RATIO = 1e-6, 1e6
 def smooth_noise(power: FloatArray, response: FloatArray, width: int) -> FloatArray:
     """Average the power of noise over ``width`` neighbouring lines, and preserve its resonances.
 
-    Forces on the machine excite resonances narrower than the average. The power is divided by the
-    shape a + b |H|² of greatest likelihood for exponential variables, averaged and multiplied;
+    It is divided by the shape a + b |H|² of greatest likelihood for exponential variables first;
     ``response`` is |H|² up to a factor, all of shape ``(n_lines,)``.
     """
     relative = response / response.max()
@@ -72,11 +71,9 @@ class Frf:
     With a periodic excitation ``response`` is the mean output over the mean input, unbiased by
     noise of either. Otherwise it is H1 from spectra of half overlapping blocks.
 
-    Noise of the input reduces H1 by its share of the input's power, most at resonances of a driven
-    structure; noise of the output raises H2, most at antiresonances; Hv lies between them and is
-    unbiased where both have the same share of noise (channels are weighted by their mean power). In
-    a closed loop, where the input contains fed back noise of the output, all three are biased
-    towards the inverse of the feedback. Blocks too short for a resonance flatten it.
+    Noise of the input reduces H1 by its share of the input's power, noise of the output raises H2;
+    Hv is unbiased where both have the same share of noise (channels are weighted by their mean
+    power). In a closed loop all three are biased towards the inverse of the feedback.
 
     Arrays have shape ``(n_lines,)``.
     """
@@ -125,21 +122,14 @@ class Pair:
 def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[Frf, Ordinates]:
     """Average whole periods of ``period`` samples; their scatter is the noise.
 
-    Raises
-    ------
-    BadLog
-        If the record holds less than two periods, too few lines of the band are excited, or the
-        input differs between periods.
+    `BadLog` if the record holds less than two periods, too few lines of the band are excited, or
+    the input differs between periods.
     """
     rate = pair.log.sample_rate
     spectra, period = cut_periods(pair.signals, period)
     if spectra.shape[1] < 2:
-        raise BadLog(
-            pair.log.name,
-            "period",
-            f"{pair.signals[0].size / rate:.4g} s hold less than two whole periods of "
-            f"{period / rate:.4g} s; record longer",
-        )
+        found = f"{pair.signals[0].size / rate:.4g} s hold less than two whole periods of "
+        raise BadLog(pair.log.name, "period", f"{found}{period / rate:.4g} s; record longer")
     frequency: FloatArray = np.arange(spectra.shape[2], dtype=np.float64) * (rate / period)
     inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
     strongest = np.abs(spectra[0]).max()
@@ -191,13 +181,12 @@ def _excited(
     check_lines(pair, int(strong.sum()), band, constants.FRF_LINES)
     excited = np.asarray(strong & (power > constants.CLEARLY_EXCITED * noise))
     if excited.sum() < constants.FRF_LINES:
-        raise BadLog(
-            pair.log.name,
-            "period",
-            f"{pair.names[0]} does not repeat after {period:.4g} s: of its {strong.sum()} lines "
-            f"{excited.sum()} exceed the differences between periods; state another period or "
-            "none, or excite more",
+        lines = (
+            f"of its {strong.sum()} lines {excited.sum()} exceed the differences between periods"
         )
+        step = "state another period or none, or excite more"
+        detail = f"{pair.names[0]} does not repeat after {period:.4g} s: {lines}; {step}"
+        raise BadLog(pair.log.name, "period", detail)
     return excited
 
 
@@ -219,10 +208,7 @@ def _is_transient(answer: ComplexArray) -> bool:
 def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     """Average half overlapping blocks for the response; transform the record for its modes.
 
-    Raises
-    ------
-    BadLog
-        If the band holds too few lines, or too many.
+    `BadLog` if the band holds too few lines, or too many.
     """
     size, rate = pair.signals[0].size, pair.log.sample_rate
     step = rate / size
@@ -271,15 +257,10 @@ def check_lines(pair: Pair, n: int, band: tuple[float, float], fewest: int) -> N
     """Refuse a band with too few excited lines, or too many."""
     where = f"between {band[0]:.4g} and {band[1]:.4g} Hz"
     if n < fewest:
-        raise BadLog(
-            pair.log.name,
-            "not-excited" if n <= 0 else "band-too-narrow",
-            f"{pair.names[0]} excites {max(n, 0)} lines {where}; needed are at least {fewest}: "
-            "choose a wider band, or record longer (a longer period has more lines)",
-        )
+        reason = "not-excited" if n <= 0 else "band-too-narrow"
+        found = f"{pair.names[0]} excites {max(n, 0)} lines {where}; needed are at least {fewest}"
+        step = "choose a wider band, or record longer (a longer period has more lines)"
+        raise BadLog(pair.log.name, reason, f"{found}: {step}")
     if n > constants.FRF_MOST_LINES:
-        raise BadLog(
-            pair.log.name,
-            "band-too-wide",
-            f"{n} lines {where}, at most {constants.FRF_MOST_LINES} are fitted; choose a band",
-        )
+        detail = f"{n} lines {where}, at most {constants.FRF_MOST_LINES} are fitted; choose a band"
+        raise BadLog(pair.log.name, "band-too-wide", detail)
