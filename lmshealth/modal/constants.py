@@ -103,6 +103,8 @@ EXCITED, CLEARLY_EXCITED = 0.2, 30.0
 # fitted; and those of a measured response whose noise is unknown, twice the unknowns of one mode.
 FRF_LINES, FRF_LINES_OF_RECORD, FRF_MOST_LINES = 16, 64, 20_000
 FRF_LINES_OF_UNKNOWN_NOISE = 34
+# Variance of unknown noise from which a fit starts, over the power of the answer.
+UNKNOWN_NOISE = 1e-4
 # Probability that the first of several equal periods is taken for a transient.
 TRANSIENT = 1e-3
 # Probability that noise alone makes an outlier, and the largest share of lines that may be ones.
@@ -145,8 +147,6 @@ DOUBLE_WITHIN, SECOND_HIT = 0.25, 0.05
 WEAK_BLOW = 0.1
 # Most lines of a blow: decays are cut accordingly, which does not bias their poles.
 BLOW_LINES = 3000
-# Variance of unknown noise from which the fit of one blow starts, over the power of the answer.
-BLOW_NOISE = 1e-4
 
 # Free decays
 

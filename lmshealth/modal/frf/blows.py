@@ -99,7 +99,7 @@ def from_blows(
     frequency, given, spectra = frequency[inside], given[inside], spectra[:, :, inside]
     cross = np.sum(spectra[1] * spectra[0].conj(), axis=0)
     answer, total = cross / given, np.sum(np.abs(spectra[1]) ** 2, axis=0)
-    noise, freedom = constants.BLOW_NOISE * total, 0.0
+    noise, freedom = constants.UNKNOWN_NOISE * total, 0.0
     if known:
         scatter = np.maximum(total - np.abs(answer) ** 2, 0.0) / (n_blows - 1)
         noise, freedom = average_noise(scatter, answer / given, n_blows - 1)

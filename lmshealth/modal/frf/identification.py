@@ -176,12 +176,11 @@ def _identify(
 
 
 def _channel(log: Log, name: str) -> Channel:
-    for channel in log.channels:
-        if channel.name == name:
-            return channel
-    available = [channel.name for channel in log.channels]
+    usable = {channel.name: channel for channel in log.channels}
+    if name in usable:
+        return usable[name]
     why = "".join(f"; {name} was refused: {r.detail}" for r in log.refused if r.channel == name)
-    raise BadLog(log.name, "channel", f"no usable channel {name!r}; available {available}{why}")
+    raise BadLog(log.name, "channel", f"no usable channel {name!r}; available {[*usable]}{why}")
 
 
 def _longest_segment(log: Log, channels: tuple[Channel, Channel]) -> tuple[FloatArray, FloatArray]:
@@ -331,18 +330,16 @@ def _why_none(frf: Frf, fit: ResponseFit) -> Rejection:
     """Return why no mode is found in a response that the fit does not miss."""
     low, high = frf.frequency[[0, -1]]
     share, most = _noise_share(fit), constants.FRF_MISSED
+    more = share / most
     none = f"no resonance between {low:.4g} and {high:.4g} Hz from {frf.input}"
     if share <= most:
         return Rejection("not-excited", none)
     few, n, _ = _too_few(frf, fit)
     if n < constants.LINES_OF_MODE and not fit.ordinates.scatter:
         return Rejection("too-few-lines", f"{none}: {few}")
-    return Rejection(
-        "noise",
-        f"{none}: noise is {100 * share:.0f} % of the response and hides modes above "
-        f"{100 * most:.0f} %; record "
-        f"{(share / most) ** 2:.1f} times as long, or excite {share / most:.1f} times as much",
-    )
+    found = f"noise is {100 * share:.0f} % of the response and hides modes above {100 * most:.0f} %"
+    step = f"record {more**2:.1f} times as long, or excite {more:.1f} times as much"
+    return Rejection("noise", f"{none}: {found}; {step}")
 
 
 def _noise_share(fit: ResponseFit) -> float:
@@ -368,11 +365,10 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
     if unresolved := _unresolved(frf, fit.ordinates, f, zeta):
         return unresolved
     if fit.over_distortion[i] < constants.OVER_DISTORTION:
-        return Rejection(
-            "distorted",
-            f"its power is {fit.over_distortion[i]:.2g} times that of the distortion around it, "
-            f"needed {constants.OVER_DISTORTION:g}: a nonlinearity may look the same; excite less",
-        )
+        found = f"its power is {fit.over_distortion[i]:.2g} times that of the distortion around it"
+        step = "a nonlinearity may look the same; excite less"
+        detail = f"{found}, needed {constants.OVER_DISTORTION:g}: {step}"
+        return Rejection("distorted", detail)
     if std_f > constants.WORST_STD_LN_F or std_zeta > constants.WORST_STD_LN_ZETA:
         found = f"standard deviation {100 * std_f:.2g} %, damping {100 * std_zeta:.0f} %"
         return Rejection("too-uncertain", f"{found}; record longer or excite more")
@@ -387,11 +383,9 @@ def _unresolved(frf: Frf, ordinates: Ordinates, f: float, zeta: float) -> Reject
         # Over several blows the phase of a line is random.
         if ordinates.scatter or fades >= constants.LEAST_FADING:
             return None
-        return Rejection(
-            "line-not-mode",
-            f"it fades by {100 * fades:.0f} % in {1 / spacing:.3g} s after the blow, needed "
-            f"{100 * constants.LEAST_FADING:.0f} %: strike several times, or record longer",
-        )
+        found = f"it fades by {100 * fades:.0f} % in {1 / spacing:.3g} s after the blow"
+        detail = f"{found}, needed {100 * constants.LEAST_FADING:.0f} %"
+        return Rejection("line-not-mode", f"{detail}: strike several times, or record longer")
     if ordinates.periodic:
         reach = constants.BANDWIDTHS_OF_LINES * zeta * f
         n = int(np.count_nonzero(np.abs(ordinates.frequency - f) <= reach))

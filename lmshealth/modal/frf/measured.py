@@ -32,8 +32,6 @@ _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
 _PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
 _ROUNDING = 1e-9
-# Variance of unknown noise from which a fit starts, over the power of the response.
-_START = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -187,7 +185,7 @@ def from_measured(
             needed += f" ({constants.FRF_LINES} suffice with coherence and --averages)"
         found = f"{response.output} has {f.size} lines in the band, {use.size} in all; {needed}"
         raise BadLog(response.name, reason, f"{found}: choose another band, or measure more lines")
-    noise, freedom = np.full(f.size, _START * np.mean(np.abs(h) ** 2)), 0.0
+    noise, freedom = np.full(f.size, constants.UNKNOWN_NOISE * np.mean(np.abs(h) ** 2)), 0.0
     if known and averages is not None:
         at = np.clip(coherence, _ROUNDING, 1 - _ROUNDING)
         noise = np.abs(h) ** 2 * (1 - at) / (at * (averages - 1))

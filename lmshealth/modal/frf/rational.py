@@ -1,9 +1,7 @@
 """Rational transfer function with modes: likelihood at the lines of a band, and search of poles.
 
-H(s) = Σ R/(s - p) + R*/(s - p*) + Σ a_k s^k with real a_k: powers of s represent modes outside the
-band. A record that is not periodic responds with Y = H U + T, a transient T of the same poles.
-Errors are circular normal. Residues and powers are linear and solved for; only ln f and ln ζ are
-searched (variable projection).
+The model is that of the README of the folder. Residues and powers are linear and solved for; only
+ln f and ln ζ are searched (variable projection).
 """
 
 from __future__ import annotations
@@ -88,8 +86,8 @@ class Order:
 
     def with_mode(self, f: float, zeta: float) -> Order:
         """Add a mode at a frequency in Hz."""
-        ln_f, ln_zeta = np.split(self.theta, 2)
-        return replace(self, theta=np.concatenate([ln_f, [np.log(f)], ln_zeta, [np.log(zeta)]]))
+        n = self.n_modes
+        return replace(self, theta=np.insert(self.theta, [n, 2 * n], np.log([f, zeta])))
 
     def without_mode(self, i: int) -> Order:
         """Remove a mode."""
@@ -210,8 +208,7 @@ def vector_fit(ordinates: Ordinates, order: Order, n_modes: int) -> Order:
     """Return an order with start values of modes from the response alone [Gustavsen1999].
 
     With σ = 1 + Σ c/(s - p), the equation σ H = Σ r/(s - p) + Σ a_k s^k is linear in c, r and a;
-    the zeros of σ are the next poles p. They converge from poles spread over the band, however few
-    lines a resonance has. Real poles are dropped.
+    the zeros of σ are the next poles p. Real poles are dropped.
     """
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     s = 1j * ordinates.frequency / centre

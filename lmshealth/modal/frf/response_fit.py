@@ -22,10 +22,9 @@ from lmshealth.modal.frf.rational import (
 from lmshealth.modal.frf.responses import smooth_noise
 from lmshealth.modal.modes import paired
 
-# Powers of s, downwards and upwards. Modes outside the band, too weak for a power to be
-# significant, bias those inside by up to one standard deviation with four powers, by half of one
-# with six, which costs a few percent of it. Powers enter in pairs: an even one for elasticity, an
-# odd one for loss.
+# Powers of s, downwards and upwards. Weak modes outside the band bias those inside by up to one
+# standard deviation with four powers, by half of one with six. Powers enter in pairs: an even one
+# for elasticity, an odd one for loss.
 FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # Lines over which the noise of a record that is not periodic is averaged.
 _NOISE_LINES = 41
@@ -44,9 +43,8 @@ _PRIOR_STD = 10.0
 class ResponseFit(ReadOnly):
     """A rational transfer function with its uncertainty, modes ascending in frequency.
 
-    ``chi_square`` is the mean squared error over the variance of the noise, per degree of freedom:
-    about one where the response is rational but for noise, NaN without periods, as the noise is
-    unknown.
+    ``chi_square`` is the squared error over the variance of the noise per degree of freedom: about
+    one where the response is rational but for noise, NaN where the noise is unknown.
     """
 
     # Lines of the fit, without outliers. Noise that was unknown before is that of the residual.
@@ -155,9 +153,9 @@ class _State:
         return float((order.n_modes - heavy) * modes + background)
 
 
-def _gain(larger: _State, smaller: _State) -> float:
+def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> float:
     """Return the gain of the larger of two models, less its penalty."""
-    return smaller.cost - larger.cost - larger.penalty + smaller.penalty
+    return (smaller.cost - larger.cost) / dependent_lines - larger.penalty + smaller.penalty
 
 
 def _settle(ordinates: Ordinates, order: Order, variance: FloatArray, rounds: int = 2) -> _State:
@@ -320,13 +318,10 @@ def _shrink(state: _State) -> _State:
             _settle(state.ordinates, state.order.without_mode(i), state.variance)
             for i in range(state.order.n_modes)
         ]
-        losses = [
-            (t.cost - state.cost) / state.dependent_lines - state.penalty + t.penalty
-            for t in trials
-        ]
-        if min(losses) > 0:
+        gains = [_gain(state, trial, state.dependent_lines) for trial in trials]
+        if min(gains) > 0:
             break
-        state = trials[int(np.argmin(losses))]
+        state = trials[int(np.argmin(gains))]
     return state
 
 

@@ -137,8 +137,7 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     stray = _stray((spectra / gain)[:, spectra.shape[1] > 2 :])
     frequency = frequency[inside]
     spectra = spectra[:, :, inside] / pair.gain(frequency)
-    if _is_transient(spectra[1]):
-        spectra = spectra[:, 1:]
+    spectra = spectra[:, int(_is_transient(spectra[1])) :]
     n = spectra.shape[1]
     excited = _excited(pair, spectra[0], strongest, period / rate, band)
     frequency, spectra = frequency[excited], spectra[:, :, excited]
@@ -215,11 +214,9 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
     check_lines(pair, last - first + 1, band, constants.FRF_LINES_OF_RECORD)
     lines: FloatArray = np.arange(first, last + 1, dtype=np.float64) * step
-    given, answer = (
-        np.asarray(fft.rfft(x - x.mean())[first : last + 1], dtype=np.complex128)
-        / (size / 2 * pair.gain(lines))
-        for x in pair.signals
-    )
+    scale = size / 2 * pair.gain(lines)
+    whole = (np.asarray(fft.rfft(x - x.mean()), dtype=np.complex128) for x in pair.signals)
+    given, answer = (spectrum[first : last + 1] / scale for spectrum in whole)
     length = size // _BLOCKS
     # Of two half overlapping Hann windows the spectra correlate by 1/6.
     n = (2 * size / length - 1) / (1 + 2 / 6**2)
