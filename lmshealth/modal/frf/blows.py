@@ -105,11 +105,10 @@ def from_blows(
         noise, freedom = average_noise(scatter, answer / given, n_blows - 1)
     h1, h2, hv, coherence = estimates(given**2 / n_blows, total / n_blows, cross / n_blows)
     coherence = coherence if known else np.full(frequency.size, np.nan)
-    std, nan = np.sqrt(noise) / given, float("nan")
-    frf = Frf(
-        *pair.names, frequency, h1, std, h1, h2, hv, coherence, nan, n_blows, method="blows",
-        note=f"{n_blows} of {len(blows)} blows, {size / rate:.4g} s of each.",
-    )  # fmt: skip
+    std = np.sqrt(noise) / given
+    note = f"{n_blows} of {len(blows)} blows, {size / rate:.4g} s of each."
+    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, n_blows, method="blows",
+              note=note)  # fmt: skip
     ordinates = Ordinates(frequency, given + 0j, answer, noise, freedom, known, at_rest=True)
     return frf, ordinates, refused
 

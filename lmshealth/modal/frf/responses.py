@@ -87,8 +87,8 @@ class Frf:
     h2: ComplexArray
     hv: ComplexArray
     coherence: FloatArray  # over periods or blocks, 0 to 1
-    period: float  # of the excitation in s; NaN where it is not periodic
     n_averages: float  # periods, or equivalent number of independent blocks
+    period: float = float("nan")  # of the excitation in s; NaN where it is not periodic
     # Amplitude of the output beyond noise at harmonics without input over that at excited ones:
     # nonlinear. NaN where the excitation is not periodic or excites all harmonics.
     stray: float = float("nan")
@@ -152,7 +152,7 @@ def from_periods(pair: Pair, band: tuple[float, float], period: float) -> tuple[
     cross = np.mean(spectra[1] * spectra[0].conj(), axis=0)
     h1, h2, hv, coherence = estimates(power[0], power[1], cross)
     std = np.sqrt(noise) / np.abs(given)
-    frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, period / rate, n, stray)
+    frf = Frf(*pair.names, frequency, response, std, h1, h2, hv, coherence, n, period / rate, stray)
     return frf, Ordinates(frequency, given, answer, noise, freedom, periodic=True)
 
 
@@ -231,8 +231,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     h1, h2, hv, coherence = estimates(power_in, power_out, cross[inside] * weight)
     unexplained = np.maximum(1 - coherence, _ROUNDING) * power_out * n / (n - 1)
     std = np.sqrt(unexplained / (n * power_in))
-    nan = float("nan")
-    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, nan, n, method="segments")
+    frf = Frf(*pair.names, frequency, h1, std, h1, h2, hv, coherence, n, method="segments")
     noise = np.interp(lines, frequency, unexplained) * (2 * step)
     return frf, Ordinates(lines, given, answer, noise, n - 1, periodic=False)
 
