@@ -28,8 +28,9 @@ SURE_NAME = 0.95
 # share of the search; and scales of ln ζ and of 1 - MAC about the described values.
 NO_SHIFT, DAMPING_PRIOR, SHAPE_PRIOR = 1 / 10, 0.5, 0.1
 # What shows that described modes do not explain the spectra: ratio by which a peak exceeds both
-# sides, and factor between the damping found and described from which a mode may stand for two.
-PEAK_RATIO, WIDE = 1.2, 2.0
+# sides, its gain in log likelihood, and factor between the damping found and described from which a
+# mode may stand for two.
+PEAK_RATIO, PEAK_GAIN, WIDE = 1.1, 40.0, 2.0
 # Differences from the description that search and map do not explain: of frequency, factor of
 # damping (beyond two standard deviations), and modal assurance criterion.
 OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8

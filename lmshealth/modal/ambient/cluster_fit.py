@@ -203,7 +203,7 @@ def shows_more(binned: BinnedSpectra, known: Sequence[Target], targets: Sequence
     mean, far = uniform_filter1d(binned.level, 3, axis=1), _SIDE_BINS
     sides = np.maximum(mean[:, : -2 * far], mean[:, 2 * far :])
     peak = (mean[:, far:-far] > constants.PEAK_RATIO * sides).any(axis=0)
-    peak &= _PEAK_BINS * uniform_filter1d(gain, _PEAK_BINS)[far:-far] > constants.PRESENT
+    peak &= _PEAK_BINS * uniform_filter1d(gain, _PEAK_BINS)[far:-far] > constants.PEAK_GAIN
     peaks = frequency[far:-far][peak]
     peaks = peaks[(np.abs(peaks[:, None] - f) > 2 * zeta * f).all(axis=1)]
     return any(is_near(target, x) for target in targets for x in peaks.tolist())
