@@ -31,6 +31,9 @@ NO_SHIFT, DAMPING_PRIOR, SHAPE_PRIOR = 1 / 10, 0.5, 0.1
 # sides, its gain in log likelihood, and factor between the damping found and described from which a
 # mode may stand for two.
 PEAK_RATIO, PEAK_GAIN, WIDE = 1.1, 40.0, 2.0
+# Ordinates in the narrowest half-power bandwidth described from which on resonances that have no
+# description are searched for: in shorter segments what masking left of a line resembles a mode.
+SEARCHABLE = 20.0
 # Differences from the description that search and map do not explain: of frequency, factor of
 # damping (beyond two standard deviations), and modal assurance criterion.
 OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8

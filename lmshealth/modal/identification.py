@@ -187,7 +187,8 @@ def read_ambient(
     modes = merge([one.modes for one in found], lines, (*log.refused, *refused), shown)
     modes = numbered(modes) if stage is None else modes
     reading = AmbientReading(modes, whole, fitted, tuple(rejected), sought)
-    if stage is None or not more:
+    widths = [2 * target.damping_ratio * target.frequency for target in targets]
+    if stage is None or not more or whole.duration * min(widths) < constants.SEARCHABLE:
         return reading
     return _with_undescribed(log, reading, known, targets, channels)
 

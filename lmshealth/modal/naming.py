@@ -235,7 +235,8 @@ def _refuse_unnamed(
             f"a resonance at {f:.5g} Hz, damping {100 * zeta:.2g} %, is not clearly any described "
             "mode: describe it, or correct the description"
         )
-        refused.append(Refusal(log, "undescribed", detail, frequency=f))
+        name = f"{f:.5g} Hz"
+        refused.append(Refusal(log, "undescribed", detail, mode=name, frequency=f))
     return tuple(refused)
 
 

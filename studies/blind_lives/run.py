@@ -51,9 +51,9 @@ NAMES = {
 }
 
 N_LIVES, IN_ARCHIVE = 100, 10
-# A sound one, and one with too few logs.
+# A sound one, and one with too few logs. In X a mains line would take the name of roll.
 QUICK = (
-    BlindPlan("lms-x", "temperature-only", 5, 3.0, 61),
+    BlindPlan("lms-y", "temperature-only", 5, 3.0, 61),
     BlindPlan("lms-x", "preload-wear", 2, 3.0, 63, until="failure"),
 )
 PROGRAMS = ("lmshealth.__main__",)

@@ -323,7 +323,7 @@ def _update(
 
 def _gains(data: BandData, e: ComplexArray, b: ComplexArray) -> tuple[FloatArray, FloatArray]:
     """Return the gain in log likelihood by each candidate, and its strength."""
-    gb = np.linalg.solve(e, b)
+    gb = np.linalg.inv(e) @ b
     r = np.einsum("kac,kac->ck", b.conj(), gb).real
     q = np.einsum("kac,kab,kbc->ck", gb.conj(), data.matrix, gb, optimize=True).real
     x = 10.0 ** np.arange(-2, 5, 0.25)[:, None, None] / r.max(axis=1)[:, None]
