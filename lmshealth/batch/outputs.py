@@ -5,25 +5,26 @@ Memory holds rows of the index and the machines in progress, however many machin
 
 from __future__ import annotations
 
-import pickle
+import csv
 import threading
+from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import Self
-
-import pandas as pd
+from typing import IO, Self
 
 from lmshealth._files import replacing, write_text
 from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
+from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.changes import Reported
 from lmshealth.report.machine_page import Page, make_page
-from lmshealth.report.tables import COLUMNS, frame, machine_tables
+from lmshealth.report.tables import COLUMNS, Row, frame, machine_tables, refused_rows
 from lmshealth.tracking.history import sort_by_time
 
 # matplotlib's settings are shared by the threads of a Dask worker.
@@ -46,11 +47,28 @@ class MachineRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineOutput:
-    """Page and tables of a machine, and the logs that were excluded from its life."""
+    """Page and table rows of a machine, and the logs that were excluded from its life."""
 
     page: Page
-    tables: dict[str, pd.DataFrame]  # those with rows, by their names
+    tables: dict[str, CsvRows]
     excluded: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class CsvRows:
+    """Rows of a table as CSV without a header, and their columns."""
+
+    columns: tuple[str, ...]
+    n_rows: int
+    text: str
+
+    @classmethod
+    def of(cls, name: str, rows: Sequence[Row]) -> Self:
+        """Encode rows of a table."""
+        table = frame(COLUMNS[name], rows)
+        # With this line terminator a cell that contains CR or LF is quoted.
+        text = table.to_csv(index=False, header=False, lineterminator="\r\n")
+        return cls(tuple(table.columns), len(rows), text)
 
 
 def machine_output(record: MachineRecord) -> MachineOutput | None:
@@ -64,7 +82,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     rows = machine_tables(readings, found) if readings else {}
     return MachineOutput(
         page=page,
-        tables={name: frame(COLUMNS[name], own) for name, own in rows.items() if own},
+        tables={name: CsvRows.of(name, own) for name, own in rows.items() if own},
         excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
     )
 
@@ -95,40 +113,53 @@ class Tables:
 
     def __init__(self, folder: Path, machines: Sequence[str]) -> None:
         self._folder = folder
-        self._order = (None, *machines)  # what belongs to no machine comes first
-        self._places: dict[str | None, int] = {}
+        self._turns = deque(machines)
+        self._early: dict[str, Mapping[str, CsvRows]] = {}
+        self._stack = ExitStack()
+        self._files: dict[str, IO[str]] = {}
+        self._columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
 
     def __enter__(self) -> Self:
-        self._file = TemporaryFile(dir=self._folder)
+        for name in COLUMNS:
+            file = TemporaryFile("w+", encoding="utf-8", newline="", dir=self._folder)
+            self._files[name] = self._stack.enter_context(file)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._file.close()
+        self._stack.close()
 
-    def add(self, machine: str | None, tables: Mapping[str, pd.DataFrame]) -> None:
-        """Add rows of a machine, or of none, once."""
-        self._places[machine] = self._file.tell()
-        pickle.dump(tables, self._file)
+    def add(self, machine: str, parts: Mapping[str, CsvRows]) -> None:
+        """Add the rows of a machine."""
+        self._early[machine] = parts
+        while self._turns and self._turns[0] in self._early:
+            self._append(self._early.pop(self._turns.popleft()))
 
-    def _parts(self) -> Iterator[dict[str, pd.DataFrame]]:
-        """Read back the tables of all machines."""
-        for machine in self._order:
-            if machine in self._places:
-                self._file.seek(self._places[machine])
-                yield pickle.load(self._file)
+    def _append(self, parts: Mapping[str, CsvRows]) -> None:
+        for name, part in parts.items():
+            self._columns[name] |= dict.fromkeys(part.columns)
+            csv.writer(self._files[name]).writerow([part.n_rows, *part.columns])
+            self._files[name].write(part.text)
+
+    def add_refused(self, refused: Iterable[Refusal]) -> None:
+        """Add refusals that belong to no machine."""
+        self._append({"refused": CsvRows.of("refused", refused_rows(refused))})
 
     def write(self) -> None:
         """Replace the tables in the folder."""
-        columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
-        for part in self._parts():
-            for name, table in part.items():
-                columns[name] |= dict.fromkeys(table.columns)
-        with ExitStack() as stack:
-            files = {}
-            for name, own in columns.items():
-                files[name] = stack.enter_context(replacing(self._folder / f"{name}.csv"))
-                pd.DataFrame(columns=list(own)).to_csv(files[name], index=False)
-            for part in self._parts():
-                for name, table in part.items():
-                    rows = table.reindex(columns=list(columns[name]))
-                    rows.to_csv(files[name], index=False, header=False)
+        for machine in self._turns:  # after a machine that was never added
+            self._append(self._early.pop(machine, {}))
+        for name, file in self._files.items():
+            file.seek(0)
+            with replacing(self._folder / f"{name}.csv") as target:
+                columns = list(self._columns[name])
+                writer = csv.DictWriter(target, columns, restval="", lineterminator="\n")
+                writer.writeheader()
+                writer.writerows(_rows(file))
+
+
+def _rows(file: IO[str]) -> Iterator[dict[str, str]]:
+    """Read back the rows of all parts."""
+    reader = csv.reader(file)
+    for n_rows, *columns in reader:
+        for row in islice(reader, int(n_rows)):
+            yield dict(zip(columns, row, strict=True))

@@ -21,7 +21,6 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.assessment import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
-from lmshealth.report.tables import COLUMNS, frame, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
 
@@ -245,7 +244,7 @@ def _report(
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
     with Tables(out, names) as tables:
-        tables.add(None, {"refused": frame(COLUMNS["refused"], refused_rows(refused))})
+        tables.add_refused(refused)
         left = list(machines)
         for attempt in range(constants.ASSESSMENT_ATTEMPTS):
             if attempt:

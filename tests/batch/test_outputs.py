@@ -6,13 +6,12 @@ import csv
 from pathlib import Path
 from typing import Any
 
-import pandas as pd
 import pytest
 
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.outputs import MachineRecord, Tables, machine_output
+from lmshealth.batch.outputs import CsvRows, MachineRecord, Tables, machine_output
 from lmshealth.io.log import Refusal
-from lmshealth.report.tables import COLUMNS, frame, refused_rows
+from lmshealth.report.tables import COLUMNS
 from tests.assessments import worn
 
 
@@ -22,10 +21,9 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def effect(mode: str, **more: Any) -> pd.DataFrame:
+def effect(mode: str, **more: Any) -> CsvRows:
     """Give a row of effects.csv."""
-    row = {"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}
-    return frame(COLUMNS["effects"], [row])
+    return CsvRows.of("effects", [{"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}])
 
 
 def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
@@ -72,8 +70,7 @@ def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
 def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
     """Refused logs are listed, and tables without rows have their headers."""
     with Tables(tmp_path, []) as tables:
-        refused = refused_rows([Refusal("a.h5", "empty", "0 bytes")])
-        tables.add(None, {"refused": frame(COLUMNS["refused"], refused)})
+        tables.add_refused([Refusal("a.h5", "empty", "0 bytes")])
         tables.write()
     assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
     for name, columns in COLUMNS.items():
