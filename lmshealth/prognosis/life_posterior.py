@@ -121,6 +121,7 @@ class ScenarioPosterior:
 
     density: LifeDensity
     probability: float  # posterior probability of the scenario
+    evidence_std: float  # relative standard deviation of its evidence
     coordinates: FloatArray  # draws, shape ``(n_ensembles, n_draws, n_dim)``
     # ess_bulk, ess_tail, r_hat: as in `Health`, of the coordinates, shape ``(n_dim,)``; after
     # importance sampling the effective sample size, and NaN for R-hat.
@@ -425,6 +426,7 @@ def _sampled_scenarios(
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
+            evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
             coordinates=coordinates,
             ess_bulk=draws.ess_bulk,
             ess_tail=draws.ess_tail,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lmshealth.modal import identification
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
 from lmshealth.signal import spectra
@@ -252,6 +253,8 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
                 "remove_sinusoids",
                 lambda raw, *_: (raw, np.ones(len(raw), dtype=bool), ()),
             )
+            # A search for undescribed resonances would find the mode beside the line.
+            patch.setattr(identification, "shows_more", lambda *_: False)
             left_in = find(values + line)
         assert not left_in.names or moved(left_in, clean) > 1
 
