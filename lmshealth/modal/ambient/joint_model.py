@@ -16,9 +16,9 @@ from lmshealth.modal.ambient.whittle import receptance, response
 _LEAST_GAIN, _HALVINGS = 0.3, 5
 # Median of the square of a normal variable.
 _MEDIAN_SQUARE = 0.455
-# Of silent channels and of such without noise, in units of the median density of a channel: smaller
-# ones would leave few digits to the inverse of the expectation.
-LEAST_FLOOR = 1e-8
+# In units of the median density of a channel. Channels of hardly any noise would else be judged by
+# the errors of the model, and the selection of modes by the rounding of the processor.
+LEAST_FLOOR = 1e-4
 
 
 @dataclass(frozen=True, slots=True, eq=False)
