@@ -317,7 +317,7 @@ def margin_record(case: Case) -> dict[str, Any]:
 def cases(stage: str, condition: Condition = NOMINAL) -> list[Case]:
     """Return the loops of a stage: three readings and the printed product, rigid and flexible.
 
-    A full stage has the loop of its drive alone: the equations say nothing of its lag.
+    A full stage has the loop of its drive alone: the equations have no lag.
 
     Raises
     ------

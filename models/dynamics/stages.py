@@ -250,7 +250,7 @@ def _bending(name: str, body: int, length: float, stiffness: float) -> FreeBeam:
 def _load(name: str, bends: int, parity: int, mass: float, stiffness: float) -> Overhang:
     """Return the load as a bar that overhangs on both sides, across its length alike or not.
 
-    In X it lies across the feed, in Y along it, as the calibrated spreads of the load say.
+    In X it lies across the feed, in Y along it, by the calibrated spreads of the load.
     """
     root, reach = Point((0.0, 0.0, 0.14), "m", "our choice"), Number(0.3, "m", "our choice")
     kilograms, spring = Number(mass, "kg", "our choice"), Number(stiffness, "N m²", "calibrated")
@@ -260,7 +260,7 @@ def _load(name: str, bends: int, parity: int, mass: float, stiffness: float) -> 
 
 
 # Housing: aluminium, 0.60 m long, base plate 20 mm and two walls 12 x 60 mm, 70 GPa.  Granite: a
-# block 0.30 m high and 1.0 m wide, 55 GPa, as long as its spread along the feed says.
+# block 0.30 m high and 1.0 m wide, 55 GPa, of the length that its spread along the feed gives.
 # Masses of the attached parts: our choice; resonances of Table 2 that X and Y have alike (255 and
 # 271 Hz, 317 and 341 Hz, 742 and 794 Hz, 923 and 927 Hz) are those of parts that they share.
 _HOUSING = _bending("housing_bending", HOUSING, 0.60, 1.5e5)

@@ -284,7 +284,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     grown = {plant: grown_rows(answer[plant]["growing_with_velocity"]) for plant in tables.PLANTS}
     named, others, count = grown["full"]
     yield Claim(
-        "frequencies said to grow with velocity that do (Figure 18)",
+        "frequencies that grow with velocity in the paper and here (Figure 18)",
         f"{named} of {count}",
         "",
         f"rigid: {grown['rigid'][0]} of {count}; 12 asked; {others} other rows grow as well "
