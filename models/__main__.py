@@ -6,6 +6,7 @@ import json
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from models.dynamics.mode_shapes import body_motions, participation, strain_ener
 from models.dynamics.plant import SENSORS, closed_loop_modes
 from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.errors import ModelError
-from models.lives.degradation import LIVES
 from models.lives.faults import FAULTS
+from models.lives.further_lives import ALL_LIVES
 from models.lives.simulation import UNTIL, Plan, simulate_life
+from models.recordings.effects import EFFECTS
 from models.recordings.formats import WRITERS, format_of, write_log
 from models.recordings.machines import machine_identity, stream
 from models.recordings.recording import signal_to_noise
@@ -68,6 +70,13 @@ def _format_option(
     return click.option("--format", "file_format", type=kinds, default=default, show_default=True)
 
 
+_effects_option = click.option(
+    "--effects",
+    type=click.Choice(list(EFFECTS)),
+    default="linear",
+    show_default=True,
+    help="disturbed: gusts, hits, bumps, cage orders; full: friction and limits of the drive too.",
+)
 _shown_as = _format_option(("table", "json"), "table")
 _written_as = _format_option(tuple(WRITERS), "hdf5")
 
@@ -210,10 +219,20 @@ def map_command(stage: str, out: Path) -> None:
 
 @cli.command(epilog=_epilog("simulate"))
 @click.argument("stage")
-@click.option("--life", required=True, help=f"Name of the life: {', '.join(LIVES)}.")
+@click.option(
+    "--life",
+    default=None,
+    help=f"Name of the life: {', '.join(ALL_LIVES)}. With --plant-seed alone it is drawn.",
+)
 @click.option("--logs", type=int, required=True, help="Count of logs.")
 @click.option("--seconds", type=float, default=20.0, show_default=True, help="Length of each.")
-@click.option("--seed", type=int, default=0, show_default=True)
+@click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
+@click.option(
+    "--plant-seed",
+    type=click.IntRange(0),
+    default=None,
+    help="Draw the machine: geometry, joints, wear, sensors, wander. Without it, the nominal one.",
+)
 @click.option(
     "--until",
     type=click.Choice(UNTIL),
@@ -230,28 +249,39 @@ def map_command(stage: str, out: Path) -> None:
 )
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
 @_written_as
+@_effects_option
 @click.option(
     "--workers", type=int, default=None, help="Processes; without it 2 where there are 2 cores."
 )
 def simulate(
     stage: str,
-    life: str,
+    life: str | None,
     logs: int,
     seconds: float,
     seed: int,
+    plant_seed: int | None,
     until: str,
     faults: tuple[str, ...],
     out: Path,
     file_format: str,
+    effects: str,
     workers: int | None,
 ) -> None:
     """Write a life of STAGE: logs, manifest.csv, maintenance.csv and truth.csv.
 
     truth.csv has the true condition and every mode's closed-loop frequency and damping at each
-    log, and the odometers at which the limits are crossed, whether or not the logs go that far.
-    The seed alone draws the laws: with --until failure the same life is seen to its end.
+    log, the effects, and the odometers at which the limits are crossed, whether or not the logs go
+    that far.
+
+    The seed alone draws the laws: with --until failure the same life is seen to its end. With
+    --plant-seed that one draws the machine and its laws, and --seed the rest; truth.csv then has
+    every number that was drawn.
     """
-    plan = Plan(stage, life, logs, seconds, seed, file_format, until, faults)
+    if life is None and plant_seed is None:
+        needed = "the name of a life, or --plant-seed N, whose life is 'drawn'"
+        raise click.UsageError(f"--life is missing; needed: {needed}")
+    life = life or "drawn"
+    plan = Plan(stage, life, logs, seconds, seed, file_format, until, faults, plant_seed, effects)
     count = min(2, os.cpu_count() or 1) if workers is None else workers
     _with_progress(logs, lambda advance: simulate_life(plan, out, workers=count, progress=advance))
 
@@ -271,6 +301,7 @@ def simulate(
     help="Velocity of the move, mm/s; lowered to what the travel allows for so long.",
 )
 @_condition_options
+@_effects_option
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", type=click.Path(dir_okay=False, path_type=Path), required=True)
 @_format_option(tuple(WRITERS), None)
@@ -292,6 +323,7 @@ def sweep(stage: str, out: Path, file_format: str | None, **options: Any) -> Non
         seconds=options["seconds"],
         velocity=options["velocity"] * 1e-3,
         rng=stream(stage, options["seed"], "sweep"),
+        effects=EFFECTS[options["effects"]],
     )
     identity = machine_identity(machine, options["seed"])
     write_log(recording.described(stage=identity), out, chosen)
@@ -312,6 +344,7 @@ def sweep(stage: str, out: Path, file_format: str | None, **options: Any) -> Non
 @click.option("--dwell", default=0.5, show_default=True, help="Standstill after a stroke, s.")
 @click.option("--seconds", default=WINDOW_S, show_default=True, help="Length of each log.")
 @_condition_options
+@_effects_option
 @click.option("--seed", type=click.IntRange(0), default=0, show_default=True)
 @click.option("--out", type=click.Path(file_okay=False, path_type=Path), required=True)
 @_written_as
@@ -326,6 +359,7 @@ def velocities(
     condition = Condition(options["preload"], options["mount"])
     sizes = (options[name] for name in ("strokes", "dwell", "seconds", "seed"))
     experiment = Experiment(stage_named(stage), condition, *sizes)
+    experiment = replace(experiment, effects=EFFECTS[options["effects"]])
     wanted = tuple(1e-3 * value for value in velocities)
     _with_progress(
         len(wanted),

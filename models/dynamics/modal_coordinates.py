@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -130,7 +131,7 @@ def stationary_state(
     return np.asarray(np.linalg.solve(diagonal.states, state.astype(complex)))
 
 
-def _half(diagonal: Diagonal) -> tuple[NDArray[np.intp], Array]:
+def half_poles(diagonal: Diagonal) -> tuple[NDArray[np.intp], Array]:
     """Return one pole of each conjugate pair and its weight: 2 for pairs, 1 for real poles."""
     imag = diagonal.poles.imag
     keep = np.flatnonzero(imag >= 0)
@@ -153,7 +154,7 @@ def propagate(
     outputs : (output, time)
     state : (n,) at the sample after the last
     """
-    keep, weight = _half(diagonal)
+    keep, weight = half_poles(diagonal)
     grown, push = held_gain(diagonal, sample_rate_hz)
     half, samples = keep.size, inputs.shape[1]
     forced = np.vstack([push[keep].real, push[keep].imag]) @ inputs
@@ -184,15 +185,27 @@ def simulate(
     *,
     sample_rate_hz: float,
     rng: np.random.Generator,
+    change: Callable[[int, Array], None] | None = None,
+    step: Callable[..., tuple[Array, ComplexArray]] = propagate,
 ) -> Array:
     """Return a stationary record (output, time) under held white noise of std (input,).
 
     The first state is drawn from the stationary distribution: no samples are thrown away.
+
+    Parameters
+    ----------
+    change
+        Called with the index of a first sample and the noise (input, time) from there on, which it
+        may change in place.
+    step
+        `propagate`, or what does the same.
     """
     state = stationary_state(diagonal, std, sample_rate_hz, rng)
     outputs = np.empty((diagonal.c.shape[0], samples))
     for start in range(0, samples, _CHUNK):
         size = min(_CHUNK, samples - start)
         white = rng.standard_normal((std.size, size)) * std[:, None]
-        outputs[:, start : start + size], state = propagate(diagonal, state, white, sample_rate_hz)
+        if change is not None:
+            change(start, white)
+        outputs[:, start : start + size], state = step(diagonal, state, white, sample_rate_hz)
     return outputs

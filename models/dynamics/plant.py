@@ -42,6 +42,8 @@ NOISE_INPUTS = (
 # Signals that the motion controller has in advance.
 COMMAND_INPUTS = ("reference_acceleration", "feedforward_current")
 INPUTS = (*NOISE_INPUTS, *COMMAND_INPUTS)
+# Where forces depend on the motion along the feed: of the platform against the housing.
+CONTACTS = (*(f"block{i}_x" for i in range(1, 5)), "motor_force")
 GUIDE_MODES = ("roll", "pitch", "yaw")
 
 # Continuation: largest step in the logarithm of a parameter, and the modal assurance below which
@@ -162,6 +164,20 @@ def closed_loop(
     system = _loop(stage, condition, tuning)
     _refuse_unstable(stage.name, np.linalg.eigvals(system.a).astype(complex))
     return system
+
+
+def contact_loop(stage: Stage, condition: Condition = NOMINAL) -> LinearSystem:
+    """Return the closed loop with the displacements at `CONTACTS` (m) as further outputs.
+
+    What pushes platform and housing apart reads their displacement by the same numbers; the
+    reference's own comes on top.
+    """
+    system, structure = closed_loop(stage, condition), build_structure(stage, condition)
+    n, chosen = structure.size, [INPUTS.index(name) for name in CONTACTS]
+    rows = np.zeros((len(chosen), len(system.a)))
+    rows[:, :n] = (structure.mass @ system.b[n : 2 * n, chosen]).T
+    c = np.vstack([system.c, rows])
+    return replace(system, c=c, d=np.vstack([system.d, np.zeros((len(chosen), len(INPUTS)))]))
 
 
 def _loop(stage: Stage, condition: Condition, tuning: Tuning | None = None) -> LinearSystem:

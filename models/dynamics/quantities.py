@@ -9,7 +9,7 @@ import numpy as np
 
 from models.errors import BadParameter
 
-SOURCES = ("paper", "catalogue", "calibrated", "our choice")
+SOURCES = ("paper", "catalogue", "calibrated", "our choice", "drawn")
 
 
 @dataclass(frozen=True, slots=True)

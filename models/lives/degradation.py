@@ -15,7 +15,7 @@ from typing import Protocol
 import numpy as np
 
 from models.dynamics.stages import Condition
-from models.errors import UnknownLife
+from models.lives.circumstances import IDEAL, Circumstances
 
 GUIDE_PRELOAD_LIMIT = 0.6
 MOUNT_STIFFNESS_LIMIT = 0.7
@@ -23,11 +23,15 @@ MOUNT_STIFFNESS_LIMIT = 0.7
 _LEAST_PRELOAD = 0.05
 
 
-class Law(Protocol):
-    """A fraction of commissioning over the odometer that never rises."""
+class Course(Protocol):
+    """A fraction of commissioning over the odometer."""
 
     def at(self, travel_km: float) -> float:
         """Return the fraction at an odometer (km)."""
+
+
+class Law(Course, Protocol):
+    """A course with a first passage; those of this module never rise."""
 
     def reaches_km(self, limit: float) -> float | None:
         """Return the odometer (km) at which the law first is at the limit or below, or None."""
@@ -179,6 +183,23 @@ class Climate:
         noise = self.scatter_k * float(np.clip(rng.standard_normal(), -2.0, 2.0))
         return self.mean_c + self.seasonal_k * season + self.daily_k * daily + noise
 
+    def behind(self, moment: datetime, lag_h: float) -> float:
+        """Return the temperature (°C) of what follows by first order with a time constant (h).
+
+        Season and day come through smaller and later; the scatter, of minutes, does not.
+        """
+        hours = moment.timetuple().tm_yday * 24.0, moment.hour + moment.minute / 60
+        waves = ((self.seasonal_k, 24 * 365.25, 24 * 200.0), (self.daily_k, 24.0, 15.0))
+        value = self.mean_c
+        for at, (size, period, warmest) in zip(hours, waves, strict=True):
+            turn = 2 * math.pi / period
+            value += (
+                size
+                * math.cos(turn * (at - warmest) - math.atan(turn * lag_h))
+                / math.hypot(1.0, turn * lag_h)
+            )
+        return value
+
 
 ROOM = Climate(mean_c=21.5, seasonal_k=1.6, daily_k=0.8, scatter_k=0.3)
 HALL = Climate(mean_c=21.5, seasonal_k=6.0, daily_k=3.0, scatter_k=0.5)
@@ -209,15 +230,24 @@ class Life:
         Added payload.
     work
         Maintenance with its odometer; ``servo`` sets the tuning ``retuned``.
+    contact
+        Course of the guide's stiffness that is not due to preload.
+    level
+        Course of the level of all that excites the stage.
+    circumstances
+        What acts on the logs besides: sensors, wander, schedule.
     """
 
     name: str
     preload: Law = Steady()
     mount: Law = Steady()
     climate: Climate = ROOM
-    grease: Grease | Steady = Steady()
+    grease: Course = Steady()
     jobs: Jobs = EMPTY
     work: tuple[Work, ...] = ()
+    contact: Course = Steady()
+    level: Course = Steady()
+    circumstances: Circumstances = IDEAL
 
     def condition(self, travel_km: float, temperature_c: float) -> Condition:
         """Return the true condition at an odometer (km) and a temperature (°C)."""
@@ -315,16 +345,3 @@ LIVES: dict[str, Callable[[Draws], Life]] = {
     "payload-change": lambda draws: Life("payload-change", jobs=draws.jobs),
     "servo-retuning": lambda draws: Life("servo-retuning", work=(Work(draws.event_km, "servo"),)),
 }
-
-
-def life_named(name: str, rng: np.random.Generator) -> Life:
-    """Return a life with its laws drawn.
-
-    Raises
-    ------
-    UnknownLife
-        If the name is not registered in `LIVES`.
-    """
-    if name not in LIVES:
-        raise UnknownLife(name, LIVES)
-    return LIVES[name](draw_laws(rng))

@@ -4,31 +4,44 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from datetime import UTC, datetime, timedelta
 from multiprocessing import get_context
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
 from models.dynamics.stages import Condition, Stage, stage_named
 from models.errors import BadParameter
-from models.lives.degradation import Life, life_named
+from models.lives.circumstances import Contact, circumstances_of, stage_at, wander_of
+from models.lives.degradation import Life
+from models.lives.drawing import FURTHEST_MM, Machine, draw_machine
 from models.lives.faults import fault_named
+from models.lives.further_lives import life_named, run_in
+from models.lives.wear_families import Product
+from models.recordings.effects import effects_named
 from models.recordings.formats import file_suffix, refuse_other_logs, write_log
 from models.recordings.machines import COMMISSIONED, machine_identity, stream
-from models.recordings.recording import move_velocity, payload_kg, record
+from models.recordings.recording import Recording, move_velocity, payload_kg, record, room_of
 
-_KM_PER_DAY = 12.0
+Array = NDArray[np.float64]
+
 _NOW_KM = (1400.0, 2000.0)
 # A life that is simulated to its failure continues for this fraction of it.
 _PAST_FAILURE = 0.15
+# Events of a law, such as shocks, that the table of the truth states.
+_EVENTS_WRITTEN = 20
 UNTIL = ("now", "failure")
+# Courses of a life that the table of the truth states as text.
+_LAWS = ("preload", "mount", "grease", "contact", "level")
 _MAINTENANCE = ["stage", "recorded_at", "travel_km", "action"]
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
@@ -39,7 +52,9 @@ class Plan:
 
     ``until`` sets the odometer of the last log: ``now``, at an odometer that does not depend on the
     life, or past its ``failure``.  ``faults`` are faults of the recording, by name: each strikes
-    a tenth of the logs, at least one.
+    a tenth of the logs, at least one.  With ``plant_seed`` the machine and its laws of wear are
+    drawn by it; ``seed`` then draws its schedule and its records only.  ``effects`` names what the
+    stage has beyond a linear loop.
     """
 
     stage: str
@@ -50,6 +65,8 @@ class Plan:
     file_format: str = "hdf5"
     until: str = "now"
     faults: tuple[str, ...] = ()
+    plant_seed: int | None = None
+    effects: str = "linear"
 
     def __post_init__(self) -> None:
         """Reject impossible plans before any file is written."""
@@ -57,10 +74,13 @@ class Plan:
             raise BadParameter("logs", self.logs, "at least 1")
         if self.seed < 0:
             raise BadParameter("seed", self.seed, "0 or more")
+        if self.plant_seed is not None and self.plant_seed < 0:
+            raise BadParameter("plant seed", self.plant_seed, "0 or more")
         move_velocity(stage_named(self.stage), self.seconds)
         file_suffix(self.file_format)
         for name in self.faults:
             fault_named(name)
+        effects_named(self.effects)
         if self.until not in UNTIL:
             raise BadParameter("until", self.until, " or ".join(UNTIL))
         if self.draw_life().failure_km() is None and self.until == "failure":
@@ -71,11 +91,28 @@ class Plan:
 
     def rng(self, step: str, log: int = 0) -> np.random.Generator:
         """Return the generator of one step of one log: independent of all others."""
+        if step == "laws" and self.plant_seed is not None:
+            return stream(self.stage, self.plant_seed, "plant/laws")
         return stream(self.stage, self.seed, step, log)
 
+    def machine(self) -> Machine:
+        """Return the machine of the plant seed, or the nominal one."""
+        return draw_machine(self.stage, self.plant_seed)
+
     def draw_life(self) -> Life:
-        """Return the life with the laws of this seed."""
-        return life_named(self.life, self.rng("laws"))
+        """Return the life with the laws of this seed, and with what a drawn machine has besides."""
+        life = life_named(self.life, self.rng("laws"))
+        if self.plant_seed is None:
+            return life
+        numbers = self.machine().numbers
+        both = life.circumstances.above(circumstances_of(numbers))
+        return replace(run_in(life, numbers), circumstances=both)
+
+    def identity_of_machine(self) -> str:
+        """Return the identity of the machine, of drawn ones by the plant seed."""
+        stage = stage_named(self.stage)
+        seed = self.seed if self.plant_seed is None else f"P{self.plant_seed}"
+        return machine_identity(stage, seed)
 
     def faults_of(self, log: int) -> list[str]:
         """Return the faults that strike a log (its index)."""
@@ -96,7 +133,19 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Visit:
-    """One log of the schedule."""
+    """One log of the schedule.
+
+    Parameters
+    ----------
+    condition, contact
+        True state; its temperature is that of the structure.
+    stage
+        The stage as it is at this log.
+    logged_temperature_c
+        What the log states, °C.
+    logged_payload_kg
+        What the log states, kg; None if it does not.
+    """
 
     index: int
     file: str
@@ -104,6 +153,10 @@ class Visit:
     recorded_at: datetime
     travel_km: float
     condition: Condition
+    contact: Contact
+    stage: Stage
+    logged_temperature_c: float
+    logged_payload_kg: float | None
 
 
 def schedule(plan: Plan) -> list[Visit]:
@@ -119,46 +172,128 @@ def schedule(plan: Plan) -> list[Visit]:
     travel[0] = end_km * 0.001
     if plan.logs > 1:
         travel[-1] = end_km
+    life, suffix = plan.draw_life(), file_suffix(plan.file_format)
     # Daily use varies; a long gap averages it out.
-    gaps = np.diff(travel, prepend=0.0) / _KM_PER_DAY
+    gaps = np.diff(travel, prepend=0.0) / life.circumstances.km_per_day
     days = np.cumsum(gaps * np.exp(0.1 * rng.standard_normal(plan.logs)))
     hours = rng.uniform(-4.0, 6.0, plan.logs)
     # Within a shift of ±hours, never overtaking the neighbour.
     moments = np.maximum.accumulate(days + hours / 24) + np.arange(plan.logs) / 1440
-    life, suffix = plan.draw_life(), file_suffix(plan.file_format)
-    identity = machine_identity(stage_named(plan.stage), plan.seed)
+    moments = _calendar_days(moments, life.circumstances.closed_months)
+    travelled = [round(float(km), 3) for km in travel]
+    contacts = _contacts(plan, life, travelled)
+    identity = plan.identity_of_machine()
+    machine = plan.machine().stage
+    positions = _positions(plan)
     visits = []
-    for i in range(plan.logs):
+    for i, (km, contact) in enumerate(zip(travelled, contacts, strict=True)):
         moment = (COMMISSIONED + timedelta(days=float(moments[i]))).replace(microsecond=0)
-        km = round(float(travel[i]), 3)
-        temperature = round(life.climate.at(moment, plan.rng("temperature", i)), 2)
-        condition = life.condition(km, temperature)
-        visits.append(Visit(i, f"log-{i + 1:04d}{suffix}", identity, moment, km, condition))
+        true_c, logged_c = _temperatures(plan, life, i, moment, km)
+        condition = replace(life.condition(km, true_c), position_mm=positions[i])
+        payload = payload_kg(machine, condition) if life.circumstances.logs_payload else None
+        stage = stage_at(machine, contact, life.circumstances.amplitude_softening)
+        name = f"log-{i + 1:04d}{suffix}"
+        visits.append(
+            Visit(i, name, identity, moment, km, condition, contact, stage, logged_c, payload)
+        )
     return visits
+
+
+def _calendar_days(days: Array, closed_months: tuple[int, ...]) -> Array:
+    """Return days since commissioning from days of operation: in closed months there is none."""
+    if not closed_months:
+        return days
+    first = math.floor(days[0])
+    needed, day = math.floor(days[-1]) - first + 1, first
+    open_days: list[int] = []
+    while len(open_days) < needed:
+        if (COMMISSIONED + timedelta(days=day)).month not in closed_months:
+            open_days.append(day)
+        day += 1
+    whole = np.floor(days).astype(int)
+    return np.asarray(np.array(open_days)[whole - first] + (days - whole))
+
+
+def _positions(plan: Plan) -> list[float]:
+    """Return where the platform stands at each log, mm from the middle of the travel.
+
+    Of a full stage uniform within ±100 mm, or within what the move of the log leaves of the travel;
+    rigid stages are alike everywhere and stay in the middle.
+    """
+    stage = stage_named(plan.stage)
+    if stage.flexible is None:
+        return [0.0] * plan.logs
+    most = min(FURTHEST_MM, 1e3 * room_of(stage, plan.seconds))
+    drawn = plan.rng("position").uniform(-most, most, plan.logs)
+    # Adding zero makes positive zeros of negative ones.
+    return [round(float(place), 1) + 0.0 for place in drawn]
+
+
+def _contacts(plan: Plan, life: Life, travel_km: list[float]) -> list[Contact]:
+    """Return the state of the contacts at every log."""
+    what = life.circumstances
+    common, own = wander_of(what, np.array(travel_km), plan.rng("wander"))
+    level = np.exp(what.level_scatter * plan.rng("level").standard_normal(len(travel_km)))
+    return [
+        Contact(
+            stiffness=life.contact.at(km),
+            level=life.level.at(km) * float(level[i]),
+            wander_common=float(common[i]),
+            wander=(float(own[i, 0]), float(own[i, 1]), float(own[i, 2])),
+        )
+        for i, km in enumerate(travel_km)
+    ]
+
+
+def _temperatures(
+    plan: Plan, life: Life, log: int, moment: datetime, travel_km: float
+) -> tuple[float, float]:
+    """Return the temperatures (°C) of the structure and of the log."""
+    what = life.circumstances
+    air = life.climate.at(moment, plan.rng("temperature", log))
+    true = life.climate.behind(moment, what.lag_h) if what.lag_h else air
+    rng = plan.rng("sensor", log)
+    duty, scatter = rng.uniform(), rng.standard_normal()
+    logged = air + what.sensor_offset_k + what.sensor_drift_k * travel_km / 1000.0
+    logged += what.sensor_scatter_k * float(np.clip(scatter, -3.0, 3.0))
+    return round(true + what.self_heating_k * float(duty), 2), round(logged, 2)
 
 
 def _simulate_log(plan: Plan, visit: Visit, folder: Path) -> dict[str, object]:
     """Write one log and return its row of the truth."""
-    stage = stage_named(plan.stage)
     recording = record(
-        stage, visit.condition, seconds=plan.seconds, rng=plan.rng("signals", visit.index)
+        visit.stage,
+        visit.condition,
+        seconds=plan.seconds,
+        rng=plan.rng("signals", visit.index),
+        level=visit.contact.level,
+        effects=effects_named(plan.effects),
     )
     struck = plan.faults_of(visit.index)
     for name in struck:
         recording = fault_named(name)(recording, plan.rng(f"fault/{name}", visit.index))
-    recording = recording.described(
+    recording = _stating(recording, visit).described(
         stage=visit.identity,
         recorded_at=visit.recorded_at.isoformat(),
         travel_km=visit.travel_km,
         servo_id=visit.condition.servo_id,
     )
     write_log(recording, folder / visit.file, plan.file_format)
-    return {**truth_row(stage, visit), "faults": " ".join(struck)}
+    row = truth_row(visit.stage, visit)
+    return {**row, "effects": plan.effects, "faults": " ".join(struck)}
+
+
+def _stating(recording: Recording, visit: Visit) -> Recording:
+    """Return a recording that states what its sensor and its operator say."""
+    metadata = {**recording.metadata, "temperature_c": visit.logged_temperature_c}
+    if visit.logged_payload_kg is None:
+        del metadata["payload_kg"]
+    return Recording(recording.columns, metadata)
 
 
 def truth_row(stage: Stage, visit: Visit) -> dict[str, object]:
     """Return what was really so at a log: its condition and every closed-loop mode."""
-    condition = visit.condition
+    condition, contact = visit.condition, visit.contact
     row: dict[str, object] = {
         "file": visit.file,
         "recorded_at": visit.recorded_at.isoformat(),
@@ -168,7 +303,13 @@ def truth_row(stage: Stage, visit: Visit) -> dict[str, object]:
         "mount_stiffness": condition.mount_stiffness,
         "payload_kg": payload_kg(stage, condition),
         "servo_id": condition.servo_id,
+        "position_mm": condition.position_mm,
         "guide_damping_factor": condition.guide_damping,
+        "logged_temperature_c": visit.logged_temperature_c,
+        "contact_stiffness_factor": contact.stiffness,
+        "excitation_level": contact.level,
+        "wander_common": contact.wander_common,
+        **{f"wander_{n}": w for n, w in zip(GUIDE_MODES, contact.wander, strict=True)},
     }
     modes = {mode.name: mode for mode in closed_loop_modes(stage, condition)}
     # One order in all rows and files: by frequency it would change where modes cross.
@@ -240,8 +381,10 @@ def simulate_life(
     for name, limit_km in life.limits_km().items():
         truth[f"{name}_limit_km"] = limit_km
     truth["failure_km"] = life.failure_km()
-    truth.to_csv(folder / "truth.csv", index=False)
-    _manifest(stage_named(plan.stage), visits).to_csv(folder / "manifest.csv", index=False)
+    pd.concat([truth, _drawn_numbers(plan, life, len(truth))], axis=1).to_csv(
+        folder / "truth.csv", index=False
+    )
+    _manifest(visits).to_csv(folder / "manifest.csv", index=False)
     _maintenance(life, visits).to_csv(folder / "maintenance.csv", index=False)
 
 
@@ -259,7 +402,35 @@ def _maintenance(life: Life, visits: list[Visit]) -> pd.DataFrame:
     return pd.DataFrame(rows, columns=_MAINTENANCE)
 
 
-def _manifest(stage: Stage, visits: list[Visit]) -> pd.DataFrame:
+def _drawn_numbers(plan: Plan, life: Life, logs: int) -> pd.DataFrame:
+    """Return the laws and the numbers of a drawn machine, the same in all rows; else no columns."""
+    if plan.plant_seed is None:
+        return pd.DataFrame(index=range(logs))
+    numbers = {f"plant_{name}": value for name, value in plan.machine().numbers.items()}
+    laws = {f"{name}_law": _text_of(getattr(life, name)) for name in _LAWS}
+    row = {"plant_seed": plan.plant_seed, **laws, **numbers}
+    return pd.DataFrame([row] * logs)
+
+
+def _text_of(law: Any) -> str:
+    """Return a law as ``family(parameter=value, ...)``; of its events the first."""
+    if isinstance(law, tuple):
+        first = " ".join(f"{value:.6g}" for value in law[:_EVENTS_WRITTEN])
+        return f"{first} ..." if len(law) > _EVENTS_WRITTEN else first
+    if not is_dataclass(law):
+        return f"{law:.6g}"
+    if isinstance(law, Product):
+        return f"{_text_of(law.first)} * {_text_of(law.second)}"
+    inner = ", ".join(f"{f.name}={_text_of(getattr(law, f.name))}" for f in fields(law))
+    return _family(law) + (f"({inner})" if inner else "")
+
+
+def _family(law: object) -> str:
+    """Return the name of a law's family in lower case, as it is written in ``truth.csv``."""
+    return re.sub(r"(?<=[a-z])(?=[A-Z])", "-", type(law).__name__).lower()
+
+
+def _manifest(visits: list[Visit]) -> pd.DataFrame:
     """Return the manifest: metadata of each log, as a user would list them."""
     return pd.DataFrame(
         [
@@ -268,8 +439,8 @@ def _manifest(stage: Stage, visits: list[Visit]) -> pd.DataFrame:
                 "stage": visit.identity,
                 "recorded_at": visit.recorded_at.isoformat(),
                 "travel_km": visit.travel_km,
-                "temperature_c": visit.condition.temperature_c,
-                "payload_kg": payload_kg(stage, visit.condition),
+                "temperature_c": visit.logged_temperature_c,
+                "payload_kg": visit.logged_payload_kg,
                 "servo_id": visit.condition.servo_id,
             }
             for visit in visits

@@ -14,9 +14,13 @@ from numpy.typing import NDArray
 
 from models.dynamics.plant import INPUTS, NOISE_INPUTS
 from models.dynamics.stages import Stage
+from models.recordings.effects import LINEAR, Effects
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
+
+# Cycles per m, index of the input and complex amplitude of every sinusoid.
+Drawn = tuple[Array, NDArray[np.intp], ComplexArray]
 
 REFERENCE_VELOCITY = 0.010
 
@@ -181,12 +185,17 @@ def noise_corners(stage: Stage) -> Array:
     return np.array([_noise_of(stage, name).corner_hz for name in NOISE_INPUTS])
 
 
-def orders(stage: Stage) -> tuple[Order, ...]:
+def orders(stage: Stage, effects: Effects = LINEAR) -> tuple[Order, ...]:
     """Return the kinematic orders of a stage (wavelength m, amplitude in the input's unit)."""
-    vertical = tuple(name for name in INPUTS if name.startswith("block") and name.endswith("z"))
+    feed, vertical = (
+        tuple(name for name in INPUTS if name.startswith("block") and name.endswith(axis))
+        for axis in "xz"
+    )
     ball, magnet = stage.ball_pitch.value, stage.magnet_pitch.value
     period = stage.encoder_period.value
     first, second = LEVELS[stage.name].encoder
+    # A ball enters every two pitches of travel, as balls roll at half of the velocity.  A block's
+    # rows, half a pitch out of step, cancel that order: even ones are left, once per pitch.
     return (
         Order("ball pass", ball, 1, 0.30, vertical),
         Order("ball pass", ball, 2, 0.10, vertical),
@@ -194,12 +203,19 @@ def orders(stage: Stage) -> tuple[Order, ...]:
         Order("magnet pitch", magnet, 6, 0.015, ("motor_force",)),
         Order("encoder period", period, 1, first, ("encoder_error",)),
         Order("encoder period", period, 2, second, ("encoder_error",)),
+        *(
+            Order(name, 2 * length, 1, amplitude, inputs)
+            for name, length, pair in (
+                ("ball entry", ball, effects.entry),
+                ("cage", effects.chain, effects.cage),
+            )
+            for amplitude, inputs in zip(pair, (feed, vertical), strict=True)
+            if amplitude
+        ),
     )
 
 
-def drawn_orders(
-    stage: Stage, rng: np.random.Generator
-) -> tuple[Array, NDArray[np.intp], ComplexArray]:
+def drawn_orders(stage: Stage, rng: np.random.Generator, effects: Effects = LINEAR) -> Drawn:
     """Return every sinusoid of the orders with a phase of its own.
 
     Balls pass four blocks out of step: every input of an order has its own phase.
@@ -213,7 +229,7 @@ def drawn_orders(
     amplitudes : (sinusoid,)
         Complex, in the input's unit.
     """
-    table = [(order, name) for order in orders(stage) for name in order.inputs]
+    table = [(order, name) for order in orders(stage, effects) for name in order.inputs]
     cycles = np.array([order.harmonic / order.wavelength for order, _ in table])
     inputs = np.array([INPUTS.index(name) for _, name in table])
     phases = np.exp(2j * np.pi * rng.random(len(table)))

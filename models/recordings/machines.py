@@ -13,8 +13,8 @@ from models.dynamics.stages import Stage
 COMMISSIONED = datetime(2026, 3, 2, 8, 0, tzinfo=UTC)
 
 
-def machine_identity(stage: Stage, seed: int) -> str:
-    """Return the identity of the machine that a seed makes of a stage."""
+def machine_identity(stage: Stage, seed: int | str) -> str:
+    """Return the identity of the machine that a seed, or a drawn plant, makes of a stage."""
     return f"LMS-{seed}-{stage.identity_suffix}"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from models.dynamics.modal_coordinates import (
     Diagonal,
     diagonalise,
     frequency_response,
+    propagate,
     sampled_spectrum,
     simulate,
 )
@@ -22,19 +23,23 @@ from models.dynamics.plant import (
     NOISE_INPUTS,
     OUTPUTS,
     SENSORS,
+    LinearSystem,
     closed_loop,
     closed_loop_modes,
+    contact_loop,
     sensor_rows,
 )
 from models.dynamics.stages import NOMINAL, Condition, Stage, build_structure, tuning_named
 from models.errors import BadParameter
 from models.recordings.disturbances import (
     LEVELS,
+    Drawn,
     drawn_orders,
     mains,
     noise_corners,
     noise_levels,
 )
+from models.recordings.effects import LINEAR, Effects, changes
 
 Array = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
@@ -102,19 +107,28 @@ def move_velocity(stage: Stage, seconds: float, wanted: float = DEFAULT_VELOCITY
     return velocity
 
 
-def shaken(stage: Stage, condition: Condition) -> Diagonal:
+def room_of(stage: Stage, seconds: float) -> float:
+    """Return how far (m) the middle of a move may be from that of the travel, either way."""
+    moved = move_velocity(stage, seconds) * seconds
+    return max(0.0, (_USABLE_TRAVEL * stage.travel.value - moved) / 2)
+
+
+def loop_of(stage: Stage, condition: Condition, effects: Effects) -> LinearSystem:
+    """Return the closed loop; with nonlinear effects its contacts' displacements follow."""
+    return (contact_loop if effects.nonlinear else closed_loop)(stage, condition)
+
+
+def shaken(stage: Stage, condition: Condition, effects: Effects = LINEAR) -> Diagonal:
     """Return the closed loop behind the low passes that shape its noise."""
-    system = closed_loop(stage, condition).driven_by(NOISE_INPUTS)
+    system = loop_of(stage, condition, effects).driven_by(NOISE_INPUTS)
     return diagonalise(system, noise_corners(stage))
 
 
-def _order_gains(
-    stage: Stage, condition: Condition, velocity: float, rng: np.random.Generator
-) -> tuple[Array, ComplexArray]:
+def _order_gains(system: LinearSystem, drawn: Drawn, velocity: float) -> tuple[Array, ComplexArray]:
     """Return frequencies (line,) and complex outputs (output, line) of the velocity orders."""
-    cycles, inputs, amplitudes = drawn_orders(stage, rng)
+    cycles, inputs, amplitudes = drawn
     frequency = cycles * abs(velocity)
-    response = frequency_response(diagonalise(closed_loop(stage, condition)), frequency)
+    response = frequency_response(diagonalise(system), frequency)
     gain = response[np.arange(frequency.size), :, inputs].T * amplitudes
     # The drive's anti-alias filter removes frequencies above half the sample rate.
     gain[:, frequency >= SAMPLE_RATE_HZ / 2] = 0.0
@@ -174,18 +188,95 @@ def simulate_signals(
     seconds: float,
     velocity: float,
     rng: np.random.Generator,
+    level: float = 1.0,
+    effects: Effects = LINEAR,
+    added: Array | None = None,
 ) -> Array:
-    """Return Δe (m), current (A) and two accelerations (m/s²) as sensed, (output, time)."""
+    """Return Δe (m), current (A) and two accelerations (m/s²) as sensed, (output, time).
+
+    Parameters
+    ----------
+    level
+        Factor on the random excitation.
+    effects
+        What the stage has beyond a linear loop.
+    added : (output, time)
+        What an excitation alone does to the outputs of `loop_of`.
+    """
     samples = sample_count(seconds)
-    std = noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
-    diagonal = shaken(stage, condition)
-    outputs = simulate(diagonal, std, samples, sample_rate_hz=SAMPLE_RATE_HZ, rng=rng)
-    _add_lines(outputs, *_order_gains(stage, condition, velocity, rng))
-    # The ball guide's constant friction costs current; its slow integrator has long met it.
-    constant = tuning_named(stage.name, condition.servo_id).force_constant
-    outputs[OUTPUTS.index("current")] += stage.friction.value / constant
-    sense(outputs, stage, np.asarray(velocity), rng)
-    return outputs
+    std = level * noise_levels(stage, np.asarray(velocity), SAMPLE_RATE_HZ)
+    position = _positions(condition, samples, velocity)
+    # A stream of their own: what is drawn for the rest does not depend on them.
+    change = changes(stage, effects, position, rng.spawn(1)[0], SAMPLE_RATE_HZ)
+    outputs = simulate(
+        shaken(stage, condition, effects), std, samples,
+        sample_rate_hz=SAMPLE_RATE_HZ, rng=rng, change=change, step=_stepping(effects),
+    )  # fmt: skip
+    drawn = drawn_orders(stage, rng, effects)
+    system = loop_of(stage, condition, effects)
+    _add_lines(outputs, *_order_gains(system, drawn, velocity))
+    if added is not None:
+        outputs += added
+    if effects.friction is None:
+        # The ball guide's constant friction costs current; its slow integrator has long met it.
+        constant = tuning_named(stage.name, condition.servo_id).force_constant
+        outputs[OUTPUTS.index("current")] += stage.friction.value / constant
+    if effects.nonlinear:
+        cycles, inputs, amplitudes = drawn
+        # Their phases are those of the first sample.
+        turned = amplitudes * np.exp(-2j * np.pi * cycles * position[0])
+        moves = np.vstack([position, np.full(samples, velocity)])
+        add_nonlinear(stage, condition, effects, outputs, moves, (cycles, inputs, turned))
+    sensed = outputs[: len(OUTPUTS)]
+    sense(sensed, stage, np.asarray(velocity), rng)
+    return sensed
+
+
+def _stepping(effects: Effects) -> Callable[..., tuple[Array, ComplexArray]]:
+    """Return what steps the linear part: compiled where effects need the compiler anyway."""
+    if effects == LINEAR:
+        return propagate
+    from models.recordings.feedback import propagate_compiled
+
+    return propagate_compiled
+
+
+def _positions(condition: Condition, samples: int, velocity: float) -> Array:
+    """Return the reference position (time,) of a move through the condition's, m."""
+    time = (np.arange(samples) - (samples - 1) / 2) / SAMPLE_RATE_HZ
+    return np.asarray(1e-3 * condition.position_mm + velocity * time)
+
+
+def add_nonlinear(
+    stage: Stage,
+    condition: Condition,
+    effects: Effects,
+    outputs: Array,
+    moves: Array,
+    drawn: Drawn,
+    moving: float | Array = 1.0,
+) -> None:
+    """Add what friction, cable, and the limits of drive and encoder cause to linear outputs.
+
+    Parameters
+    ----------
+    outputs : (output + contact, time)
+        Of `loop_of`; changed in place.
+    moves : (2, time)
+        Reference position (m) and velocity (m/s).
+    drawn
+        Orders with their phases at position 0.
+    moving : () or (time,)
+        Which part of the orders acts.
+
+    Raises
+    ------
+    MissingLibrary
+        If numba is not installed.
+    """
+    from models.recordings.feedback import follow
+
+    follow(stage, condition, effects, outputs, moves, drawn, moving, SAMPLE_RATE_HZ)
 
 
 def record(
@@ -195,6 +286,9 @@ def record(
     seconds: float,
     velocity: float = DEFAULT_VELOCITY,
     rng: np.random.Generator,
+    level: float = 1.0,
+    effects: Effects = LINEAR,
+    added: Array | None = None,
 ) -> Recording:
     """Record a move at constant velocity through the condition's position on the travel.
 
@@ -206,12 +300,22 @@ def record(
         Duration, s.
     velocity
         Wanted velocity, m/s; lowered where the travel is too short for the duration.
+    level, effects, added
+        See `simulate_signals`.
     """
     velocity = move_velocity(stage, seconds, velocity)
-    signals = simulate_signals(stage, condition, seconds=seconds, velocity=velocity, rng=rng)
+    signals = simulate_signals(
+        stage,
+        condition,
+        seconds=seconds,
+        velocity=velocity,
+        rng=rng,
+        level=level,
+        effects=effects,
+        added=added,
+    )
     samples = signals.shape[1]
-    time = (np.arange(samples) - (samples - 1) / 2) / SAMPLE_RATE_HZ
-    position = 1e-3 * condition.position_mm + velocity * time
+    position = _positions(condition, samples, velocity)
     return to_recording(stage, condition, signals, position, np.full(samples, velocity))
 
 

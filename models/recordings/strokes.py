@@ -11,14 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from models.dynamics.modal_coordinates import diagonalise, propagate, stationary_state
-from models.dynamics.plant import INPUTS, closed_loop
+from models.dynamics.plant import INPUTS, OUTPUTS
 from models.dynamics.stages import NOMINAL, Condition, Stage, tuning_named
 from models.errors import BadParameter
-from models.recordings.disturbances import drawn_orders, noise_levels
+from models.recordings.disturbances import Drawn, drawn_orders, noise_levels
+from models.recordings.effects import LINEAR, Effects, changes
 from models.recordings.motion_profile import JERK, Profile
 from models.recordings.recording import (
     SAMPLE_RATE_HZ,
     Recording,
+    add_nonlinear,
+    loop_of,
     sample_count,
     sense,
     shaken,
@@ -26,7 +29,6 @@ from models.recordings.recording import (
 )
 
 Array = NDArray[np.float64]
-Orders = tuple[Array, NDArray[np.intp], NDArray[np.complex128]]
 
 # The paper's set velocities, m/s.
 VELOCITIES = (0.001, 0.005, 0.010, 0.020, 0.100, 0.200, 0.400)
@@ -48,7 +50,9 @@ def full_stroke(stage: Stage, velocity: float) -> Profile:
     return Profile(velocity, min(STROKE, 0.95 * stage.travel.value), jerk=jerk)
 
 
-def commands(stage: Stage, condition: Condition, reference: Array) -> Array:
+def commands(
+    stage: Stage, condition: Condition, reference: Array, expected: Array | None = None
+) -> Array:
     """Return what the move itself puts into the stage's inputs, (input, time).
 
     The reference's acceleration, the controller's feedforward of mass and friction, and the
@@ -58,21 +62,26 @@ def commands(stage: Stage, condition: Condition, reference: Array) -> Array:
     ----------
     reference : (4, time)
         Position, velocity, acceleration, jerk, SI.
+    expected : (time,)
+        Friction that the controller expects, N, where the friction itself depends on the motion;
+        without it both turn round with the reference.
     """
     _, velocity, acceleration, jerk = reference
     led = acceleration + stage.feedforward_lead.value * jerk
-    friction = stage.friction.value * np.tanh(velocity / _TURNING)
-    wanted = stage.moving_mass.value * led + stage.friction_compensation.value * friction
+    turned = stage.friction.value * np.tanh(velocity / _TURNING)
+    met = turned if expected is None else expected
+    wanted = stage.moving_mass.value * led + stage.friction_compensation.value * met
     inputs = np.zeros((len(INPUTS), velocity.size))
-    blocks = [i for i, n in enumerate(INPUTS) if n.startswith("block") and n.endswith("x")]
-    inputs[blocks] = -friction / len(blocks)
+    if expected is None:
+        blocks = [i for i, n in enumerate(INPUTS) if n.startswith("block") and n.endswith("x")]
+        inputs[blocks] = -turned / len(blocks)
     inputs[INPUTS.index("reference_acceleration")] = acceleration
     constant = tuning_named(stage.name, condition.servo_id).force_constant
     inputs[INPUTS.index("feedforward_current")] = wanted / constant
     return inputs
 
 
-def _add_orders(inputs: Array, drawn: Orders, reference: Array) -> None:
+def _add_orders(inputs: Array, drawn: Drawn, reference: Array) -> None:
     """Add the kinematic orders, which follow the position, to inputs (input, time)."""
     position, velocity = reference[:2]
     moving = np.tanh(np.abs(velocity) / _TURNING)
@@ -106,44 +115,67 @@ def _lead_in_s(profile: Profile, start: float) -> float:
 def commanded(
     stage: Stage,
     condition: Condition,
-    profile: Profile,
-    time: Array,
-    rng: np.random.Generator,
-) -> tuple[Array, Array]:
+    reference: Array,
+    drawn: Drawn,
+    effects: Effects = LINEAR,
+) -> Array:
     """Return what a move does to the outputs, its kinematic orders included, without noise.
 
     Parameters
     ----------
-    time : (time,)
-        Even times at the sample rate, s; 0 is the start of the first stroke.
+    reference : (4, time)
+        Position, velocity, acceleration, jerk, SI, at the sample rate.
 
     Returns
     -------
     outputs : (output, time)
-    reference : (4, time)
-        Position, velocity, acceleration, jerk, SI.
+        Of `loop_of`.
     """
-    lead = round(_lead_in_s(profile, float(time[0])) * SAMPLE_RATE_HZ)
-    early = time[0] - np.arange(lead, 0, -1) / SAMPLE_RATE_HZ
-    reference = profile.sampled(np.concatenate([early, time]))
-    direct = diagonalise(closed_loop(stage, condition))
+    direct = diagonalise(loop_of(stage, condition, effects))
+    expected = expected_friction(stage, effects, reference, SAMPLE_RATE_HZ)
     # The command of the first sample has been constant before.
-    state = -(direct.b @ commands(stage, condition, reference[:, :1])[:, 0]) / direct.poles
-    drawn = drawn_orders(stage, rng)
+    held = None if expected is None else expected[:1]
+    first = commands(stage, condition, reference[:, :1], held)[:, 0]
+    state = -(direct.b @ first) / direct.poles
     outputs = np.empty((direct.c.shape[0], reference.shape[1]))
     for start in range(0, reference.shape[1], _CHUNK):
         part = slice(start, start + _CHUNK)
-        inputs = commands(stage, condition, reference[:, part])
+        held = None if expected is None else expected[part]
+        inputs = commands(stage, condition, reference[:, part], held)
         _add_orders(inputs, drawn, reference[:, part])
         outputs[:, part], state = propagate(direct, state, inputs, SAMPLE_RATE_HZ)
-    return outputs[:, lead:], reference[:, lead:]
+    return outputs
+
+
+def expected_friction(
+    stage: Stage, effects: Effects, reference: Array, sample_rate_hz: float
+) -> Array | None:
+    """Return the friction (time,) that a drive computes along its reference, N.
+
+    A drive of a nanometre stage has the law of friction, presliding included, of its commissioning:
+    without it a stop would rest some 40 µm off, where friction holds it [Lampaert2004].
+    """
+    if effects.friction is None:
+        return None
+    # Needs numba: imported where friction is asked for.
+    from models.recordings.friction import contacts_of, force_along
+
+    contacts = contacts_of(stage, NOMINAL, effects.friction)
+    step, velocity = 1 / sample_rate_hz, float(reference[1, 0])
+    return force_along(contacts, reference[0], step, velocity=velocity)
 
 
 def _noise_outputs(
-    stage: Stage, condition: Condition, velocity: Array, rng: np.random.Generator
+    stage: Stage,
+    condition: Condition,
+    reference: Array,
+    rng: np.random.Generator,
+    effects: Effects,
 ) -> Array:
     """Return the outputs (output, time) of noise that grows and falls with the velocity."""
-    diagonal = shaken(stage, condition)
+    position, velocity = reference[:2]
+    change = changes(stage, effects, position, rng.spawn(1)[0], SAMPLE_RATE_HZ)
+    diagonal = shaken(stage, condition, effects)
     state = stationary_state(
         diagonal, noise_levels(stage, velocity[0], SAMPLE_RATE_HZ), SAMPLE_RATE_HZ, rng
     )
@@ -152,6 +184,8 @@ def _noise_outputs(
         part = slice(start, start + _CHUNK)
         level = noise_levels(stage, velocity[part], SAMPLE_RATE_HZ)
         white = rng.standard_normal(level.shape) * level
+        if change is not None:
+            change(start, white)
         outputs[:, part], state = propagate(diagonal, state, white, SAMPLE_RATE_HZ)
     return outputs
 
@@ -163,6 +197,7 @@ def record_strokes(
     profile: Profile,
     seconds: float = WINDOW_S,
     rng: np.random.Generator,
+    effects: Effects = LINEAR,
 ) -> Recording:
     """Record a window about the middle of a move.
 
@@ -172,6 +207,8 @@ def record_strokes(
         Its last dwell does not count when the middle is found.
     seconds
         Length of the window, s; longer than the move, it has standstill at both ends.
+    effects
+        What the stage has beyond a linear loop.
 
     Raises
     ------
@@ -182,8 +219,16 @@ def record_strokes(
     if profile.stroke > stage.travel.value:
         raise BadParameter("stroke", f"{profile.stroke} m", f"at most {stage.travel.value} m")
     start = (profile.seconds - profile.dwell - seconds) / 2
-    time = start + np.arange(samples) / SAMPLE_RATE_HZ
-    outputs, reference = commanded(stage, condition, profile, time, rng)
-    outputs += _noise_outputs(stage, condition, reference[1], rng)
+    lead = round(_lead_in_s(profile, start) * SAMPLE_RATE_HZ)
+    reference = profile.sampled(start + np.arange(-lead, samples) / SAMPLE_RATE_HZ)
+    drawn = drawn_orders(stage, rng, effects)
+    outputs = commanded(stage, condition, reference, drawn, effects)
+    # Only friction remembers the noise before the window.
+    noisy = 0 if effects.nonlinear else lead
+    outputs[:, noisy:] += _noise_outputs(stage, condition, reference[:, noisy:], rng, effects)
+    if effects.nonlinear:
+        moving = np.tanh(np.abs(reference[1]) / _TURNING)
+        add_nonlinear(stage, condition, effects, outputs, reference[:2], drawn, moving)
+    outputs, reference = outputs[: len(OUTPUTS), lead:].copy(), reference[:, lead:]
     sense(outputs, stage, reference[1], rng)
     return to_recording(stage, condition, outputs, reference[0], reference[1])

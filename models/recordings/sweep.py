@@ -21,18 +21,19 @@ from models.dynamics.plant import (
     OUTPUTS,
     Mode,
     assurance,
-    closed_loop,
     closed_loop_modes,
     structure_state,
 )
-from models.dynamics.quantities import Number
 from models.dynamics.stages import NOMINAL, Condition, Stage, build_structure, tuning_named
 from models.errors import BadParameter
+from models.recordings.effects import LINEAR, Effects
 from models.recordings.recording import (
     DEFAULT_VELOCITY,
     LONGEST_S,
     SAMPLE_RATE_HZ,
     Recording,
+    loop_of,
+    move_velocity,
     record,
     sample_count,
 )
@@ -42,10 +43,6 @@ Array = NDArray[np.float64]
 # Among the contract's names of currents, which fixes its unit.
 EXCITATION = "current_excitation_a"
 _LAWS = ("log", "linear")
-# Columns of the outputs, in their order, and their unit's count in one of SI.
-_MOVED = (("delta_e_um", 1e6), ("current_a", 1.0), ("acc_feed_m_s2", 1.0), ("acc_pitch_m_s2", 1.0))
-# An encoder without steps: counts are taken after the sweep's part is added.
-_STEPLESS = Number(1e-15, "m", "our choice")
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,9 +100,9 @@ class Sweep:
         return np.asarray(self.amplitude * np.cos(2 * np.pi * cycles[:-1]))
 
 
-def _from_current(stage: Stage, condition: Condition) -> Diagonal:
+def _from_current(stage: Stage, condition: Condition, effects: Effects) -> Diagonal:
     """Return the closed loop with a current (A), added to the servo's, as its only input."""
-    diagonal = diagonalise(closed_loop(stage, condition))
+    diagonal = diagonalise(loop_of(stage, condition, effects))
     force = tuning_named(stage.name, condition.servo_id).force_constant
     index = INPUTS.index("motor_force")
     b, d = force * diagonal.b[:, [index]], force * diagonal.d[:, [index]]
@@ -114,12 +111,19 @@ def _from_current(stage: Stage, condition: Condition) -> Diagonal:
     return replace(diagonal, b=b, d=d)
 
 
-def response(stage: Stage, sweep: Sweep, condition: Condition = NOMINAL, *, samples: int) -> Array:
+def response(
+    stage: Stage,
+    sweep: Sweep,
+    condition: Condition = NOMINAL,
+    *,
+    samples: int,
+    effects: Effects = LINEAR,
+) -> Array:
     """Return what the sweep alone does to the outputs (output, time), as if it ran for ever.
 
     Starting from the periodic state, every period is alike: a log has no transient to throw away.
     """
-    diagonal = _from_current(stage, condition)
+    diagonal = _from_current(stage, condition, effects)
     wave = sweep.one_period()
     rest = np.zeros(diagonal.poles.size, dtype=complex)
     _, end = propagate(diagonal, rest, wave[None], SAMPLE_RATE_HZ)
@@ -137,6 +141,7 @@ def record_sweep(
     seconds: float,
     velocity: float = DEFAULT_VELOCITY,
     rng: np.random.Generator,
+    effects: Effects = LINEAR,
 ) -> Recording:
     """Record a move at constant velocity, with all its disturbances, while the sine sweeps.
 
@@ -146,26 +151,27 @@ def record_sweep(
         Duration, s: at least one period.
     velocity
         Wanted velocity, m/s; lowered where the travel is too short for the duration.
+    effects
+        What the stage has beyond a linear loop.
 
     Raises
     ------
     BadParameter
-        If the log is shorter than a period, or the sine so strong that the stage turns back.
+        If the log is shorter than a period, or the sine so strong that the stage turns back, unless
+        the effects have the friction that is then nonlinear.
     """
     samples = sample_count(seconds)
     if not seconds >= sweep.period:
         raise BadParameter("seconds", seconds, f"at least one period of {sweep.period} s")
-    moved = replace(stage, encoder_count=_STEPLESS)
-    quiet = record(moved, condition, seconds=seconds, velocity=velocity, rng=rng)
-    columns = {name: values.astype(float) for name, values in quiet.columns.items()}
-    parts = response(stage, sweep, condition, samples=samples)
-    _refuse_turning_back(sweep, parts[OUTPUTS.index("delta_e")], quiet)
-    for (name, unit), part in zip(_MOVED, parts, strict=True):
-        columns[name] += unit * part
-    count = 1e6 * stage.encoder_count.value
-    columns["delta_e_um"] = count * np.round(columns["delta_e_um"] / count)
-    columns[EXCITATION] = np.resize(sweep.one_period(), samples)
-    stored = {name: values.astype(np.float32) for name, values in columns.items()}
+    parts = response(stage, sweep, condition, samples=samples, effects=effects)
+    if effects.friction is None:
+        error = parts[OUTPUTS.index("delta_e")]
+        _refuse_turning_back(sweep, error, move_velocity(stage, seconds, velocity))
+    log = record(
+        stage, condition,
+        seconds=seconds, velocity=velocity, rng=rng, effects=effects, added=parts,
+    )  # fmt: skip
+    excitation = np.resize(sweep.one_period(), samples).astype(np.float32)
     settings = {
         "excitation_low_hz": sweep.low_hz,
         "excitation_high_hz": sweep.high_hz,
@@ -173,12 +179,11 @@ def record_sweep(
         "excitation_period_s": sweep.samples / SAMPLE_RATE_HZ,
         "excitation_law": sweep.law,
     }
-    return Recording(stored, {**quiet.metadata, **settings})
+    return Recording({**log.columns, EXCITATION: excitation}, {**log.metadata, **settings})
 
 
-def _refuse_turning_back(sweep: Sweep, error: Array, quiet: Recording) -> None:
+def _refuse_turning_back(sweep: Sweep, error: Array, velocity: float) -> None:
     """Raise if the sweep alone would stop the move at times: friction would not be linear then."""
-    velocity = 1e-3 * float(quiet.columns["reference_velocity_mm_s"][0])
     fastest = float(np.abs(np.diff(error)).max()) * SAMPLE_RATE_HZ
     if fastest >= velocity:
         largest = sweep.amplitude * velocity / fastest

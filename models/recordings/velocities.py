@@ -12,6 +12,7 @@ import pandas as pd
 
 from models.dynamics.stages import NOMINAL, Condition, Stage
 from models.errors import BadParameter
+from models.recordings.effects import LINEAR, Effects
 from models.recordings.formats import file_suffix, refuse_other_logs, write_log
 from models.recordings.machines import COMMISSIONED, machine_identity, stream
 from models.recordings.motion_profile import Profile
@@ -23,7 +24,7 @@ _EVERY = timedelta(minutes=2)
 
 @dataclass(frozen=True, slots=True)
 class Experiment:
-    """What to drive: stage, condition, strokes of each move, dwell and window in s, seed."""
+    """What to drive: stage, condition, strokes of each move, dwell, window (s), seed, effects."""
 
     stage: Stage
     condition: Condition = NOMINAL
@@ -31,6 +32,7 @@ class Experiment:
     dwell: float = 0.5
     seconds: float = WINDOW_S
     seed: int = 0
+    effects: Effects = LINEAR
 
     def __post_init__(self) -> None:
         """Reject a window that no log can have."""
@@ -99,6 +101,7 @@ def drive_velocities(
             profile=move,
             seconds=experiment.seconds,
             rng=experiment.rng(move.velocity),
+            effects=experiment.effects,
         )
         travel_km += move.strokes * move.stroke * 1e-3
         row = {

@@ -19,10 +19,9 @@ from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series, Step
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
-from models.dynamics.stages import NOMINAL, Condition, stage_named
+from models.dynamics.stages import NOMINAL, Condition, Stage
 from models.lives.degradation import draw_laws
 from models.lives.simulation import Plan, Visit, schedule, simulate_life
-from models.recordings.recording import payload_kg
 from studies.harness.study import STUDIES, Trials, read_record
 
 Array = NDArray[np.float64]
@@ -62,6 +61,7 @@ class Life:
     # Of ln frequency at the reference temperature, the nominal payload and the tuning of
     # commissioning, (n, 3)
     drift: Array
+    regreased: tuple[int, ...] = ()  # first logs after regreasings that are declared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -97,10 +97,10 @@ def losing_life(plan: Plan) -> Life:
 
 def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
     """Take a life whose visits are those of its plan, with other conditions."""
-    stage = stage_named(plan.stage)
+    machine, drawn_life = plan.machine().stage, plan.draw_life()
     conditions = [visit.condition for visit in visits]
-    seen = np.array([_modes(plan.stage, condition) for condition in conditions])
-    own = np.array([_modes(plan.stage, _at_reference(condition))[0] for condition in conditions])
+    seen = np.array([_modes(visit.stage, visit.condition) for visit in visits])
+    own = np.array([_modes(machine, _at_reference(condition))[0] for condition in conditions])
     travel_km = np.array([visit.travel_km for visit in visits])
     event = int(np.searchsorted(travel_km, draw_laws(plan.rng("laws")).event_km))
     happens = plan.life in ("crash", "sudden-loosening", "regreasing", "servo-retuning")
@@ -111,8 +111,8 @@ def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
         recorded_at=tuple(visit.recorded_at for visit in visits),
         travel=1000.0 * travel_km,
         covariates={
-            "temperature_c": np.array([one.temperature_c for one in conditions]),
-            "payload_kg": np.array([payload_kg(stage, one) for one in conditions]),
+            "temperature_c": np.array([visit.logged_temperature_c for visit in visits]),
+            "payload_kg": np.array([visit.logged_payload_kg for visit in visits], dtype=float),
         },
         servo=np.array([one.servo_id for one in conditions]),
         event=event if happens and event < len(visits) else None,
@@ -120,7 +120,16 @@ def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
         ln_frequency=seen[:, 0],
         ln_damping=seen[:, 1],
         drift=own - own[0],
+        regreased=_logs_after(
+            [one.travel_km for one in drawn_life.work if one.action == "regrease"], travel_km
+        ),
     )
+
+
+def _logs_after(odometers_km: Sequence[float], travel_km: Array) -> tuple[int, ...]:
+    """Return the first logs at or after odometers, each once; none after the last log."""
+    first = np.unique(np.searchsorted(travel_km, odometers_km))
+    return tuple(int(k) for k in first if k < travel_km.size)
 
 
 def _at_reference(condition: Condition) -> Condition:
@@ -134,9 +143,9 @@ def _at_reference(condition: Condition) -> Condition:
 
 
 @lru_cache(maxsize=4096)
-def _modes(stage: str, condition: Condition) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def _modes(stage: Stage, condition: Condition) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return ln frequency and ln damping of the guide modes."""
-    modes = {mode.name: mode for mode in closed_loop_modes(stage_named(stage), condition)}
+    modes = {mode.name: mode for mode in closed_loop_modes(stage, condition)}
     return (
         tuple(float(np.log(modes[name].frequency_hz)) for name in GUIDE_MODES),
         tuple(float(np.log(modes[name].damping_ratio)) for name in GUIDE_MODES),
@@ -198,13 +207,27 @@ def history_of(
 
 def _declared(life: Life) -> tuple[Step, ...]:
     """Return the steps that maintenance and metadata declare."""
-    k = life.event
-    if k is None or life.kind not in ("regreasing", "servo-retuning"):
-        return ()
-    there = np.arange(life.travel.size) >= k
-    if life.kind == "regreasing":
-        return (Step("regreasing", k, there, name=f"{life.recorded_at[k]:%Y-%m-%d}"),)
-    return (Step("servo", k, there, name=str(life.servo[k])),)
+    after = np.arange(life.travel.size)
+    steps = [
+        Step("regreasing", k, after >= k, name=f"{life.recorded_at[k]:%Y-%m-%d}")
+        for k in life.regreased
+    ]
+    if life.event is not None and life.kind == "servo-retuning":
+        k = life.event
+        steps.append(Step("servo", k, after >= k, name=str(life.servo[k])))
+    return tuple(steps)
+
+
+def drawn_history(
+    stage: str, plant_seed: int, *, kind: str = "drawn", logs: int = 30, seed: int = 0
+) -> tuple[History, Life]:
+    """Draw a machine, the true modes of its logs, and estimates of them: no signal is simulated.
+
+    The covariances are those of `recorded`; ``seed`` draws the schedule and the errors.
+    """
+    life = life_of(replace(plan_of(stage, kind, seed, logs), plant_seed=plant_seed))
+    estimates = drawn(life, *recorded(stage), rng_of(41, plant_seed, seed))
+    return history_of(life, estimates), life
 
 
 def measured(stage: str, logs: int, kept: Path | None = None) -> tuple[Estimates, Life]:

@@ -53,6 +53,39 @@ def test_modes_agree_with_the_truth(tmp_path):
         assert modes[name] == pytest.approx(row[f"{name}_hz"], rel=1e-9)
 
 
+def test_a_plant_seed_draws_the_machine(tmp_path):
+    """Truth names the seed; two seeds are two machines, without one there are no drawn columns."""
+    common = ["simulate", "lms-y", "--life", "drawn", "--logs", "2", "--seconds", "0.1"]
+    tables = []
+    for name, more in (("1", ["--plant-seed", "1"]), ("2", ["--plant-seed", "2"]), ("none", [])):
+        out = tmp_path / name
+        result = CliRunner().invoke(cli, [*common, *more, "--out", str(out), "--workers", "1"])
+        assert result.exit_code == 0
+        tables.append(pd.read_csv(out / "truth.csv"))
+    first, second, nominal = tables
+    assert set(first["plant_seed"]) == {1} and set(second["plant_seed"]) == {2}
+    assert first["plant_block_stiffness"][0] != second["plant_block_stiffness"][0]
+    assert not [column for column in nominal if column.startswith("plant_")]
+    for option in ("--plant-seed", "--seed"):
+        wrong = CliRunner().invoke(cli, [*common, option, "-1", "--out", str(tmp_path / "x")])
+        assert wrong.exit_code == 2
+
+
+def test_a_drawn_machine_has_a_drawn_life(tmp_path):
+    """With a plant seed the life is `drawn` by default; without one it has to be named."""
+    common = ["simulate", "lms-y", "--logs", "2", "--seconds", "0.1", "--workers", "1"]
+    tables = []
+    for name, more in (("default", []), ("named", ["--life", "drawn"])):
+        folder = ["--plant-seed", "4", "--out", str(tmp_path / name)]
+        assert CliRunner().invoke(cli, [*common, *more, *folder]).exit_code == 0
+        tables.append(pd.read_csv(tmp_path / name / "truth.csv"))
+    pd.testing.assert_frame_equal(*tables)
+    wrong = CliRunner().invoke(cli, [*common, "--out", str(tmp_path / "x")])
+    assert wrong.exit_code == 2
+    assert "--life is missing" in wrong.output and "--plant-seed" in wrong.output
+    assert not (tmp_path / "x").exists()
+
+
 @pytest.mark.slow
 def test_map_has_its_columns(tmp_path):
     """The map holds the three guide modes over the grid."""

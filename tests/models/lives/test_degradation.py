@@ -25,8 +25,8 @@ from models.lives.degradation import (
     Steady,
     Stepped,
     draw_laws,
-    life_named,
 )
+from models.lives.further_lives import ALL_LIVES, life_named
 
 SEEDS = range(200)
 # What each life changes other than the temperature.
@@ -115,7 +115,7 @@ def test_unknown_life_lists_the_known():
     """An unknown life raises and names the registered ones."""
     with pytest.raises(UnknownLife, match="healthy") as caught:
         life_named("eternal", np.random.default_rng(0))
-    assert caught.value.known == tuple(LIVES)
+    assert caught.value.known == ALL_LIVES
 
 
 def test_draws_begin_as_they_always_did():
