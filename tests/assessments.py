@@ -20,10 +20,9 @@ from lmshealth._arrays import FloatArray
 from lmshealth._files import write_text
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.changes import Reported
+from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.signal.spectral_lines import Line
@@ -173,6 +172,7 @@ def make_prognosis(
         limits=np.array([*limits, np.nan]),
         remaining=np.column_stack([remaining, remaining.min(axis=1)]),
         usage=12e3 * np.exp(rng.normal(0, 0.08, n)),
+        half=remaining.min(axis=1) / 2,
         horizon=horizon,
         health=np.column_stack(present),
         curve_travel=grid + history.travel[0],
@@ -262,7 +262,14 @@ def make(tmp_path: Path) -> Maker:
                 ),
                 Refusal("logs/x.csv", "gap", "31 % of the samples are missing, 5 % are allowed"),
             ),
-            notes=("The temperature of 3 logs is missing; their estimates are less certain.",),
+            notices=(
+                Notice(
+                    "mode-missing",
+                    "caution",
+                    "",
+                    "The temperature of 3 logs is missing; their estimates are less certain.",
+                ),
+            ),
             seed=0,
             waterfall=make_waterfall(history),
         )
@@ -375,7 +382,7 @@ def worn(folder: Path, identity: str = "M7-Y") -> Assessment:
         prognosis=make_prognosis(history, 8000, 0.68),
         judgement=Verdict(identity, history.recorded_at[-1], "both", 0.93, "It is so."),
         refused=(Refusal("a.csv", "gap", "31 % are missing", channel="acc_feed"),),
-        notes=("The temperature of 3 logs is missing.",),
+        notices=(Notice("mode-missing", "caution", "", "The temperature of 3 logs is missing."),),
         seed=0,
         waterfall=make_waterfall(history),
     )
@@ -404,7 +411,7 @@ def write_report(
     assessments: Sequence[Assessment],
     refused: Sequence[Refusal],
     *,
-    earlier: Mapping[str, Reported] | None = None,
+    earlier: Mapping[str, Summary] | None = None,
     generated: datetime | None = None,
 ) -> list[Path]:
     """Write all pages as a run does; return those of the machines, most urgent first, and index."""

@@ -15,6 +15,8 @@ from lmshealth.tracking.history import History, Series
 
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.
 LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
+# Logs in a life, and what modes have in common of the variances of rates and of wander.
+LIFE, COMMON_RATE, COMMON_WANDER = 150, 0.9, 0.3
 BIAS = (0.005, 0.2)
 # Standard deviations of the jumps of ln f and ln ζ.
 JUMPS = {
@@ -28,22 +30,41 @@ JUMPS = {
 
 @dataclass(frozen=True)
 class Wander:
-    """One setting: walks and rate of ln f in a life, factors on the std of each source."""
+    """One setting: walks and rate of ln f in a life, factors on the std of each source.
+
+    A rate decays by ``decay`` per life. Readings wander by ``size`` of their first scaled errors,
+    with the correlation ``keep`` from log to log.
+    """
 
     level: float
     rate: float
     bend: float
     scales: Mapping[str, float]
+    decay: float = 0.0
+    size: float = 0.0
+    keep: float = 0.0
+
+    def moved(self, t: FloatArray) -> FloatArray:
+        """Give the change of ln f after so many lives, per initial rate."""
+        return (1 - np.exp(-self.decay * t)) / self.decay if self.decay else t
+
+    def stds(self, history: History) -> FloatArray:
+        """Give the standard deviation of the wander of each mode."""
+        std = []
+        for mode in history.modes:
+            own = [c for c, one in enumerate(history.series) if one.mode == mode]
+            std.append(_first(np.sqrt(np.array([np.diag(c)[own] for c in history.cov]))))
+        scale = stats.gmean(list(self.scales.values())) if self.scales else 1.0
+        return self.size * scale * np.array(std)
 
 
 @dataclass(frozen=True)
 class Known:
-    """What a stage says: ticks of a life, and covariates ``(name, reference, std, curvature)``.
+    """What a stage says: covariates ``(name, reference, std, curvature)``.
 
     Rates are unknown anew in front of the logs in ``reopened``.
     """
 
-    life: float
     covariates: Sequence[tuple[str, float, float, float]] = ()
     reopened: Sequence[int] = ()
 
@@ -59,6 +80,23 @@ class Followed:
     cov: FloatArray
     log_evidence: FloatArray
     nis: FloatArray
+
+
+def lives(history: History) -> FloatArray:
+    """Give the lives gone by at each log: their unit is the mean distance of logs so far."""
+    clock, gone, before, count = history.clock() - history.clock()[0], [0.0], 0.0, 0
+    for k in range(1, clock.size):
+        more = 0.0
+        if np.isfinite(history.ln_frequency[k]).any():
+            count += 1
+            mean = clock[k] / count
+            more, before = (clock[k] - before) / mean / LIFE if mean else 0.0, clock[k]
+        gone.append(gone[-1] + more)
+    return np.array(gone, dtype=np.longdouble)
+
+
+def _alike(common: float, n: int) -> FloatArray:
+    return np.array([[1.0 if i == j else common for i in range(n)] for j in range(n)])
 
 
 def _unknown(history: History, known: Known, k: int) -> float:
@@ -114,7 +152,7 @@ class Textbook:
 
     def __init__(self, history: History, wander: Wander, known: Known) -> None:
         self.history, self.wander, self.known = history, wander, known
-        parts = ("level", "rate", "damping", "base")
+        parts = ("level", "rate", "damping", "base", "wander")
         self.names: list[tuple[object, ...]] = [(p, i) for i in history.modes for p in parts]
         for name, _, _, curvature in known.covariates:
             self.names += [(name, i) for i in history.modes]
@@ -137,7 +175,6 @@ class Textbook:
             ):
                 x[self.at[part, i]] = _first(table[:, own])
                 p[self.at[part, i]] = std**2
-            p[self.at["rate", i]] = (self.wander.rate / self.known.life) ** 2
             for name, _, std, curvature in self.known.covariates:
                 p[self.at[name, i]] = std**2
                 if curvature:
@@ -147,24 +184,41 @@ class Textbook:
                 p[self.at[name]] = BIAS[0] ** 2
             if name[0] == "bias z":
                 p[self.at[name]] = BIAS[1] ** 2
-        return x, np.diag(p)
+        cov, m = np.diag(p), len(history.modes)
+        rates, wanders = self.all("rate"), self.all("wander")
+        cov[np.ix_(rates, rates)] = self.wander.rate**2 * _alike(COMMON_RATE, m)
+        std = self.wander.stds(history)
+        cov[np.ix_(wanders, wanders)] = np.outer(std, std) * _alike(COMMON_WANDER, m)
+        return x, cov
+
+    def all(self, part: str) -> list[int]:
+        """Give the places of a part of the state, mode by mode."""
+        return [self.at[part, i] for i in self.history.modes]
 
     def moved(self, k: int) -> tuple[FloatArray, FloatArray]:
         """Transition into log k and its noise: first time goes by, then steps, then the copy."""
-        history, at, wander, life = self.history, self.at, self.wander, self.known.life
+        history, at, wander = self.history, self.at, self.wander
         f, q = np.eye(len(at)), np.zeros((len(at), len(at)))
         if k > 0:
-            tick = float(history.clock()[k] - history.clock()[k - 1])
-            walk, bend = wander.level**2 / life, wander.bend**2 / life**3
-            for i in history.modes:
-                level, rate = at["level", i], at["rate", i]
-                # A rate that is unknown anew is so from the log before on.
-                anew = (wander.rate / life) ** 2 if k in self.known.reopened else 0.0
-                f[level, rate] = tick
-                q[level, level] = walk * tick + bend * tick**3 / 3 + anew * tick**2
-                q[level, rate] = q[rate, level] = bend * tick**2 / 2 + anew * tick
-                q[rate, rate] = bend * tick + anew
-                q[at["damping", i], at["damping", i]] = DAMPING_WALK**2 / life * tick
+            gone, m = lives(history), len(history.modes)
+            tick = float(gone[k] - gone[k - 1])
+            level, rate, own = self.all("level"), self.all("rate"), self.all("wander")
+            far, left = float(wander.moved(np.array(tick))), np.exp(-wander.decay * tick)
+            # A rate that is unknown anew is so from the log before on.
+            anew = wander.rate**2 * (k in self.known.reopened)
+            alike = _alike(COMMON_RATE, m)
+            bend = wander.bend**2
+            f[level, rate], f[rate, rate] = far, left
+            q[np.ix_(level, level)] = (bend * tick**3 / 3 + anew * far**2) * alike
+            q[level, level] += wander.level**2 * tick
+            q[np.ix_(level, rate)] = (bend * tick**2 / 2 + anew * far * left) * alike
+            q[np.ix_(rate, level)] = q[np.ix_(level, rate)]
+            q[np.ix_(rate, rate)] = (bend * tick + anew * left**2) * alike
+            q[self.all("damping"), self.all("damping")] = DAMPING_WALK**2 * tick
+            keep = wander.keep if np.isfinite(history.ln_frequency[k]).any() else 1.0
+            std = (1 - keep**2) * np.outer(wander.stds(history), wander.stds(history))
+            f[own, own] = keep
+            q[np.ix_(own, own)] = std * _alike(COMMON_WANDER, m)
         q += self._begun(k)
         if k in history.baselines:
             copy = np.eye(len(at))
@@ -196,6 +250,7 @@ class Textbook:
         h = np.zeros((2 * r, len(at)))
         for a, one in enumerate(history.series):
             h[a, at["level", one.mode]] = h[r + a, at["damping", one.mode]] = 1
+            h[a, at["wander", one.mode]] = 1
             for name, reference, _, curvature in self.known.covariates:
                 offset = _offset(history, name, reference, k)
                 h[a, at[name, one.mode]] = offset
@@ -261,26 +316,27 @@ def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
     return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
 
-def _levels(history: History, wander: Wander, known: Known) -> tuple[np.ndarray, np.ndarray]:
-    """Covariance of ln f, and of ln ζ, of one mode over all logs, ``(n, n)`` each.
+def _levels(history: History, wander: Wander, known: Known) -> list[np.ndarray]:
+    """Covariance of ln f, of ln ζ, and between ln f of two modes, over all logs, ``(n, n)`` each.
 
-    With t the ticks since the first log, that of ln f is
+    With t the lives since the first log, that of ln f is
     σ² + σ_r² t t' + walk min(t, t') + bend min² (3 max − min)/6 + Σ jump² where both come after it.
     """
-    t = (history.clock() - history.clock()[0]).astype(np.longdouble) / known.life
+    t = lives(history)
     low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
-    level = LEVEL_STD**2 + wander.rate**2 * np.outer(t, t) + wander.level**2 * low
-    level += wander.bend**2 * low**2 * (3 * high - low) / 6
+    rates = wander.rate**2 * np.outer(wander.moved(t), wander.moved(t))
+    rates += wander.bend**2 * low**2 * (3 * high - low) / 6
+    level = LEVEL_STD**2 + wander.level**2 * low
     damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
     for k in known.reopened:
-        since = np.maximum(t - t[k - 1], 0.0)
-        level += wander.rate**2 * np.outer(since, since)
+        since = wander.moved(np.maximum(t - t[k - 1], 0.0))
+        rates += wander.rate**2 * np.outer(since, since)
     for step in history.steps:
         if step.kind in ("step", "regreasing", "reset"):
             then = np.arange(t.size) >= step.first
             level += JUMPS[step.kind][0] ** 2 * np.outer(then, then)
             damping += JUMPS[step.kind][1] ** 2 * np.outer(then, then)
-    return level, damping
+    return [level + rates, damping, COMMON_RATE * rates]
 
 
 def _readings(history: History, known: Known, a: Series, c: Series, part: int) -> np.ndarray:
@@ -300,6 +356,26 @@ def _readings(history: History, known: Known, a: Series, c: Series, part: int) -
     return read
 
 
+def _between(
+    history: History,
+    wander: Wander,
+    shared: np.ndarray,
+    tables: tuple[np.ndarray, np.ndarray, np.ndarray],
+) -> None:
+    """Fill in what the series of all modes have in common: rates and wander of ln f."""
+    total, cross, own = tables
+    mode_of = history.mode_of()
+    logs, std = np.cumsum(np.isfinite(history.ln_frequency).any(axis=1)), wander.stds(history)
+    kept = wander.keep ** np.abs(np.subtract.outer(logs, logs)) * (1.0 if wander.size else 0.0)
+    for i in range(len(history.modes)):
+        for c, j in enumerate(mode_of):
+            if i != j:
+                own[:, 0, i, :, 0, j] = cross[:, 0, i, :, 0, c] = shared
+            alike = std[i] * std[j] * (1.0 if i == j else COMMON_WANDER) * kept
+            for a in np.flatnonzero(mode_of == i):
+                total[:, 0, a, :, 0, c] = alike + (shared if i != j else 0.0)
+
+
 def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = False) -> Followed:
     """Condition the whole joint Gaussian on the logs so far, or on all, without any recursion.
 
@@ -312,7 +388,9 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
     own = np.zeros((n, 2, m, n, 2, m), dtype=np.longdouble)
     centre, prior = np.zeros((n, 2, r)), np.zeros((n, 2, m))
     values = np.stack([history.ln_frequency, history.ln_damping], axis=1)
-    for part, truth in enumerate(_levels(history, wander, known)):
+    *truths, shared = _levels(history, wander, known)
+    _between(history, wander, shared, (total, cross, own))
+    for part, truth in enumerate(truths):
         for i, mode in enumerate(history.modes):
             series = [(a, one) for a, one in enumerate(history.series) if one.mode == mode]
             first = _first(values[:, part, [a for a, _ in series]])
@@ -321,7 +399,7 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
                 centre[:, part, a], cross[:, part, i, :, part, a] = first, truth
                 for c, other in series:
                     read = _readings(history, known, one, other, part)
-                    total[:, part, a, :, part, c] = truth + read
+                    total[:, part, a, :, part, c] += truth + read
     total = total.reshape(n * 2 * r, -1)
     for k in range(n):
         _, noise, rows = _data(history, known, wander, k)
@@ -395,7 +473,6 @@ class LifeBelief:
     """
 
     slopes: FloatArray
-    horizon: float
     model_std: float
     intercept_std: float
     reference: float = 21.0
@@ -404,7 +481,7 @@ class LifeBelief:
 
 @dataclass(frozen=True)
 class LifeSetting:
-    """A point of the grid: walk, factor on standard deviations, deviation at the horizon."""
+    """A point of the grid: walk, factor on standard deviations, deviation over the history."""
 
     walk: float
     scale: float
@@ -436,13 +513,13 @@ def life_covariance(
     values = history.covariates["temperature_c"][first:]
     unknown = np.isnan(values)
     offset = np.where(unknown, 0.0, values - belief.reference)
-    known = Known(1.0, (("temperature_c", belief.reference, belief.b_std, 0.0),))
+    known = Known((("temperature_c", belief.reference, belief.b_std, 0.0),))
     cov = np.zeros((len(where), len(where)))
     for a, (k, i) in enumerate(where):
         for c, (o, j) in enumerate(where):
             shared = min(clock[k], clock[o])
             for slope in belief.slopes:
-                cov[a, c] += slope[i] * slope[j] * setting.deviation**2 * shared / belief.horizon
+                cov[a, c] += slope[i] * slope[j] * setting.deviation**2 * shared / clock.max()
             if k == o:
                 cov[a, c] += setting.scale**2 * history.cov[first + k][i, j]
             if k == o and i == j and unknown[k]:
@@ -489,7 +566,7 @@ def life_deviation(
     where, values, clock = _life_data(history)
     r = values - np.array([predicted[k, i] for k, i in where])
     inverse = np.linalg.inv(life_covariance(history, alone, belief, setting))
-    unit = setting.deviation**2 / belief.horizon
+    unit = setting.deviation**2 / clock.max()
     p = belief.slopes.shape[0]
     cross = np.zeros((p, len(where)))
     for j in range(p):

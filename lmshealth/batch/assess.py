@@ -18,6 +18,7 @@ from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
+from lmshealth.io.log import Notice
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
     MachineEvidence,
@@ -26,12 +27,11 @@ from lmshealth.prognosis.fleet_prior import (
 )
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.changes import reported
+from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notes
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notes
+from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notices
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 
 PackedLogs = tuple[tuple[str, bytes], ...]
@@ -75,7 +75,7 @@ def assess(
     Returns
     -------
     Assessment
-        Results that the data do not support are None, with the reason among the notes.
+        Results that the data do not support are None, with the reason among the notices.
 
     Examples
     --------
@@ -87,12 +87,12 @@ def assess(
     >>> found = lmshealth.assess(examples.readings()[:2], stage, epochs=1)
     >>> found.judgement.verdict, found.judgement.why
     ('not-enough-data', '2 usable logs since the baseline began; it needs 5.')
-    >>> found.notes[0].split("; ")[1]
+    >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
     history, refused = build_history(readings, stage, work.actions)
-    notes = maintenance_notes(work, [reading.metadata.recorded_at for reading in readings])
-    notes += missing_mode_notes(history, refused)
+    notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
+    notices += missing_mode_notices(history, refused)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
@@ -105,7 +105,7 @@ def assess(
         prognosis=None,
         judgement=judge(stage, history, None),
         refused=(*not_excited, *refused),
-        notes=tuple(notes),
+        notices=tuple(notices),
         seed=seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
@@ -118,7 +118,7 @@ def assess(
 def _with_results(
     made: Assessment, readings: Sequence[LogEstimates], epochs: int, executor: Executor | None
 ) -> Assessment:
-    """Add the results up to the first that fails, and a note why it does."""
+    """Add the results up to the first that fails, and a notice why it does."""
     history, stage = made.history, made.stage
     seed = seed_of(made.seed, history.stage, stage.digest)
     try:
@@ -146,7 +146,7 @@ def _with_results(
             f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
             "with modes.csv"
         )
-    return replace(made, notes=(*made.notes, why))
+    return replace(made, notices=(*made.notices, Notice("no-result", "serious", "", why)))
 
 
 def map_in_order(
@@ -215,7 +215,7 @@ def _assessed(
     pool = resources.pool
     jobs = ((machine, packed_logs(machine, resources.store)) for machine in machines)
     if pool.executor is None or len(machines) >= pool.size:
-        for (machine, _), made in pool.map_unordered(_assess_packed, jobs, _reason):
+        for (machine, _), made in pool.map_unordered(_assess_packed, jobs, lambda _, why: why):
             yield machine, made
         return
     for machine, logs in jobs:
@@ -240,7 +240,8 @@ def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
 
 def pack_assessment(assessment: Assessment) -> PackedAssessment:
     """Encode an assessment for the store."""
-    evidence, summary = pack(assessment.evidence), pack(reported(assessment))
+    evidence = pack(assessment.evidence)
+    summary = pack(summarise(assessment, assessment.service()))
     return PackedAssessment(pack(assessment), evidence, summary)
 
 
@@ -282,7 +283,7 @@ def apply_fleet_priors(
     if left:
         resources.progress("fleet priors", 0, len(left))
     updates = ((m.name, key, store.assessment(m.name, m.key), prior) for m, prior, key in left)
-    done = resources.pool.map_unordered(_update, updates, _reason)
+    done = resources.pool.map_unordered(_update, updates, lambda _, why: why)
     for k, ((name, key, _, _), made) in enumerate(done, start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(name, key, made)
@@ -325,10 +326,6 @@ def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment 
         return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))
 
     return reason_if_failed(work, machine)
-
-
-def _reason(job: object, why: str) -> str:
-    return why
 
 
 def reason_if_failed(

@@ -7,24 +7,21 @@ from __future__ import annotations
 
 import csv
 import threading
-from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from tempfile import TemporaryFile
-from typing import IO, Self
+from typing import Self
 
 from lmshealth._files import replacing, write_text
+from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
-from lmshealth.io.log import Refusal
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.changes import Reported
+from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.machine_page import Page, make_page
-from lmshealth.report.tables import COLUMNS, Row, frame, machine_tables, refused_rows
+from lmshealth.report.tables import COLUMNS, Row, machine_tables
 from lmshealth.tracking.history import sort_by_time
 
 # matplotlib's settings are shared by the threads of a Dask worker.
@@ -42,33 +39,16 @@ class MachineRecord:
     file: str
     assessment: bytes | None
     logs: PackedLogs
-    before: Reported | None
+    before: Summary | None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineOutput:
-    """Page and table rows of a machine, and the logs that were excluded from its life."""
+    """Page and packed table rows of a machine, and the logs that were excluded from its life."""
 
     page: Page
-    tables: dict[str, CsvRows]
+    tables: bytes
     excluded: tuple[str, ...]
-
-
-@dataclass(frozen=True, slots=True)
-class CsvRows:
-    """Rows of a table as CSV without a header, and their columns."""
-
-    columns: tuple[str, ...]
-    n_rows: int
-    text: str
-
-    @classmethod
-    def of(cls, name: str, rows: Sequence[Row]) -> Self:
-        """Encode rows of a table."""
-        table = frame(COLUMNS[name], rows)
-        # With this line terminator a cell that contains CR or LF is quoted.
-        text = table.to_csv(index=False, header=False, lineterminator="\r\n")
-        return cls(tuple(table.columns), len(rows), text)
 
 
 def machine_output(record: MachineRecord) -> MachineOutput | None:
@@ -82,7 +62,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     rows = machine_tables(readings, found) if readings else {}
     return MachineOutput(
         page=page,
-        tables={name: CsvRows.of(name, own) for name, own in rows.items() if own},
+        tables=pack(rows),
         excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
     )
 
@@ -106,60 +86,48 @@ def _output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
 
 
 class Tables:
-    """Tables of a run, collected in parts whose columns may differ, in the order of machines.
+    """Tables of a run, whose rows are kept in a file until all machines are done.
 
     They replace older tables at the end: an interrupted run leaves those of the run before.
     """
 
     def __init__(self, folder: Path, machines: Sequence[str]) -> None:
         self._folder = folder
-        self._turns = deque(machines)
-        self._early: dict[str, Mapping[str, CsvRows]] = {}
-        self._stack = ExitStack()
-        self._files: dict[str, IO[str]] = {}
-        self._columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
+        self._order = ("", *machines)  # what belongs to no machine comes first
+        self._places: dict[str, tuple[int, int]] = {}
 
     def __enter__(self) -> Self:
-        for name in COLUMNS:
-            file = TemporaryFile("w+", encoding="utf-8", newline="", dir=self._folder)
-            self._files[name] = self._stack.enter_context(file)
+        self._file = TemporaryFile(dir=self._folder)
         return self
 
     def __exit__(self, *_: object) -> None:
-        self._stack.close()
+        self._file.close()
 
-    def add(self, machine: str, parts: Mapping[str, CsvRows]) -> None:
-        """Add the rows of a machine."""
-        self._early[machine] = parts
-        while self._turns and self._turns[0] in self._early:
-            self._append(self._early.pop(self._turns.popleft()))
+    def add(self, machine: str, tables: bytes) -> None:
+        """Add the packed rows of a machine by table, or those of none, whose name is empty."""
+        self._places[machine] = self._file.tell(), len(tables)
+        self._file.write(tables)
 
-    def _append(self, parts: Mapping[str, CsvRows]) -> None:
-        for name, part in parts.items():
-            self._columns[name] |= dict.fromkeys(part.columns)
-            csv.writer(self._files[name]).writerow([part.n_rows, *part.columns])
-            self._files[name].write(part.text)
-
-    def add_refused(self, refused: Iterable[Refusal]) -> None:
-        """Add refusals that belong to no machine."""
-        self._append({"refused": CsvRows.of("refused", refused_rows(refused))})
+    def _rows(self) -> Iterator[tuple[str, Row]]:
+        """Read the table and the cells of each row, in the order of the machines."""
+        for machine in self._order:
+            if machine in self._places:
+                place, size = self._places[machine]
+                self._file.seek(place)
+                for name, rows in unpack(self._file.read(size), dict[str, list[Row]]).items():
+                    yield from ((name, row) for row in rows)
 
     def write(self) -> None:
         """Replace the tables in the folder."""
-        for machine in self._turns:  # after a machine that was never added
-            self._append(self._early.pop(machine, {}))
-        for name, file in self._files.items():
-            file.seek(0)
-            with replacing(self._folder / f"{name}.csv") as target:
-                columns = list(self._columns[name])
-                writer = csv.DictWriter(target, columns, restval="", lineterminator="\n")
-                writer.writeheader()
-                writer.writerows(_rows(file))
-
-
-def _rows(file: IO[str]) -> Iterator[dict[str, str]]:
-    """Read back the rows of all parts."""
-    reader = csv.reader(file)
-    for n_rows, *columns in reader:
-        for row in islice(reader, int(n_rows)):
-            yield dict(zip(columns, row, strict=True))
+        columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
+        for name, row in self._rows():
+            columns[name] |= dict.fromkeys(row)
+        with ExitStack() as stack:
+            writers = {}
+            for name, own in columns.items():
+                target = stack.enter_context(replacing(self._folder / f"{name}.csv"))
+                writers[name] = csv.DictWriter(target, own, lineterminator="\n")
+                writers[name].writeheader()
+            for name, row in self._rows():
+                # NaN is a missing value.
+                writers[name].writerow({key: cell for key, cell in row.items() if cell == cell})

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
+from lmshealth._serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Resources, ingest
@@ -21,6 +22,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.assessment import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
+from lmshealth.report.tables import refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
 
@@ -244,7 +246,7 @@ def _report(
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
     with Tables(out, names) as tables:
-        tables.add_refused(refused)
+        tables.add("", pack({"refused": refused_rows(refused)}))
         left = list(machines)
         for attempt in range(constants.ASSESSMENT_ATTEMPTS):
             if attempt:
@@ -259,7 +261,6 @@ def _report(
             for name, output in write_pages(records, resources.pool, out):
                 if isinstance(output, str):
                     failed[name] = output
-                    tables.add(name, {})
                     continue
                 store.publish(name, (keys[name], own_keys[name]), refused_key)
                 tables.add(name, output.tables)

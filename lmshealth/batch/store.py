@@ -29,7 +29,7 @@ from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
-from lmshealth.report.changes import Reported
+from lmshealth.report.assessment import Summary
 from lmshealth.tracking.history import LogEstimates
 
 Outcome = LogEstimates | tuple[Refusal, ...]
@@ -233,7 +233,7 @@ class Store:
             connection.execute(self._upsert(_REPORTED, summary, where=of_this))
             connection.execute(others)
 
-    def previous_summary(self, machine: str, key: str) -> Reported | None:
+    def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
         query = (
             sql.select(_REPORTED.c.content)
@@ -241,7 +241,7 @@ class Store:
             .order_by(_REPORTED.c.number.desc())
         )
         with self._begin() as connection:
-            summaries = (unpack_or_none(row, Reported) for row in connection.scalars(query))
+            summaries = (unpack_or_none(row, Summary) for row in connection.scalars(query))
             return next((summary for summary in summaries if summary is not None), None)
 
     def published(self) -> tuple[Published, ...]:

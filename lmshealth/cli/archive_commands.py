@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from lmshealth.cli import options, terminal, views
-from lmshealth.cli.progress import progress_bars
 from lmshealth.report.rendering import write_pdfs
 
 if TYPE_CHECKING:
@@ -53,7 +52,7 @@ def run(
     from lmshealth.batch.run import run as run_pipeline
 
     pdf = given.pop("pdf")
-    with progress_bars() as progress:
+    with terminal.progress_bars() as progress:
         result = run_pipeline(logs, stages, out, Settings(**given), progress)
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
@@ -87,7 +86,7 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
     from lmshealth.batch.run import report as write_pages
     from lmshealth.batch.store import Store
 
-    with progress_bars() as progress, closing(Store(store, create=False)) as opened:
+    with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")
     terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import click
 
 from lmshealth.cli import options, terminal, views
-from lmshealth.cli.progress import progress_bars
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
     from lmshealth.modal.frf.measured import MeasuredResponse
     from lmshealth.modal.identification import AmbientReading
     from lmshealth.report.tables import Row
-    from lmshealth.stage.description import Stage
     from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
@@ -78,6 +76,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     criterion (MAC) of each pair of modes, and spectral lines.
     """
     from lmshealth.modal.mode_shapes import mode_shapes
+    from lmshealth.modal.naming import compare
     from lmshealth.report.tables import modes_rows, shapes_rows
     from lmshealth.signal.following_error import loop_error
     from lmshealth.tracking.history import LogEstimates
@@ -88,7 +87,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
     def estimate(log: Log) -> LogEstimates:
-        with progress_bars(_PATIENCE) as report:
+        with terminal.progress_bars(_PATIENCE) as report:
             reading = _read_modes(log, given, report)
         shapes, mac = shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes
@@ -103,7 +102,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     rows = [row for one in found for row in modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
-    if off := _off_description(found, stage):
+    pairs = [(r.log, one) for r in found if stage for one in compare(r.modes, stage)]
+    if off := [{"log": log, **one._asdict()} for log, one in pairs]:
         content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
@@ -131,15 +131,6 @@ def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) ->
         return read_ambient(log, given["stage"], **chosen, progress=report)
     found = identify_decays(log, given["stage"], **chosen)
     return AmbientReading(found, settling_spectra(log, given["channels"]))
-
-
-def _off_description(found: Sequence[LogEstimates], stage: Stage | None) -> list[Row]:
-    """Return rows of declared and found values of logs that differ from their description."""
-    from lmshealth.modal.naming import compare
-
-    if stage is None:
-        return []
-    return [{"log": r.log, **one._asdict()} for r in found for one in compare(r.modes, stage)]
 
 
 def _check_outputs(given: dict[str, Any]) -> None:

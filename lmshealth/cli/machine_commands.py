@@ -14,8 +14,7 @@ from numpy.linalg import LinAlgError
 
 from lmshealth._files import write_draws, write_text
 from lmshealth.cli import options, views
-from lmshealth.cli.progress import progress_bars
-from lmshealth.cli.terminal import print_errors, print_notes
+from lmshealth.cli.terminal import print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
 
 if TYPE_CHECKING:
@@ -90,9 +89,9 @@ def track(table: Path, **given: Any) -> None:
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Return what the reader of a track must take into account."""
-    from lmshealth.tracking.history import missing_mode_notes
+    from lmshealth.tracking.history import missing_mode_notices
 
-    notes = missing_mode_notes(history, refused)
+    notes = [notice.what for notice in missing_mode_notices(history, refused)]
     if not history.has_odometer:
         notes.append("not every log has travel_km: the clock is the time")
     if len(history.logs) == 1:
@@ -239,7 +238,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     from lmshealth.prognosis.maintenance_decision import decide, probability_before
     from lmshealth.report.assessment import summarise_life
     from lmshealth.report.tables import prognosis_rows
-    from lmshealth.tracking.history import missing_mode_notes
+    from lmshealth.tracking.history import missing_mode_notices
     from lmshealth.tracking.read_tables import read_machines
 
     stage, by = given["stage"], given["by"]
@@ -248,7 +247,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     machines, notes = read_machines(table, stage, **more)
     print_notes(notes)
     for history, refused in machines:
-        print_notes(f"{history.stage}: {note}" for note in missing_mode_notes(history, refused))
+        missing = missing_mode_notices(history, refused)
+        print_notes(f"{history.stage}: {notice.what}" for notice in missing)
     with progress_bars() as progress:
         found, lost = _prognose_machines([history for history, _ in machines], given, progress)
     rows = []

@@ -1,20 +1,24 @@
-"""Output to a terminal: tables, JSON, wrapped text."""
+"""Output to a terminal: tables, JSON, wrapped text, progress bars of long jobs."""
 
 from __future__ import annotations
 
 import json
 import math
+import sys
+import time
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from string import Formatter
 from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import click
-from rich import box
+from rich import box, progress
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from lmshealth.report.text import fixed, number, percent, plain
 
@@ -119,3 +123,43 @@ def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
     shared = Counter(names.values())
     names = {log: name if shared[name] == 1 else log for log, name in names.items()}
     return [row | {"log": names[row["log"]]} for row in rows]
+
+
+class _Rate(progress.ProgressColumn):
+    """Rate per second, or per minute below one per second."""
+
+    def render(self, task: progress.Task) -> Text:
+        """Return the rate; empty until it is measured."""
+        speed = task.finished_speed or task.speed
+        if not speed:
+            return Text("")
+        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min")
+
+
+@contextmanager
+def progress_bars(delay: float = 0.0) -> Iterator[Any]:
+    """Show progress bars on standard error if it is a terminal; yield their callback.
+
+    Nothing is shown in the first ``delay`` seconds.
+    """
+    shown_from = time.monotonic() + delay
+    with progress.Progress(
+        progress.TextColumn("{task.description:<12}"),
+        progress.BarColumn(),
+        progress.MofNCompleteColumn(),
+        _Rate(),
+        progress.TimeRemainingColumn(),
+        console=Console(stderr=True),
+        disable=not sys.stderr.isatty(),
+    ) as bars:
+        tasks: dict[str, Any] = {}
+
+        def report(what: str, done: int, total: int) -> None:
+            if time.monotonic() < shown_from:
+                return
+            if what not in tasks:
+                # Work that is done at the start was cached and does not count for the rate.
+                tasks[what] = bars.add_task(what, total=total, completed=done)
+            bars.update(tasks[what], completed=done, total=total)
+
+        yield report

@@ -46,6 +46,7 @@ _FLAGS = {
     "at-bound": "at the end of the search; check the description.",
     "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
     "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
+    "unsteady": "its excitation varies over time, which the standard deviations include.",
     "cluster": "one estimate for two modes that the data do not separate.",
     "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }
@@ -639,6 +640,10 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
         yield f"Probability that a limit has already been reached, at most: {risk}."
     elif not service.max_risk or risk != percent(service.max_risk):
         yield f"Probability that a limit is reached before that day, at most: {risk}."
+    if service.inspect_by is not None:
+        every = _km(service.inspect_every)
+        often = f", then every {every} km" if math.isfinite(service.inspect_every) else ""
+        yield f"Inspect (record a log) by {service.inspect_by}{often}."
     if service.planned is not None:
         planned = probability_range(service.planned_risk)
         yield f"Before the service planned for {service.planned}: {planned}."

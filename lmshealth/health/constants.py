@@ -36,3 +36,7 @@ MIN_WIDENING = 1.2
 EDGE_SHARE = 0.01
 """A posterior is at the edge if its 5 or 95 % quantile is closer to an end of the map than this
 share of the map's range in ln parameter."""
+
+STEP_PROBABILITY = 0.1
+"""Prior probability that a machine has a sudden change without declared cause since its baseline.
+The tracker's evidence for a step is against wander, outliers and running-in at their own priors."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
 from typing import TYPE_CHECKING
@@ -29,7 +29,7 @@ CHECKS = (
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Health:
-    """Posterior of the health parameters per epoch, as fractions of their baseline value.
+    """Posterior of the health parameters per epoch, in their units.
 
     Arrays have the shape ``(n_epochs, n_parameters)`` where none is stated.
     """
@@ -74,6 +74,11 @@ class Health:
         for name in ("travel", "converged", "fit"):
             expect_shape(name, getattr(self, name), (n,))
         freeze(self)
+
+    def relative_to(self, baselines: FloatArray) -> Health:
+        """Return the posterior of the parameters divided by their baseline values."""
+        width = self.prior_width / baselines
+        return replace(self, chains=self.chains / baselines, prior_width=width)
 
     @property
     def samples(self) -> FloatArray:

@@ -30,6 +30,24 @@ class Refusal:
 
 
 @dataclass(frozen=True, slots=True)
+class Notice:
+    """What the reader of a result must take into account: one row of ``warnings.csv``.
+
+    Severities: of a ``note`` the result takes account; a ``caution`` may make it wrong or old; what
+    is ``serious`` withholds it, or makes it unreliable.
+    """
+
+    code: str
+    severity: Literal["note", "caution", "serious"]
+    where: str  # mode, parameter or file; empty for the whole machine
+    what: str  # a sentence
+    to_do: str = ""  # a sentence
+
+    def __str__(self) -> str:
+        return f"{self.what} {self.to_do}".rstrip()
+
+
+@dataclass(frozen=True, slots=True)
 class Metadata:
     """Metadata of a log; None where nothing is stated."""
 

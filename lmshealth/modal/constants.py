@@ -67,6 +67,9 @@ STABLE, LEAST_START, LEAST_EXCESS, MOST_FOUND = 0.4, 15.0, 40.0, 5
 # Dispersion (variance of the residual over that of noise): flagged as loose-fit, refused as
 # poor-fit; and the ordinates needed to measure it.
 LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30
+# Mean square of the intensity of a mode's excitation over the square of its mean, flagged as
+# unsteady: intervals are wider by a tenth; and standard deviations of steady noise above one.
+UNSTEADY, UNSTEADY_SIGMAS = 1.2, 5.0
 # Fourier frequencies in the half-power bandwidth below which a mode is flagged resolution-limited.
 RESOLVED = 4.0
 # Share of the search, or of the span of dampings, beyond which a mode is flagged at-bound.

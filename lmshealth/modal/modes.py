@@ -19,7 +19,7 @@ from lmshealth.signal.spectral_lines import Line
 
 # Fields of `Modes` with one entry per mode.
 _TEXTS = ("names", "sources", "channels", "flags")
-_ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion")
+_ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion", "excitation")
 
 
 class Rejection(NamedTuple):
@@ -57,7 +57,8 @@ class Modes:
         Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
         half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
         ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes),
-        ``doubtful-name`` (may be another mode).
+        ``unsteady`` (the intensity of its excitation varies), ``doubtful-name`` (may be another
+        mode).
     shape_channels : tuple of str
         Channels of the shapes; empty where shapes were not identified.
     shapes : ndarray
@@ -68,6 +69,9 @@ class Modes:
         Spectral lines excluded from the likelihood.
     refused : tuple of Refusal
         Modes that were sought and are not published, with the reason.
+    excitation : ndarray
+        Root mean square acceleration of the mode in m/s², over time, as a norm over the channels;
+        NaN (the default) where it was not measured. Shape ``(n_modes,)``.
     """
 
     names: tuple[str, ...]
@@ -83,9 +87,12 @@ class Modes:
     shapes: FloatArray
     lines: tuple[Line, ...]
     refused: tuple[Refusal, ...]
+    excitation: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
         n = len(self.names)
+        if self.excitation is None:
+            object.__setattr__(self, "excitation", np.full(n, np.nan))
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")

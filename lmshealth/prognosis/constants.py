@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.stage.priors import Normal
+from lmshealth.stage.priors import Lognormal, Normal
 
 # What a life needs.
 MIN_LOGS = 3
@@ -27,9 +27,9 @@ NOISE_SCALES = (1.0, 1.5, 2.25)
 """Factors on the reported standard deviations of ln f; 1 is probable, as 95 % intervals of the
 identification cover 95 % (studies/identification)."""
 NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
-DEVIATION_STDS = (0.0, 0.04, 0.15)
-"""Standard deviations at the horizon of ln health about its law: exact laws, and deviations of a
-tenth and of a third of the loss at a limit of 0.6."""
+DEVIATION_STDS = (0.0, 0.0125, 0.05)
+"""Standard deviations over the history of ln health about its law: exact laws, and deviations that
+grow to a tenth and to a third of the loss at a limit of 0.6 over ten times the travel seen."""
 DEVIATION_PRIOR = (0.6, 0.3, 0.1)
 
 # Posterior over scenarios, see README.md.
@@ -40,6 +40,18 @@ MIN_CHAIN_PROBABILITY = 0.1
 draws is too small for chains to change a quantile."""
 MAX_LOG_ODDS = 9.0
 """Scenarios so much less probable than the best by a rough evidence are dropped (1 : 8100)."""
+
+# Beyond the laws, see README.md.
+RATE_STD, ACCELERATION_STD = 0.075, 1.0
+"""Standard deviation of ln of the travel left by a law for a future as long as the travel seen;
+intervals open with distance. The second is of a loss that accelerates: logs up to now determine
+neither its exponent nor whether the acceleration lasts."""
+UNSEEN_ONSETS = 0.5
+"""Onsets of a fast end in the travel seen, in place of the none that happened: the Gamma shape of
+the hazard by Jeffreys's prior [Jeffreys1946]. A life of twice the travel seen is not certain."""
+UNSEEN_GROWTH = Lognormal(0.2, 1.0)
+"""Travel from such an onset to the end over the travel at the onset: 4 % to 100 % (90 %), sudden
+breaks to wear that doubles its rate once."""
 
 # Fleet prior, see README.md.
 MIN_MACHINES = 3
@@ -54,6 +66,10 @@ FLEET_VARIANCE = (np.arange(12) + 0.5) / 12
 fifth of the prior's standard deviation: machines that are more alike change no date."""
 FLEET_DIGITS = 2
 """Significant digits of a fleet prior: with more, one new log would recompute a whole fleet."""
+
+INSPECTION_RISK = 0.2
+"""Share of the accepted risk that may come from ends between two logs that no log announced: small,
+as the service date uses the risk that is accepted."""
 
 MIN_SAVING = 0.01
 """A service that saves a smaller share of the long-run costs gets no date: 10,000 draws do not

@@ -70,11 +70,6 @@ class LifeData(ReadOnly):
         return float(self.clock.max())
 
     @property
-    def horizon(self) -> float:
-        """Travel in m beyond which no remaining life is published."""
-        return self.stage.description.usage.horizon_km * 1000.0
-
-    @property
     def log_of(self) -> np.ndarray:
         """Index of the log of each datum, shape ``(n_data,)``."""
         return np.asarray(self.rows % self.clock.size)

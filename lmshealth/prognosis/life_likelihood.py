@@ -35,7 +35,7 @@ class LifeCovariance(ReadOnly):
 
     `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
     of the estimates; `walk` the random walk of ln f with variance 1 at the last log; `deviation`
-    that of ln health with variance 1 at the horizon.
+    that of ln health, likewise.
     """
 
     fixed: FloatArray
@@ -65,7 +65,7 @@ class LifeCovariance(ReadOnly):
             fixed=(np.kron(same, common) + _offsets(data, same))[own],
             noise=noise.reshape(size, size)[own],
             walk=np.kron(same, shared / data.now)[own],
-            deviation=np.kron(sensitivity @ sensitivity.T, shared / data.horizon)[own],
+            deviation=np.kron(sensitivity @ sensitivity.T, shared / data.now)[own],
         )
 
     def factor(self, walk: float, noise_scale: float, deviation: float) -> FloatArray:
@@ -213,7 +213,7 @@ class LifeLikelihood:
         data, deviation = self.data, float(grid.deviation[k])
         point = grid[np.arange(grid.walk.size) == k]
         factor = self.covariance.factor(float(grid.walk[k]), float(grid.noise_scale[k]), deviation)
-        unit = deviation**2 / data.horizon
+        unit = deviation**2 / data.now
         shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)
         cross = shared[:, None] * data.sensitivity[data.mode_of].T
         n_moments, p, n_data = cross.shape

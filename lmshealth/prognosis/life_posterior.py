@@ -97,7 +97,7 @@ class LifeDensity:
         n_parameters)``, independent from moment to moment, and their variance per m of future
         travel ``(n, n_parameters)``.
         """
-        free, horizon = self.likelihood.data.free, self.likelihood.data.horizon
+        free, now = self.likelihood.data.free, self.likelihood.data.now
         # Without coordinates all draws are of one life.
         one = y[:1] if not self.scenario.n_dim else y
         x, _ = self.likelihood.path(self.scenario, one)
@@ -112,7 +112,7 @@ class LifeDensity:
             least = 1e-15 * np.eye(cov.shape[-1])
             unit = rng.standard_normal((own.sum(), *mean.shape[1:], 1))
             off[own] = mean + (np.linalg.cholesky(cov + least) @ unit)[..., 0]
-        return off * free, self.grid.deviation[point, None] ** 2 / horizon * free
+        return off * free, self.grid.deviation[point, None] ** 2 / now * free
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -11,9 +11,11 @@ import numpy as np
 from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.results import Prognosis
+from lmshealth.stage.constants import MAX_RISK
 from lmshealth.stage.description import Decision
 
 _SECONDS_PER_DAY = 86_400.0
+_SHORTER = 0.9  # factor between the intervals of logs that are tried
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -42,6 +44,12 @@ class Service:
     planned_risk: tuple[float, float]  # bounds of the probability to reach a limit before it
     max_risk: float | None  # max_risk, cost_ratio: criterion; one of them is None
     cost_ratio: float | None
+    # Last day of the next log, and the travel in m from one log to the next; None and infinite if
+    # the horizon comes first.
+    inspect_by: date | None = None
+    inspect_every: float = np.inf
+    # Day before which an end has at most the risk of `inspect_by`; None beyond the horizon.
+    earliest_end: date | None = None
 
     @property
     def kept_risk(self) -> float | None:
@@ -81,7 +89,12 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
         kind = "now" if by <= prognosis.recorded_at.date() else "by"
     risk = np.nan if by is None else _any_risk(prognosis, by)[1]
     planned_risk = unknown if planned is None else _any_risk(prognosis, planned)
-    return Service(kind, by, wait, risk, planned, planned_risk, *criterion)
+    every, earliest = _inspection(prognosis, decision)
+    next_log = day_after(prognosis, every / float(np.median(prognosis.usage)))
+    dates = [day for day in (next_log, by) if day is not None]
+    log_by = min(dates) if dates else None
+    end = day_after(prognosis, earliest)
+    return Service(kind, by, wait, risk, planned, planned_risk, *criterion, log_by, every, end)
 
 
 def _any_risk(prognosis: Prognosis, day: date) -> tuple[float, float]:
@@ -107,6 +120,24 @@ def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
         cost = (1 + (cost_ratio - 1) * failed / n) / (age + mean_travel)
     best = int(np.argmin(cost))
     return float(planned[best]) if cost[best] < (1 - constants.MIN_SAVING) * cost[-1] else np.inf
+
+
+def _inspection(prognosis: Prognosis, decision: Decision) -> tuple[float, float]:
+    """Return the longest travel in m between logs, and the days to the earliest plausible end.
+
+    An end is missed if no log falls between the loss of half of the margin and the end; at most a
+    share `constants.INSPECTION_RISK` of the accepted risk is. Infinite beyond the horizon.
+    """
+    risk = constants.INSPECTION_RISK * (decision.accepted or MAX_RISK)
+    left, n = prognosis.remaining[:, -1], prognosis.usage.size
+    ends = (left > 0) & (left <= prognosis.horizon)
+    half, left = prognosis.half[ends], left[ends]
+    half = np.where(half < left, half, left / 2)  # a deviation may end a draw before its law does
+    every = np.inf if left.size <= risk * n else prognosis.horizon
+    while np.isfinite(every) and np.sum(np.ceil(half / every) * every >= left) > risk * n:
+        every *= _SHORTER
+    days = float(np.quantile(remaining_days(prognosis)[:, -1], risk, method="inverted_cdf"))
+    return every, days
 
 
 def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:

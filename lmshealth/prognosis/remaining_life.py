@@ -9,9 +9,11 @@ import numpy as np
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.health.ensemble_sampling import stream
+from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.prognosis.scenarios import DegradationPath
+from lmshealth.stage.degradation_laws import Accelerating, Law
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
 from lmshealth.tracking.history import History
@@ -88,7 +90,7 @@ def prognose_with_posterior(
     horizon = stage.description.usage.horizon_km * _KM
     since = float(history.travel[-1] - history.travel[history.baseline])
     of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds)
-    remaining = remaining_travel(life, limited, of_passage, now=since, horizon=horizon)
+    remaining, half = _passages(life, limited, of_passage, now=since, horizon=horizon)
     usage = _usage(history, stage, of_usage, remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
     columns = [j for j, _ in limited]
@@ -103,6 +105,7 @@ def prognose_with_posterior(
         limits=np.array([p.limit.below for _, p in limited if p.limit] + [np.nan]),
         remaining=remaining,
         usage=usage,
+        half=half,
         horizon=horizon,
         health=life.health.reshape(-1, len(life.parameters))[:, columns] * unit,
         curve_travel=travel + history.travel[history.baseline],
@@ -136,19 +139,68 @@ def remaining_travel(
     For parameters with a limit, and their indices; `now` is the travel in m since the baseline, and
     the horizon is in m from now. Shape ``(n_draws, n_limits + 1)``, in the order of the draws.
     """
+    return _passages(life, limited, rng, now=now, horizon=horizon)[0]
+
+
+def _passages(
+    life: LifePosterior,
+    limited: Sequence[tuple[int, ParameterSpec]],
+    rng: np.random.Generator,
+    *,
+    now: float,
+    horizon: float,
+) -> tuple[FloatArray, FloatArray]:
+    """Return the result of `remaining_travel`, and `half` of `Prognosis`."""
     parts = []
     for one, off, rate in life.by_scenario():
         theta = one.scenario.split(one.scenario.natural(one.mixture_draws))
-        columns = []
+        columns, halves = [], []
         for j, parameter in limited:
             assert parameter.limit is not None
             path, limit = one.scenario.paths[j], parameter.limit.below / parameter.baseline
             of_health = (path, theta[j], off[:, j], rate[:, j], rng)
             columns.append(first_passage(*of_health, now=now, limit=limit, horizon=horizon))
-        found = np.column_stack([*columns, np.min(columns, axis=0)])
+            by_law = path.health(theta[j], np.array([now]))[:, 0]
+            halves.append(
+                path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
+            )
+            if path.law.names:
+                opened = _beyond_laws(rng, path.law, columns[-1], halves[-1], now)
+                columns[-1], halves[-1] = opened
+        first = np.argmin(columns, axis=0)[None]
+        half = np.take_along_axis(np.array(halves), first, axis=0)[0]
+        found = np.column_stack([*columns, np.min(columns, axis=0), half])
         parts.append(found.reshape(life.rate.shape[0], one.n_mixture_draws, -1))
     joined = np.concatenate(parts, axis=1)
-    return joined.reshape(-1, joined.shape[-1])
+    joined = joined.reshape(-1, joined.shape[-1])
+    return joined[:, :-1], joined[:, -1]
+
+
+def rate_std(law: Law) -> float:
+    """Return the standard deviation of ln of the travel left as `constants.RATE_STD` has it."""
+    late = isinstance(law, Accelerating)
+    return constants.ACCELERATION_STD if late else constants.RATE_STD
+
+
+def _beyond_laws(
+    rng: np.random.Generator, law: Law, left: FloatArray, half: FloatArray, now: float
+) -> tuple[FloatArray, FloatArray]:
+    """Open passages by a law, in m from now: README.md, "Beyond the laws".
+
+    The rate of the law drifts, and an end that no log shows yet may come sooner. For the travel
+    left and that to half of the loss, shape ``(n,)`` each.
+    """
+    ahead = np.where(np.isfinite(left), np.maximum(left, 0.0), 0.0)
+    factor = np.exp(
+        rate_std(law) * np.sqrt(np.log2(1 + ahead / now)) * rng.standard_normal(left.size)
+    )
+    with np.errstate(over="ignore"):
+        onset = now * np.expm1(rng.exponential(size=left.size) / constants.UNSEEN_ONSETS)
+    growth = constants.UNSEEN_GROWTH.quantile(rng.uniform(1e-9, 1 - 1e-9, left.size))
+    growth = (now + onset) * growth
+    sooner = left * factor > onset + growth
+    half = np.where(sooner, onset + np.sqrt(0.5) * growth, half * factor)
+    return np.where(sooner, onset + growth, left * factor), half
 
 
 def first_passage(
@@ -251,7 +303,8 @@ def _usage(
         raise NotEnoughData(f"{history.stage}: the odometer gives no usage; {needed}")
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
-    ahead = np.clip(remaining, 0.01 * horizon, horizon) / rate
+    # Over less than the time between two logs the usage was never observed.
+    ahead = np.maximum(np.minimum(remaining, horizon) / rate, days.mean())
     scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
     # Usage is positive: errors are those of its logarithm, with the tails of few logs cut at e^5.
     return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))

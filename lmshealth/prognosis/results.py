@@ -38,6 +38,9 @@ class Prognosis:
     # is never reached, ``(n_draws, n + 1)``; and of the mean travel in m per day, ``(n_draws,)``.
     remaining: FloatArray
     usage: FloatArray
+    # Draws of the travel in m, by the laws, at which half of ln(health now / limit) is lost, of the
+    # limit that is reached first, ``(n_draws,)``.
+    half: FloatArray
     horizon: float  # travel in m beyond which nothing is published
     health: FloatArray  # draws of the parameters now in their units, ``(n_draws, n)``
     # Odometer grid in m of the life curves, ``(n_grid,)``, and 5, 25, 50, 75, 95 % quantiles of the
@@ -48,7 +51,7 @@ class Prognosis:
     chi_square: float  # of the residuals at the posterior mean
     degrees_of_freedom: int  # number of data minus law parameters
     # Posterior means: standard deviation over the history of the random walk of ln f, factor on the
-    # reported standard deviations, standard deviation at the horizon of ln health about its laws.
+    # reported standard deviations, standard deviation over it of ln health about its laws.
     walk: float
     noise_scale: float
     deviation: float
@@ -59,7 +62,8 @@ class Prognosis:
         n = len(self.parameters)
         expect_shape("limits", self.limits, (n,))
         expect_shape("remaining", self.remaining, (self.remaining.shape[0], n))
-        expect_shape("usage", self.usage, (self.remaining.shape[0],))
+        for name in ("usage", "half"):
+            expect_shape(name, getattr(self, name), (self.remaining.shape[0],))
         expect_shape("health", self.health, (self.health.shape[0], n - 1))
         expect_shape("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
         freeze(self)

@@ -11,7 +11,7 @@ import numpy as np
 
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict, degraded_words, undeclared_events
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
@@ -37,7 +37,7 @@ class Assessment:
     prognosis: Prognosis | None  # none without health, or without a limit
     judgement: Verdict
     refused: tuple[Refusal, ...]  # everything of this machine that was not analysed
-    notes: tuple[str, ...]  # what the reader must take into account, one sentence each
+    notices: tuple[Notice, ...]  # about logs and maintenance; `report.notices` adds the others
     seed: int  # seed of all random streams
     # Spectra of the logs of the history; None when no log covers the band of the modes.
     waterfall: Waterfall | None = None
@@ -62,9 +62,12 @@ class Assessment:
 
     @property
     def latest_health(self) -> Health | None:
-        """The health, if it has an epoch and a parameter."""
+        """The health as fractions of the baseline, if it has an epoch and a parameter."""
         health = self.health
-        return health if health is not None and health.recorded_at and health.parameters else None
+        if health is None or not (health.recorded_at and health.parameters):
+            return None
+        specs = {spec.name: spec.baseline for spec in self.stage.parameters}
+        return health.relative_to(np.array([specs[name] for name in health.parameters]))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: days until the service; without a verdict before safe machines."""
@@ -136,12 +139,16 @@ class Life:
 
 @dataclass(frozen=True, slots=True)
 class Summary:
-    """A machine as the fleet page and a terminal show it, in a few numbers."""
+    """A machine in a few numbers, for the fleet page, a terminal and later reports."""
 
     file: str  # its page, in the folder of the fleet page
     identity: str
     urgency: tuple[int, float, float, str]  # sort key, most urgent first
-    last_log: date
+    recorded_at: datetime  # recorded_at, baseline_at: the last log, and that at the baseline
+    baseline_at: datetime
+    description: str  # digest of the stage description
+    n_logs: int
+    travel: float  # odometer at the last log in m, NaN without one
     state: State  # ``good``, ``bad`` or ``open`` (no verdict)
     headline: str  # the verdict in words
     verdict: str  # verdict, probability, why: as in `Verdict`
@@ -155,13 +162,18 @@ class Summary:
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
+    history = assessment.history
     states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
         file=file,
         identity=judgement.stage,
         urgency=assessment.urgency(service),
-        last_log=judgement.recorded_at.date(),
+        recorded_at=judgement.recorded_at,
+        baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
+        description=assessment.stage.digest,
+        n_logs=len(history.logs),
+        travel=float(history.travel[-1]) if history.logs else np.nan,
         state=state,
         headline=_headline(assessment),
         verdict=judgement.verdict,

@@ -22,7 +22,6 @@ from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants
-from lmshealth.report.svg import compact
 from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -38,7 +37,7 @@ BLUE, RED, GREEN = "#0072b2", "#c44e00", "#007a5a"
 _NAMED = {INK: "ink", MUTED: "muted", GRID: "line", PAPER: "card"}
 _NAMED |= {BLUE: "blue", RED: "red", GREEN: "green"}
 _STYLE: dict[str, Any] = {
-    "font.family": "DejaVu Sans",  # comes with matplotlib: the same outlines everywhere
+    "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same layout everywhere
     "font.size": 9,
     "text.usetex": False,
     "axes.edgecolor": MUTED,
@@ -52,7 +51,7 @@ _STYLE: dict[str, Any] = {
     "hatch.linewidth": 0.6,
     "legend.fontsize": 8,
     "legend.frameon": False,
-    "svg.fonttype": "path",
+    "svg.fonttype": "none",
     **dict.fromkeys(("xtick.color", "ytick.color"), MUTED),
     **dict.fromkeys(("axes.labelcolor", "legend.labelcolor", "text.color"), INK),
     **dict.fromkeys(("xtick.labelcolor", "ytick.labelcolor"), INK),
@@ -81,12 +80,32 @@ def inline(draw: Callable[[Figure], object], *, salt: str, size: tuple[float, fl
     text = print_figure(draw, size, salt=salt).decode()
     text = _LINK.sub(r'<g class="hint" fill-opacity="0.004"><title>\1</title>', text)
     text = text.replace("</a>", "</g>").replace(_CLEAR, "")
-    text = compact(text[text.index("<svg") :])
-    # Glyphs and groups have the same identifiers in every figure: make them unique.
+    text = _compact(text[text.index("<svg") :])
+    # Groups have the same identifiers in every figure: make them unique.
     text = re.sub(r'(\sid="|href="#|url\(#)', rf"\g<1>{salt}-", text)
     for colour, name in _NAMED.items():
         text = text.replace(colour, f"var(--{name}, {colour})")
     return text.replace("<svg ", '<svg aria-hidden="true" focusable="false" ', 1)
+
+
+def _compact(text: str) -> str:
+    """Remove invisible content of an SVG by matplotlib: a third of its text."""
+    text = re.sub(r"(?s)<!--.*?-->|<metadata>.*?</metadata>", "", text)
+    text = re.sub(r"\n\s*", "\n", text).strip().replace("xlink:href", "href")
+    # Two decimals of a point are finer than screens and printers.
+    places = r'\s[dxy]="[^"]*"|translate\([^)]*\)'
+    text = re.sub(places, lambda m: re.sub(r"(\.\d\d)\d+", r"\1", m[0]), text)
+    text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
+    text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
+    # Successive equal markers share their style.
+    text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
+    used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
+    text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
+    return re.sub(r"<g>\n(<(?:use|path) [^>]*/>)\n</g>", r"\1", text)
+
+
+def _once(found: re.Match[str]) -> str:
+    return f"<g {found[1]}>\n{found[0].replace(f' {found[1]}', '')}</g>\n"
 
 
 def print_figure(
@@ -108,7 +127,7 @@ def print_figure(
     target = io.BytesIO()
     style: Any = _STYLE | {"svg.hashsalt": salt}
     with matplotlib.rc_context(style), warnings.catch_warnings():
-        # Characters missing in the font are drawn as boxes; the page contains them as text.
+        # The browser draws characters that the font lacks in another one.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)
         draw(figure)

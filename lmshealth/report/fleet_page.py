@@ -71,7 +71,7 @@ def write_index(
     if len(ranked) > constants.MANY_MACHINES:
         templates = resources.files("lmshealth") / "report" / "templates"
         script = (templates / "index.js").read_text(encoding="utf-8")
-    newest = max((one.last_log for one in ranked), default=date.min)
+    newest = max((one.recorded_at.date() for one in ranked), default=date.min)
     by_reason = [
         (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])
         for reason, count in Counter(one.reason for one in refused).most_common()

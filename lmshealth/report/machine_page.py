@@ -25,10 +25,10 @@ from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, Summary, limit_of, summarise
-from lmshealth.report.changes import Reported, changes, reported
+from lmshealth.report.changes import changes
 from lmshealth.report.log_figures import plot_spectra, spectra_size
+from lmshealth.report.notices import notices
 from lmshealth.report.rendering import render
-from lmshealth.report.svg import share_letters
 from lmshealth.report.tables import track_rows
 from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
@@ -54,23 +54,24 @@ def make_page(
     assessment: Assessment,
     file: str,
     *,
-    before: Reported | None = None,
+    before: Summary | None = None,
     generated: datetime | None = None,
 ) -> Page:
     """Make the page of one machine, under a name from `file_names`.
 
-    ``before`` is the state of the machine in its previous report; ``generated`` is printed.
+    ``before`` is the summary of the machine in its previous report; ``generated`` is printed.
     """
     service, parameters = assessment.service(), assessment.stage.parameters
     summary = summarise(assessment, service, file)
     highest = max((one.high for one in summary.health), default=1.0)
     content = {
         "assessment": assessment,
+        "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "first_limit": _first_limit(assessment.prognosis),
         "before": before,
-        "news": before and [*changes(before, reported(assessment, service), parameters)],
+        "news": before and [*changes(before, summary, parameters)],
         **_track_content(assessment),
         **_health_content(assessment),
     }
@@ -86,10 +87,9 @@ def make_page(
         plot = partial(plot_spectra, summary=shown[0], modes=shown[1], stage=assessment.stage)
         pictures["latest", "all"] = figures.inline(plot, salt="last", size=spectra_size(*shown))
     # An HTML parser needs no namespaces; without them the page names no address at all.
-    pictures = {
+    content["picture"] = {
         key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
     }
-    content["letters"], content["picture"] = share_letters(pictures)
     return Page(render("stage.html.j2", generated, **content), summary)
 
 

@@ -13,7 +13,6 @@ from typing import Any
 from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
 from lmshealth.report import text
-from lmshealth.report.svg import give_letters
 
 _FILTERS = (
     *(text.change, text.fixed, text.interval, text.km, text.law, text.moment, text.number),
@@ -72,7 +71,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     for page in pages:
         source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
         # WeasyPrint does not resolve CSS variables inside SVG.
-        source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", give_letters(source))
+        source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", source)
         target = page.with_suffix(".pdf")
         try:
             content = html(string=source, url_fetcher=fetcher).write_pdf()

@@ -20,6 +20,7 @@ from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
+from lmshealth.report.notices import notices
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
@@ -36,7 +37,7 @@ _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
     "delta_e_below_40hz_um mode source channel frequency_hz frequency_std_hz damping_ratio "
-    "damping_ratio_std correlation_f_zeta snr dispersion flags",
+    "damping_ratio_std correlation_f_zeta snr dispersion excitation_mm_s2 flags",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
     "damping_ratio_std drift drift_std nis nis_dof noise_scale widening",
@@ -53,9 +54,10 @@ COLUMNS = {
         for level in RUL_LEVELS
     )
     + " censored_from probability_beyond_horizon probability_already_past service service_by "
-    "service_risk",
+    "service_risk inspect_by inspect_every_km earliest_end",
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
+    "warnings": "stage recorded_at code severity where what what_to_do",
 }
 
 # Tables of single logs and of plans.
@@ -110,6 +112,8 @@ def machine_tables(
     verdict = found.stage, _iso(found.recorded_at), found.verdict, found.probability
     rows["verdict"] = _rows("verdict", [verdict])
     rows["refused"] = refused_rows(assessment.refused)
+    own = (found.stage, _iso(found.recorded_at))
+    rows["warnings"] = _rows("warnings", [(*own, *astuple(one)) for one in notices(assessment)])
     return rows
 
 
@@ -137,7 +141,7 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
     )
     numbers = (
         *(modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std),
-        *(modes.correlation, modes.snr, modes.dispersion),
+        *(modes.correlation, modes.snr, modes.dispersion, modes.excitation / _MILLI),
     )
     lists = [one.tolist() for one in numbers]
     values = zip(modes.names, modes.sources, modes.channels, *lists, modes.flags, strict=True)
@@ -280,7 +284,7 @@ def prognosis_rows(
             *(None if np.isinf(value) else value for value in quantiles),
             next((level for level, wait in pairs if np.isinf(wait)), None),
             *(one.beyond_horizon, one.already_past),
-            *((service.kind, service.by, service.risk) if one.parameter == "any" else [None] * 3),
+            *(_service_cells(service) if one.parameter == "any" else [None] * 6),
         )
         (row,) = _rows("prognosis", [values])
         if before is not None:
@@ -289,6 +293,14 @@ def prognosis_rows(
             row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows
+
+
+def _service_cells(service: Service) -> tuple[Any, ...]:
+    every = service.inspect_every / _KM
+    return (
+        *(service.kind, service.by, service.risk, service.inspect_by),
+        *(every if np.isfinite(every) else None, service.earliest_end),
+    )
 
 
 def error_row(log: str, error: FollowingError) -> Row:

@@ -8,7 +8,7 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy.special import stdtr
+from scipy.stats import linregress
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
@@ -215,11 +215,8 @@ def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float
     n_velocities = np.unique(np.round(x / 0.02)).size
     slope = std = p_value = float("nan")
     if n_velocities > 1:
-        off = x - x.mean()
-        slope = float(off @ y / (off @ off))
-        dof = x.size - 2
-        if dof > 0:
-            rest = y - y.mean() - slope * off
-            std = float(np.sqrt(rest @ rest / dof / (off @ off)))
-            p_value = float(stdtr(dof, -slope / std)) if std > 0 else float(slope <= 0)
+        line = linregress(x, y, alternative="greater")
+        slope = float(line.slope)
+        if x.size > 2:
+            std, p_value = float(line.stderr), float(line.pvalue)
     return Growth(stage, channel, band, x.size, n_velocities, slope, std, p_value)

@@ -50,10 +50,6 @@ class FollowingError(ReadOnly):
         """Amplitude of the strongest harmonic in m."""
         return float(self.harmonics.amplitude[self.kept[0]])
 
-    def rebuilt(self) -> FloatArray:
-        """Return Δe in m from the kept harmonics above the floor, shape ``(n_samples,)``."""
-        return self.harmonics.rebuild(self.above)
-
 
 def read_error(
     log: Log,

@@ -60,16 +60,6 @@ class Harmonics:
         power = self.power
         return float(power[kept].sum() / power.sum())
 
-    def rebuild(self, kept: Indices) -> FloatArray:
-        """Return the sum of the mean and some harmonics, by index; shape ``(size,)``."""
-        transform = np.zeros(self.size // 2 + 1, dtype=complex)
-        transform[0] = self.mean * self.size
-        half = np.full(self.frequency.size, 0.5 * self.size)
-        if self.size % 2 == 0:
-            half[-1] = self.size
-        transform[kept + 1] = (half * self.amplitude * np.exp(1j * self.phase))[kept]
-        return np.asarray(fft.irfft(transform, self.size))
-
 
 def decompose(values: FloatArray, sample_rate: float) -> Harmonics:
     """Decompose a gap-free record, at least two samples ``(n_samples,)``, into its harmonics."""

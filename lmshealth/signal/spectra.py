@@ -98,6 +98,7 @@ class CrossSpectrum:
     lines: tuple[tuple[int, float, float], ...] = ()
     count: int = 1
     foreign: ComplexArray | None = None  # expectation of what no mode causes, as the matrix
+    transforms: ComplexArray | None = None  # F of each segment, (count, n_ordinates, n_channels)
 
     def __post_init__(self) -> None:
         if self.matrix.shape[:1] != self.frequency.shape:
@@ -120,6 +121,7 @@ class CrossSpectrum:
             free=self.free[cut],
             lines=tuple(line for line in self.lines if low <= line[1] < high),
             foreign=None if self.foreign is None else self.foreign[cut],
+            transforms=None if self.transforms is None else self.transforms[:, cut],
         )
 
     def without(self, lines: Sequence[float]) -> CrossSpectrum:
@@ -176,6 +178,7 @@ class LogSpectra:
                 matrix=s.matrix[:, rows, columns],
                 lines=tuple((kept.index(c), f, a) for c, f, a in s.lines if c in kept),
                 foreign=None if s.foreign is None else s.foreign[:, rows, columns],
+                transforms=None if s.transforms is None else s.transforms[:, :, kept],
             )
             for s in self.spectra
         )
@@ -252,7 +255,10 @@ def cross_spectra(
             for one in own.sinusoids
         )
         matrix = own.transforms[:, :, None] * own.transforms[:, None].conj()
-        return CrossSpectrum(own.frequency, matrix, own.duration, part.velocity, own.free, lines)
+        return CrossSpectrum(
+            own.frequency, matrix, own.duration, part.velocity, own.free, lines,
+            transforms=own.transforms[None],
+        )  # fmt: skip
 
     return tuple(_mean(map(transformed, group)) for group in _exchangeable(segments))
 
@@ -328,10 +334,15 @@ def _same(one: Segment, other: Segment) -> bool:
 def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
     first = next(spectra)
     total, free, lines, count = first.matrix, first.free, first.lines, 1
+    every = [] if first.transforms is None else [first.transforms]
     for spectrum in spectra:
         total, count = total + spectrum.matrix, count + 1
+        every += [] if spectrum.transforms is None else [spectrum.transforms]
         free, lines = free & spectrum.free, (*lines, *spectrum.lines)
-    return replace(first, matrix=total / count, free=free, lines=lines, count=count)
+    transforms = every[0] if len(every) == 1 else np.concatenate(every)
+    return replace(
+        first, matrix=total / count, free=free, lines=lines, count=count, transforms=transforms
+    )
 
 
 def periodogram(

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import fft
 
 from lmshealth._arrays import FloatArray, expect_shape, freeze
-from lmshealth.io.log import Channel, Log
+from lmshealth.io.log import Log
 from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment, find_segments
 from lmshealth.signal.spectra import Spectrum, periodogram
@@ -104,7 +104,12 @@ def relative_spectrum(
         return None
     total = np.zeros(n_bins)
     for channel in channels:
-        density = _density(channel, segments, log.sample_rate, edges)
+        spectra = [
+            periodogram(channel, s, log.sample_rate, high, ceiling=1.1 * high) for s in segments
+        ]
+        duration = np.array([spectrum.duration for spectrum in spectra])
+        binned = np.array([bin_density(spectrum, edges) for spectrum in spectra])
+        density = duration @ binned / duration.sum()
         middle = float(np.median(density[below]))
         if middle > 0:
             total += density / middle
@@ -122,17 +127,6 @@ def _cut(segments: Sequence[Segment], size: float) -> list[Segment]:
         starts = range(segment.start, segment.stop - n + 1, n)
         parts += [replace(segment, start=at, stop=at + n) for at in starts] or [segment]
     return parts
-
-
-def _density(
-    channel: Channel, segments: Sequence[Segment], sample_rate: float, edges: FloatArray
-) -> FloatArray:
-    """Average the power spectral density of a channel over segments and within bins."""
-    top = float(edges[-1])
-    spectra = [periodogram(channel, s, sample_rate, top, ceiling=1.1 * top) for s in segments]
-    duration = np.array([spectrum.duration for spectrum in spectra])
-    binned = np.array([bin_density(spectrum, edges) for spectrum in spectra])
-    return np.asarray(duration @ binned / duration.sum())
 
 
 def bin_density(spectrum: Spectrum, edges: FloatArray) -> FloatArray:

@@ -10,12 +10,13 @@ from scipy.special import expit, log_expit
 
 from lmshealth._arrays import FloatArray
 from lmshealth.stage import constants
-from lmshealth.stage.priors import Prior, Uniform
+from lmshealth.stage.priors import Lognormal, Prior, Uniform
 
 _KM = 1000.0
 # ln of ratios of lengths is cut here: a distant walker may ask for a length outside the range of
 # floats, where its prior is 0 anyway.
 _LARGEST_LN = 300
+_BISECTIONS = 50
 
 
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
@@ -99,7 +100,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
         """Return the log prior with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
-        life, n = self.natural(y, now).T
+        life, n = HertzWear.natural(self, y, now).T
         slope = log_expit(y[:, 1]) + log_expit(-y[:, 1])
         return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / _KM / n) + slope)
 
@@ -233,4 +234,57 @@ class Unchanging(Law, frozen=True, tag="none", tag_field="kind"):
         return np.where(np.broadcast_to(limit, theta.shape[:1]) >= 1, 0.0, np.inf)
 
 
-AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging
+def _late(y: FloatArray) -> FloatArray:
+    """Return the coordinates of the late loss of `Accelerating` as those of `HertzWear`."""
+    return np.column_stack([y[:, 0] + log_expit(y[:, 2]), y[:, 1]])
+
+
+class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind", kw_only=True):
+    """Slow loss that accelerates: ln h(s) = -b s / s_w - (s / s_w)^n."""
+
+    slow: Lognormal
+    exponent: Uniform = Uniform(2.0, 12.0)
+    label: ClassVar[str] = "slow loss that accelerates"
+    names: ClassVar[tuple[str, ...]] = ("life_m", "exponent", "slow")
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """Convert y1 = ln of -ln h(now), y2 = logit of n, y3 = logit of the late share of -ln h."""
+        wear = super().natural(_late(y), now)
+        slow = np.clip(y[:, 0] + log_expit(-y[:, 2]), -_LARGEST_LN, _LARGEST_LN)
+        return np.column_stack([wear, np.exp(slow) * wear[:, 0] / now])
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Return the log prior; d(ln late, ln slow)/d(y1, y3) has the determinant -1."""
+        slow = self.natural(y, now)[:, 2]
+        density = self.slow.log_density(slow) + np.log(slow)
+        return np.asarray(super().log_prior(_late(y), now) + density)
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior."""
+        wear = super().draw(rng, n, now)
+        late, slow = wear[:, 0], _draw(self.slow, rng, n)
+        slow = np.log(slow * now / super().natural(wear, now)[:, 0])
+        return np.column_stack([np.logaddexp(late, slow), wear[:, 1], late - slow])
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Return the health."""
+        return np.asarray(np.exp(-self._loss(theta, np.maximum(travel, 0))))
+
+    def _loss(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Return -ln health."""
+        life, n, slow = theta.T[:, :, None]
+        with np.errstate(over="ignore"):
+            return np.asarray(slow * travel / life + (travel / life) ** n)
+
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
+        """Return the travel at the limit, by bisection; 0 for a limit of 1 or more."""
+        loss = np.maximum(-np.log(limit), 0.0)
+        low, high = np.zeros(len(theta)), theta[:, 0] * loss ** (1 / theta[:, 1])
+        for _ in range(_BISECTIONS):
+            middle = (low + high) / 2
+            before = self._loss(theta, middle[:, None])[:, 0] < loss
+            low, high = np.where(before, middle, low), np.where(before, high, middle)
+        return high
+
+
+AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging | Accelerating

@@ -15,56 +15,6 @@ from lmshealth.stage.description import ModeSpec
 
 # Widest search, in relative distances of neighbouring modes, and its least value.
 _NEIGHBOURS, _LEAST_SEARCH = 2.0, 0.02
-_HEAD = """\
-# Skeleton of a stage description. Reference of all keys: lmshealth/stage/README.md
-# Edit it, check it with `lmshealth stage FILE`, and use it with `--stage FILE`.
-
-name = {name}
-source = {source}
-
-[match]
-stage = {stage}    # pattern of the machines (metadata `stage` of their logs) it applies to
-
-# Rename the modes after their motion (roll, pitch, yaw, ...); delete those you do not want to
-# follow. `search`: the mode is searched within ± this fraction of its frequency. It must cover the
-# changes by wear and load over the whole life.
-"""
-_MODE = """
-[[mode]]
-name = {name}
-frequency_hz = {frequency:.6g}    # {comment}
-damping_ratio = {damping:.3g}
-snr = {snr:.3g}
-search = {search:.2g}
-"""
-_TAIL = """
-# Places of the sensors, for drawings of the mode shapes by `lmshealth modes --plot`.
-# [[channel]]
-# name = "acc_pitch"
-# position_m = [0.10, 0.00, 0.25]
-# direction = [0, 0, 1]
-
-# Lines that move with the velocity: frequency = velocity / wavelength.
-# [[order]]
-# name = "ball pass"
-# wavelength_mm = 4.0
-
-# Covariates in the metadata of the logs, which shift frequencies without wear.
-# [[covariate]]
-# name = "temperature_c"
-# reference = 21.0
-# prior_std = 0.001    # of the relative change of frequency per unit
-
-# Health parameters, with a modal map: a CSV beside this file with their effect on the modes.
-# [[parameter]]
-# name = "guide_preload"
-# prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }
-# limit = { below = 0.6 }
-# law = { kind = "none" }
-#
-# [map]
-# file = "my-stage.map.csv"
-"""
 
 
 def searches(frequencies: Sequence[float]) -> list[float]:
@@ -86,19 +36,15 @@ def write_skeleton(
     """
     if not modes:
         raise BadStage(f"{path} is not written: a description needs at least one mode; none found")
-    head = {"name": path.stem, "source": source, "stage": glob.escape(stage) if stage else "*"}
-    text = _HEAD.format(**{key: _quoted(value) for key, value in head.items()})
-    for mode, comment in modes:
-        text += _MODE.format(
-            name=_quoted(mode.name),
-            frequency=mode.frequency_hz,
-            damping=mode.damping_ratio,
-            snr=mode.snr,
-            search=mode.search,
-            comment=comment,
-        )
+    from jinja2 import Template  # late: only this needs it
+
+    layout = (Path(__file__).parent / "descriptions" / "skeleton.toml.j2").read_text("utf-8")
+    template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
+    machines = glob.escape(stage) if stage else "*"
+    given = {"name": path.stem, "source": source, "stage": machines, "modes": modes}
+    text = template.render(given, quoted=_quoted)
     with path.open("x", encoding="utf-8") as file:
-        file.write(text + _TAIL)
+        file.write(text)
 
 
 def _quoted(text: str) -> str:

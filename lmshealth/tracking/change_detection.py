@@ -84,7 +84,8 @@ class Change:
 
     def settled(self, now: int) -> bool:
         """Return whether its kind is clear, or no more logs are waited for."""
-        clear = self.log_odds >= constants.KIND_LOG_ODDS
+        # A step that is in the model raises no alarm any more.
+        clear = self.damage if self.kind == "step" else self.log_odds >= constants.KIND_LOG_ODDS
         return clear or now - self.first >= constants.KIND_PATIENCE
 
     @property

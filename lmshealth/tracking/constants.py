@@ -18,6 +18,8 @@ ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
+# Standardised innovations count at most so much there: a single one opens no weighing for long.
+MOST_INNOVATION = 6.0
 # The kind of a change is settled at these odds over all other kinds, or after so many logs.
 KIND_LOG_ODDS = float(np.log(10.0))
 KIND_PATIENCE = 8
@@ -31,11 +33,10 @@ LOOP_CHANGE_VARIANCE = 100.0
 LOOP_LOGS, LOOP_FEWEST, LOOP_P_VALUE = 12, 3, 0.01
 
 # --- Outliers and consistency -------------------------------------------------------------------
-# An estimate with a standardised innovation beyond the gate is an outlier until the next log
-# confirms it. False alarms of the gate: 2e-9 per estimate.
-OUTLIER_GATE = 6.0
-# Prior probability that a log holds an outlier.
-OUTLIER_PROBABILITY = 0.01
+# Prior probability that the estimates of a mode, or of a whole log, are outliers. They scatter by
+# this factor more than stated, or as widely as the priors below. Modes whose standardised
+# innovations are inside the gate are no candidates: their odds would be below 1:10.
+OUTLIER_PROBABILITY, OUTLIER_SCALE, OUTLIER_GATE = 0.02, 6.0, 2.5
 # Published standard deviations are widened once the innovations are less probable than this.
 WIDENING_P_VALUE = 5e-4
 # Below these p-values a filter is not consistent: overconfident, or too cautious. The second is
@@ -54,6 +55,9 @@ DAMPING_WALK = 0.5
 BIAS_STD = (0.005, 0.2)
 # d ln f per unit of a covariate that no stage description describes.
 COVARIATE_STD = 0.001
+# Amplitude of the daily cycle by which a structure may lag behind its temperature sensor (K), and
+# the least that the times of the logs must resolve.
+LAGGED_CYCLE, LEAST_CYCLE = 2.0, 0.5
 # Jumps of ln f and ln ζ: a loosened bolt or a crash; grease; the loop's poles after a retuning; a
 # sensor that was moved or recalibrated; an overhaul.
 JUMP_STD: dict[str, tuple[float, float]] = {
@@ -65,16 +69,36 @@ JUMP_STD: dict[str, tuple[float, float]] = {
 }
 
 # --- Process noise, averaged over its evidence (maximum likelihood collapses to none) -------------
-# Random walk of ln f of a healthy machine, which has no rate.
-HEALTHY_WALKS = (1e-5, 3e-4, 1e-3)
+# A life of the tracker is the clock of so many logs at their mean distance so far.
+LOGS_PER_LIFE = 150
+# Random walk of ln f of a healthy machine, which has no rate, with probabilities.
+HEALTHY_WALKS = ((1e-5, 0.3), (3e-4, 0.25), (1e-3, 0.25))
+# A new or repaired machine may run in: its rate decays within so many logs, with probabilities,
+# and ln f moves by so much altogether (standard deviation).
+RUNNING_IN_LOGS, RUNNING_IN_STD = ((0.5, 0.07), (1.5, 0.07), (4.0, 0.06)), 0.03
 # Random walk of ln f of a changing machine, its initial rates, and the random walks of the rate.
-CHANGING_WALKS = (1e-5, 1e-3, 3e-3, 1e-2)
-CHANGING_RATES = ((0.03, 0.01), (0.03, 0.1), (0.3, 0.1), (0.3, 1.0), (1.0, 3.0))
+CHANGING_WALKS = (1e-5, 1e-3)
+# The last are of a machine that changes from log to log, by up to LN_F_STD or a few times that.
+CHANGING_RATES = ((0.03, 0.01), (0.03, 0.1), (0.3, 0.1), (0.3, 1.0), (1.0, 3.0), (30.0, 300.0))
+# Share of the variance of rates that all modes have in common: damage lowers most modes.
+RATE_COMMON = 0.9
 # Prior probability of the healthy group. It cancels in the Bayes factor of an alarm.
-HEALTHY_PROBABILITY = 0.1
+HEALTHY_PROBABILITY = 0.2
 # Factors on the reported standard deviations of one source, with prior probabilities. Sources past
 # the third share the factor of the third, to bound the size of the grid.
-SOURCE_NOISE_SCALES = ((0.5, 0.02), (0.7, 0.05), (1.0, 0.8), (1.5, 0.08), (2.25, 0.03), (4.0, 0.02))
+SOURCE_NOISE_SCALES = (
+    (0.05, 0.005), (0.15, 0.01), (0.4, 0.02), (0.7, 0.06), (1.0, 0.75), (1.5, 0.10), (2.25, 0.03),
+    (4.0, 0.02), (8.0, 0.004), (20.0, 0.001),
+)  # fmt: skip
+# Combinations of scales of several sources that are less probable are left out.
+LEAST_SCALES_PROBABILITY = 1e-3
+# Wander of ln f from log to log that is no wear: size in errors of the estimates, correlation
+# length in logs, probability; and the share of its variance that all modes have in common.
+WANDERS = (
+    (0.0, 0.0, 0.7),
+    *((size, logs, 0.3 / 9) for size in (0.7, 2.0, 5.0) for logs in (2.0, 6.0, 20.0)),
+)
+WANDER_COMMON = 0.3
 MOST_SCALED_SOURCES = 3
 
 # --- Association: gates --------------------------------------------------------------------------

@@ -64,7 +64,7 @@ def find_covariate_effects(
     The order is that of the description; a covariate that is unknown or never left its reference
     has no effect.
     """
-    columns = regressors(history.covariates, stage)
+    columns = regressors(history.covariates, stage, history.recorded_at)
     if not columns:
         return ()
     taken = accepted_estimates(history, track)
@@ -96,11 +96,12 @@ def find_covariate_effects(
 
 def covariate_shifts(history: History, track: Track, stage: Stage) -> FloatArray:
     """Return the change of ln f of every mode by covariates, shape ``(n_logs, n_modes)``."""
-    columns = regressors(history.covariates, stage)
+    columns = regressors(history.covariates, stage, history.recorded_at)
     known = {(e.mode, e.covariate): e for e in track.effects}
     moved = np.zeros((len(history.logs), len(track.modes)))
     for m, mode in enumerate(track.modes):
-        moved[:, m] += _explained(columns, tuple(known[mode, r.name] for r in columns))
+        own = [r for r in columns if (mode, r.name) in known]
+        moved[:, m] += _explained(own, tuple(known[mode, r.name] for r in own))
     return moved
 
 

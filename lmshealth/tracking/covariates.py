@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 
 import numpy as np
 import pandas as pd
@@ -23,7 +24,11 @@ class Regressor:
     unknown: FloatArray  # variance of ln f where the value is unknown, ``(n_logs,)``
 
 
-def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tuple[Regressor, ...]:
+def regressors(
+    covariates: Mapping[str, FloatArray],
+    stage: Stage | None,
+    recorded_at: Sequence[datetime] = (),
+) -> tuple[Regressor, ...]:
     """Return the regressors of the described covariates that at least one log has.
 
     Without a stage every covariate present is one, about its median. Keys are column names, values
@@ -53,4 +58,22 @@ def regressors(covariates: Mapping[str, FloatArray], stage: Stage | None) -> tup
         if covariate.curvature_std:
             square = (f"{covariate.name}^2", offset**2, covariate.curvature_std)
             found.append(Regressor(*square, np.zeros_like(unknown)))
+        if covariate.name == "temperature_c" and recorded_at:
+            found += _daily(covariate, recorded_at)
     return tuple(found)
+
+
+def _daily(covariate: Covariate, recorded_at: Sequence[datetime]) -> list[Regressor]:
+    """Return the cycle of a day, by which a structure lags behind the temperature of its sensor.
+
+    A first-order lag of a daily cycle is another cycle of the day: its sine and cosine have linear
+    coefficients, whatever the time constant is. Their size is in units of the covariate.
+    """
+    angle = np.array([moment.timestamp() for moment in recorded_at]) * (2 * np.pi / 86400)
+    waves = constants.LAGGED_CYCLE * np.array([np.cos(angle), np.sin(angle)])
+    waves -= waves[:, :1]
+    if not np.abs(waves).max() > constants.LEAST_CYCLE:  # all logs at one time of the day
+        return []
+    none = np.zeros(angle.size)
+    names = (f"{covariate.name}:day-cos", f"{covariate.name}:day-sin")
+    return [Regressor(n, w, covariate.prior_std, none) for n, w in zip(names, waves, strict=True)]

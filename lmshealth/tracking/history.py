@@ -13,7 +13,7 @@ import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
-from lmshealth.io.log import Metadata, Refusal
+from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.signal.waterfall import RelativeSpectrum
@@ -444,7 +444,7 @@ def _line_up(
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 
-def missing_mode_notes(history: History, refused: Sequence[Refusal]) -> list[str]:
+def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:
     """List modes that the last logs do not detect, or whose estimates are ambiguous there."""
     least = constants.MISSING_LOGS
     last = history.logs[-least:]
@@ -454,16 +454,19 @@ def missing_mode_notes(history: History, refused: Sequence[Refusal]) -> list[str
         if len({r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last))
         == least
     ]
-    notes = []
+    notices = []
     if ambiguous:
-        notes.append(
-            f"{' and '.join(ambiguous)}: the estimates of the last {least} logs are ambiguous, so "
-            "that nothing new is known; logs with more channels would distinguish modes by their "
-            "shapes."
+        names = " and ".join(ambiguous)
+        what = (
+            f"{names}: the estimates of the last {least} logs are ambiguous, so that nothing new "
         )
+        what += "is known; logs with more channels would distinguish modes by their shapes."
+        notices.append(Notice("ambiguous-modes", "caution", names, what))
     for name in history.modes:
         found = np.flatnonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]).any(1))
         missed = len(history.logs) - 1 - int(found.max(initial=-1))
         if missed >= least and name not in ambiguous:
-            notes.append(f"{name}: no estimate in the last {missed} logs; nothing new is known.")
-    return notes
+            what = f"{name}: no estimate in the last {missed} logs; nothing new is known."
+            to_do = f"refused.csv has the reasons in its rows of {name}."
+            notices.append(Notice("mode-missing", "caution", name, what, to_do))
+    return notices

@@ -8,7 +8,7 @@ from datetime import datetime
 from pathlib import Path
 
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Notice, Refusal
 from lmshealth.io.manifest import find_sheets, name_of
 from lmshealth.io.metadata import parse_moment, parse_name
 from lmshealth.io.refusal import Unusable, shown
@@ -114,14 +114,20 @@ def _machine(row: Row) -> str:
         return ""
 
 
-def maintenance_notes(work: Maintenance, moments: Sequence[datetime | None]) -> list[str]:
-    """Return notes for a report: rows that cannot be read, and new baselines.
+def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -> list[Notice]:
+    """Return notices for a report: rows that cannot be read, and new baselines.
 
     `work` is that of one machine, `moments` are the times of recording of its logs.
     """
-    notes = [
-        f"{one.refusal.log} cannot be read completely ({one.refusal.detail}): work on this machine "
-        "that it lists there is not used."
+    notices = [
+        Notice(
+            "maintenance-unread",
+            "caution",
+            one.refusal.log,
+            f"{one.refusal.log} cannot be read completely ({one.refusal.detail}): work on this "
+            "machine that it lists there is not used.",
+            "Correct the row and run again.",
+        )
         for one in work.unread
     ]
     for action in work.actions:
@@ -130,10 +136,12 @@ def maintenance_notes(work: Maintenance, moments: Sequence[datetime | None]) -> 
         before = sum(moment is not None and moment < action.recorded_at for moment in moments)
         work_done = f"{action.action} on {action.recorded_at.date().isoformat()}"
         if before == len(moments):
-            notes.append(f"{work_done}: no log since, so nothing is known after it.")
+            what = f"{work_done}: no log since, so nothing is known after it."
+            notices.append(Notice("no-log-since", "caution", "", what, "Record a log."))
         elif before:
-            notes.append(
+            what = (
                 f"{work_done} opened a new baseline: fractions are relative to the state after it, "
                 f"and {before} earlier logs only inform the effects of temperature, load and loop."
             )
-    return notes
+            notices.append(Notice("new-baseline", "note", "", what))
+    return notices

@@ -13,15 +13,15 @@ from lmshealth.tracking.filter_bank import (
     FilterBank,
     FilterModel,
     Hyperparameters,
-    advance,
     initial,
     predict,
+    update,
 )
 from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track
 
-# Filters that together have less of the posterior are left out.
+# Filters that together have less of the posterior, and of its variance of ln f, are left out.
 _SHARE = 1e-3
 # Eigenvalues of correlations below this are rounding.
 _SINGULAR = 1e-10
@@ -48,11 +48,17 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     # Where a regime begins, rates have their prior variance again.
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
     model = FilterModel(space, begun - {0})
-    bank = advance(model, initial(model), 0, len(history.logs) - 1)
-    order = np.argsort(bank.weight)
-    bank = bank[order[np.cumsum(bank.weight[order]) > _SHARE]]
+    bank, trust = initial(model), np.ones(model.values.shape)
+    for k in range(len(history.logs)):
+        bank, found = update(model, predict(model, bank, k), k)
+        trust[k, found.rows], bank = np.maximum(1 - found.outlying, _SINGULAR), bank.pruned()
+    # An improbable filter may be as wide as to count.
+    variance = np.einsum("gii->g", bank.cov[:, space.level, space.level])
+    share = bank.weight * (1 + variance / (bank.weight @ variance)) / 2
+    order = np.argsort(share)
+    bank = bank[order[np.cumsum(share[order]) > _SHARE]]
     weight = bank.weight
-    runs = [smooth_one(model, bank.hyperparameters[[g]]) for g in range(weight.size)]
+    runs = [smooth_one(model, bank.hyperparameters[[g]], trust) for g in range(weight.size)]
     mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
     cov = np.einsum("g,gkij->kij", weight, [run[1] for run in runs])
     for share, (own, _) in zip(weight, runs, strict=True):
@@ -77,14 +83,19 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     )
 
 
-def smooth_one(model: FilterModel, own: Hyperparameters) -> tuple[FloatArray, FloatArray]:
-    """Filter and smooth with one set of hyperparameters: states ``(n, size)`` and covariances."""
+def smooth_one(
+    model: FilterModel, own: Hyperparameters, trust: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Filter and smooth with one set of hyperparameters: states ``(n, size)`` and covariances.
+
+    `trust`, ``(n, 2 n_series)``, is the probability that an estimate is no outlier: the share of
+    its information that counts.
+    """
     space = model.space
     n, size = len(space.history.logs), space.size
     kalman = KalmanFilter(dim_x=size, dim_z=1)
-    kalman.x, kalman.P = space.prior()
-    rate = np.arange(space.rate.start, space.rate.stop)
-    kalman.P[rate, rate] = own.rate_std[0] ** 2
+    start = initial(model, own)
+    kalman.x, kalman.P = start.mean[0], start.cov[0]
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
     for k in range(n):
@@ -92,7 +103,7 @@ def smooth_one(model: FilterModel, own: Hyperparameters) -> tuple[FloatArray, Fl
         kalman.predict(F=moves[k], Q=noises[k])
         rows = np.flatnonzero(model.there[k])
         if rows.size:
-            scale = own.scales[0, model.scale_of[rows]]
+            scale = own.scales[0, model.scale_of[rows]] / np.sqrt(trust[k, rows])
             noise = space.history.cov[k][np.ix_(rows, rows)] * np.outer(scale, scale)
             noise += np.diag(model.extra[k, rows])
             kalman.update(model.values[k, rows], R=noise, H=space.matrix(k)[rows])

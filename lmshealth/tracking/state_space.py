@@ -1,6 +1,6 @@
 """State space of a machine's modes: state vector, measurement matrices and prior.
 
-The state is ``[ℓ, ℓ̇, ln ζ, ℓ₀ | covariates | biases | steps]``, as the README of this folder
+The state is ``[ℓ, ℓ̇, ln ζ, ℓ₀, w | covariates | biases | steps]``, as the README of this folder
 describes. All but the biases are in blocks of the modes, biases and steps have ln f and ln ζ.
 """
 
@@ -10,38 +10,39 @@ from copy import copy
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Step
 
-_KM = 1000.0
-
 
 class StateSpace:
     """Layout of the state, and the measurement matrices of a history.
 
-    Rates and random walks are per life: the horizon of the stage, or without one the length of the
-    history. `life` is its length on the clock, `ticks` are the parts of it between each log and the
-    one before, ``(n_logs,)``, and `size` is the length of the state.
+    Rates and random walks are per life of `constants.LOGS_PER_LIFE` logs at their mean distance so
+    far. `ticks` are the parts of it between each log that has estimates (`seen`) and the one
+    before, ``(n_logs,)``, and `size` is the length of the state.
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
         self.history, self.steps = history, steps
-        regressed = self.regressed = regressors(history.covariates, stage)
-        self.life = float(np.ptp(history.clock())) or 1.0
-        if stage is not None and history.has_odometer:
-            self.life = stage.description.usage.horizon_km * _KM
+        regressed = self.regressed = regressors(history.covariates, stage, history.recorded_at)
         m = self.n_modes = len(history.modes)
-        self.level, self.rate, self.damping, self.base = (
-            slice(part * m, (part + 1) * m) for part in range(4)
+        self.level, self.rate, self.damping, self.base, self.wander = (
+            slice(part * m, (part + 1) * m) for part in range(5)
         )
-        self.first_bias = (4 + len(regressed)) * m
+        self.first_bias = (5 + len(regressed)) * m
         self.biased = self._biased()
         self.first_step = self.first_bias + 2 * len(self.biased)
         self.size = self.first_step + 2 * m * len(steps)
-        self.ticks = np.diff(history.clock(), prepend=history.clock()[:1]) / self.life
+        # The mean distance between logs so far is the unit: no horizon has to be known.
+        self.seen: BoolArray = np.asarray(np.isfinite(history.ln_frequency).any(axis=1))
+        self.seen[:1] = True
+        clock = np.where(self.seen, history.clock() - history.clock()[:1], 0.0)
+        clock = np.maximum.accumulate(clock)
+        logs = (np.cumsum(self.seen) - 1) / np.where(clock > 0, clock, 1.0)
+        self.ticks = np.diff(clock, prepend=0.0) * logs / constants.LOGS_PER_LIFE
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
@@ -67,7 +68,7 @@ class StateSpace:
 
     def regressor(self, j: int) -> slice:
         """Return the place of the coefficients of a regressor."""
-        return slice((4 + j) * self.n_modes, (5 + j) * self.n_modes)
+        return slice((5 + j) * self.n_modes, (6 + j) * self.n_modes)
 
     def jump(self, j: int) -> slice:
         """Return the place of the jumps of a step: those of ln f, then those of ln ζ."""
@@ -90,7 +91,7 @@ class StateSpace:
         history, r = self.history, len(self.history.series)
         mode, series = history.mode_of(), np.arange(r)
         matrix = np.zeros((len(history.logs), 2 * r, self.first_step))
-        matrix[:, series, mode] = 1
+        matrix[:, series, mode] = matrix[:, series, self.wander.start + mode] = 1
         matrix[:, r + series, self.damping.start + mode] = 1
         for j, regressor in enumerate(self.regressed):
             matrix[:, series, self.regressor(j).start + mode] = regressor.values[:, None]

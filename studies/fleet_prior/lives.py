@@ -46,9 +46,15 @@ class Life:
 
 
 def machine() -> Stage:
-    """Load the stage that all machines are: that of Y, with a mount that keeps its stiffness."""
+    """Load the stage that all machines are: that of Y, with a mount that keeps its stiffness.
+
+    The preload wears by Hertz or keeps its value: the two laws whose share and pace are estimated.
+    """
     stage = load_stage("lms-y")
     preload, mount = stage.parameters
+    named = (law for law in preload.laws if law.kind in ("hertz-wear", "none"))
+    laws = tuple(msgspec.structs.replace(law, weight=1.0) for law in named)
+    preload = msgspec.structs.replace(preload, law=laws)
     return _with(stage, (preload, msgspec.structs.replace(mount, law=Unchanging())))
 
 
@@ -131,7 +137,7 @@ def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, A
         first, second = rng.uniform(size=(2, 1))
         theta = np.r_[1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
     deviation = rng.choice(constants.DEVIATION_STDS, p=_shares(fleet, "deviation"))
-    rate = float(deviation**2 / (1000 * fleet.description.usage.horizon_km))
+    rate = float(deviation**2 / clock[-1])
     steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
     part = Part(law, theta, 0.0, np.inf, 1.0, np.cumsum(steps), rate)
     with np.errstate(divide="ignore"):

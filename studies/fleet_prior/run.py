@@ -47,10 +47,11 @@ from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
 from studies.common.metrics import crps, place
 from studies.fleet_prior.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
-from studies.harness.claims import Claim, covered, measured, percents
+from studies.harness.claims import Claim, Older, covered, measured, percents
 from studies.harness.study import Row, Study, judge_places
 
 STEP = "prognose, young machines"
+OLDER = {"result": Older("0e5d2e08a2bf", "lives could end by more than their laws")}
 
 Array = NDArray[np.float64]
 SEED = 20261122

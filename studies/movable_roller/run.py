@@ -10,9 +10,10 @@ Method
     the baseline, so that nine of ten dwells are inferred. Controls that must lose the roller: the
     map taken as exact and drifts as four times as certain; a straight line for a map.
 Answer
-    Yes. Positions are off by 8 mV at most on a travel of 2.14 V, half a standard deviation in rms:
-    the intervals are cautious. Most of the error is hysteresis: at inner positions the same
-    frequency reads 3 to 6 mV higher on the way back.
+    Yes, but four intervals of nine are wide, 0.5 to 0.7 V on a travel of 2.14 V: those of the first
+    two moves and the last two. ln f jumps by some 10 % in each log, which the tracker may take for
+    an outlier until the next log confirms it. The other five are 0.05 V wide, and their positions
+    off by 8 mV at most.
 Run time
     Two minutes of a busy processor.
 Data
@@ -40,9 +41,12 @@ STEP = "infer"
 NEW = 2  # the repeat that map and description do not know
 LEAST_INSIDE = 8
 ALL_EPOCHS, QUICK_EPOCHS = 40, 3  # more than there are, and few
-QUICK_DWELLS = (0, 1, 3, 5, 7, 9)  # the first is not excited
+QUICK_DWELLS = tuple(range(9))  # the first is not excited
 _SIGMAS_90 = 1.645  # half a 90 % interval of a normal distribution
 _TOO_SURE = 0.25  # factor on standard deviations of the control
+NARROW, BELIEVED = "no interval is wider than 3 % of the travel", "the tracker believes every dwell"
+_JUMP = "a jump of 10 % in one log may be an outlier until the next log confirms it"
+NOT_MET = {NARROW: _JUMP, BELIEVED: _JUMP}
 
 
 def main() -> None:
@@ -53,7 +57,8 @@ def main() -> None:
     study = Study(__file__, __doc__)
     with tempfile.TemporaryDirectory() as scratch:
         answer = answered(real_data(), Path(scratch), quick=study.quick)
-    study.conclude(answer)
+    answer["not_met"] = {name: why for name, why in NOT_MET.items() if not answer["passed"][name]}
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def answered(data: Path, scratch: Path, *, quick: bool) -> Row:
@@ -222,11 +227,9 @@ def judge(answer: Row) -> dict[str, bool]:
             abs(pair["difference_v"] - pair["measured_difference_v"]) <= pair["half_interval_v"]
             for pair in answer["up_and_down"]
         ),
-        "no interval is wider than 3 % of the travel": all(
-            row["q95"] - row["q05"] <= 0.03 * travel for row in inferred
-        ),
+        NARROW: all(row["q95"] - row["q05"] <= 0.03 * travel for row in inferred),
         "all chains converged": all(row["converged"] for row in inferred),
-        "the tracker believes every dwell": answer["doubted_by_tracker"] == 0,
+        BELIEVED: answer["doubted_by_tracker"] == 0,
         "controls cover too little": all(
             control["inside"] < least for control in answer["controls"].values()
         ),
@@ -252,7 +255,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "width of the intervals, of the travel",
         f"{number(100 * min(width) / travel)} to {number(100 * max(width) / travel)} %",
         beside="3 % required",
-        met=passed["no interval is wider than 3 % of the travel"],
+        met=passed[NARROW],
     )
     apart = max(abs(row["difference_v"]) / row["half_interval_v"] for row in answer["up_and_down"])
     yield Claim(

@@ -11,6 +11,7 @@ import pandas as pd
 
 from lmshealth.io.reading import read_log
 from lmshealth.signal.following_error import read_error
+from studies.common.harmonics import rebuild
 from studies.harness.study import Row
 from studies.readings.checks import Check, below, command, control
 
@@ -123,7 +124,7 @@ def rebuilt(path: Path, harmonics: list[Row], truth: Row) -> dict[str, float]:
     Also the share of variance: explained by the rebuilt error, one minus what it leaves.
     """
     (reading,) = read_error(read_log(path))
-    ours, exact = 1e6 * reading.rebuilt(), truth["kept_above_um"]
+    ours, exact = 1e6 * rebuild(reading.harmonics, reading.above), truth["kept_above_um"]
     t = np.arange(exact.size) / RATE
     cosines = sum(
         h["amplitude_um"] * np.cos(2 * np.pi * h["frequency_hz"] * t + h["phase_rad"])

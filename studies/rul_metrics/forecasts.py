@@ -82,6 +82,9 @@ def states_of(life: LifePosterior, history: History) -> dict[str, Array]:
     """
     now, parts = _since_baseline(history), []
     for way, off, rate in life.by_scenario():
+        # Not a law of that model: its share of the draws goes to the other laws.
+        if any(path.law.kind == "accelerating" for path in way.scenario.paths):
+            continue
         n = rate.shape[0]
         never = np.full(n, np.inf), np.ones(n)
         theta = way.scenario.split(way.scenario.natural(way.mixture_draws))

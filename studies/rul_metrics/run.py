@@ -36,12 +36,13 @@ import numpy as np
 from lmshealth.stage.description import Stage, load_stage
 from studies.common import metrics
 from studies.common.lives import Array, recorded, rng_of
-from studies.harness.claims import Claim, counted, measured, number
+from studies.harness.claims import Claim, Older, counted, measured, number
 from studies.harness.study import Row, Study, judge_places
 from studies.rul_metrics import lives
 from studies.rul_metrics.forecasts import CONTROL, LINE, MISSING, OURS, PROGPY, WAYS, all_ways
 
 STEP = "prognose, compared with others"
+OLDER = {"result": Older("1939acb4ecd7", "lives could end by more than their laws")}
 
 SEED = 20261124
 LIVES, UNENDING = 16, 6  # of each kind, and healthy ones

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.prognosis import constants
-from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
+from lmshealth.prognosis.remaining_life import rate_std
+from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
@@ -44,6 +45,21 @@ class Part:
 
     def left(self, rng: np.random.Generator, now: float, limit: float, horizon: float) -> float:
         """Follow the parameter from now on until its limit, in m; inf past the horizon."""
+        left = self._left_by_law(rng, now, limit, horizon)
+        if left <= 0 or not self.law.names:
+            return left
+        if left <= horizon:
+            left *= rng.lognormal(0.0, rate_std(self.law) * np.sqrt(np.log2(1 + left / now)))
+        hazard = rng.gamma(constants.UNSEEN_ONSETS) / now
+        onset = rng.exponential() / hazard if hazard > 0 else np.inf
+        growth = constants.UNSEEN_GROWTH
+        end = onset + (now + onset) * rng.lognormal(np.log(growth.median), growth.sigma)
+        return min(left, float(end))
+
+    def _left_by_law(
+        self, rng: np.random.Generator, now: float, limit: float, horizon: float
+    ) -> float:
+        """Follow the parameter by its law and its deviation alone."""
         start = limit * np.exp(-self.off[-1]) / (self.jump if now >= self.step else 1.0)
         closed = self.begin + self.law.passage(self.theta[None], np.array([start]))[0] - now
         if self.rate == 0 or closed <= 0:
@@ -117,7 +133,7 @@ def _parts(
     step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
     while True:
         deviation = rng.choice(constants.DEVIATION_STDS, p=constants.DEVIATION_PRIOR)
-        rate = deviation**2 / (1000 * machine.description.usage.horizon_km)
+        rate = deviation**2 / clock[-1]
         parts = tuple(_part(rng, one, clock, step, rate) for one in machine.parameters)
         with np.errstate(divide="ignore"):
             if machine.modal_map.inside(np.log(_path(machine, clock, parts))).all():
@@ -146,6 +162,9 @@ def _part(
 def _of_law(rng: np.random.Generator, law: Law) -> Array:
     """Draw the natural parameters of a law, lengths in m."""
     first, second = rng.uniform(size=(2, 1))
+    if isinstance(law, Accelerating):
+        wear = [1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
+        return np.concatenate([*wear, law.slow.quantile(rng.uniform(size=1))])
     if isinstance(law, HertzWear):
         return np.concatenate([1000 * law.life_km.quantile(first), law.exponent.quantile(second)])
     if isinstance(law, Loosening):

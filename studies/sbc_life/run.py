@@ -5,17 +5,17 @@ Method
     none, its parameters, the deviation and its path are drawn from the priors of the description,
     the odometer of now independently of the life (lognormal about 2,000 km); lives that leave the
     map are drawn again. In 15 % of lives every parameter jumps once, and a law may begin anew
-    there. The remaining life is that of the path followed on in steps of 2 km; a life past the
-    horizon is censored. Each of 60 logs has roll and pitch, in half of the lives pitch by two
-    sources, with correlated errors of 0.03 to 0.2 %; unknown are intercepts, coefficients of
-    temperature and payload, the walk and the factor on the reported errors, the second source's
-    bias, the size of declared steps, and a relative error of the map's sensitivities. A twentieth
-    of estimates and temperatures is missing. Posteriors are drawn by importance sampling; some of
-    the same lives by chains too. Ranks among 127 draws, ties (a limit that is never reached, a
-    parameter that keeps its health, censored lives) at random, are compared with the simultaneous
-    band of their distribution at 99.9 %, coverages with their 99.9 % Clopper-Pearson interval.
-    Controls that must fail: a map taken as exact that is wrong by 5 %; every parameter taken to
-    degrade, while half of them do not.
+    there. The remaining life is that of the path followed on in steps of 2 km, then opened beyond
+    the laws as the prognosis opens it; a life past the horizon is censored. Each of 60 logs has
+    roll and pitch, in half of the lives pitch by two sources, with correlated errors of 0.03 to 0.2
+    %; unknown are intercepts, coefficients of temperature and payload, the walk and the factor on
+    the reported errors, the second source's bias, the size of declared steps, and a relative error
+    of the map's sensitivities. A twentieth of estimates and temperatures is missing. Posteriors are
+    drawn by importance sampling; some of the same lives by chains too. Ranks among 127 draws, ties
+    (a limit that is never reached, a parameter that keeps its health, censored lives) at random,
+    are compared with the simultaneous band of their distribution at 99.9 %, coverages with their
+    99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as exact that is wrong by
+    5 %; every parameter taken to degrade, while half of them do not.
 Answer
     Yes. All eight ranks stay inside their bands, and a parameter degrades as often as its posterior
     states. Run with the code before jumps were separated from logs at the same odometer, which

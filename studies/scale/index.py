@@ -60,7 +60,12 @@ def bare(rows: Sequence[Summary]) -> str:
     """Write the words of the rows as the plainest table."""
     lines = []
     for row in rows:
-        cells = [row.identity, row.last_log.isoformat(), row.headline, probability(row.probability)]
+        cells = [
+            row.identity,
+            row.recorded_at.date().isoformat(),
+            row.headline,
+            probability(row.probability),
+        ]
         for one in row.health:
             cells += [percent(one.median, 0), interval(one.low, one.high)]
         if row.life is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from datetime import UTC, date, datetime, timedelta
+from datetime import UTC, date, datetime, time, timedelta
 
 import numpy as np
 
@@ -51,7 +51,11 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
         file=f"{identity}.html",
         identity=identity,
         urgency=(1 if young else 2 if service.kind == "later" else 0, days, 0.0, identity),
-        last_log=TODAY - timedelta(days=int(rng.integers(0, 30))),
+        recorded_at=datetime.combine(TODAY, time()) - timedelta(days=int(rng.integers(0, 30))),
+        baseline_at=datetime.combine(TODAY, time()) - timedelta(days=365),
+        description="as drawn",
+        n_logs=40,
+        travel=1e6,
         state=state,
         headline=headline,
         verdict=state,

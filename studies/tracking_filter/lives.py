@@ -13,7 +13,13 @@ from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking import filter_bank
-from lmshealth.tracking.constants import BIAS_STD, DAMPING_WALK
+from lmshealth.tracking.constants import (
+    BIAS_STD,
+    DAMPING_WALK,
+    LOGS_PER_LIFE,
+    RATE_COMMON,
+    WANDER_COMMON,
+)
 from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.state_space import StateSpace
@@ -76,7 +82,10 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     chosen = grid[rng.choice(grid.rate_std.size, size=1, p=np.exp(grid.log_prior))]
     n, m, r = int(rng.integers(20, 41)), len(MODES), len(MODES) * len(sources)
     travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
-    level, damping = _walk(rng, chosen, np.diff(travel) / HORIZON)
+    missing = rng.random((n, r)) < 0.1
+    missing[0] = False
+    seen = ~missing.all(axis=1)
+    level, damping = _walk(rng, chosen, _ticks(travel, seen))
     temperature, effect = _temperature(rng, n)
     mode = np.tile(np.arange(m), len(sources))
     bias = rng.standard_normal((2, r)) * np.array(BIAS_STD)[:, None]
@@ -84,9 +93,8 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     cov = _covariance(rng, n, len(sources))
     scales = np.tile(np.repeat(chosen.scales[0], m), 2)
     noise = (np.linalg.cholesky(cov) @ rng.standard_normal((n, 2 * r, 1)))[:, :, 0] * scales
-    missing = rng.random((n, r)) < 0.1
-    missing[0] = False
-    ln_frequency = (level + effect)[:, mode] + bias[0] + noise[:, :r]
+    wander = _wander(rng, chosen, np.sqrt(np.diag(cov[0]))[:m], seen)
+    ln_frequency = (level + effect + wander)[:, mode] + bias[0] + noise[:, :r]
     ln_damping = damping[:, mode] + bias[1] + noise[:, r:]
     history = make_history(
         MODES,
@@ -102,17 +110,48 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
 def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tuple[Array, Array]:
     """Let both modes wander: ln f and ln ζ, ``(n_logs, n_modes)`` each."""
     m = len(MODES)
-    rate = chosen.rate_std * rng.standard_normal(m)
+    rate = chosen.rate_std * _together(rng, RATE_COMMON)
+    decay = float(chosen.rate_decay[0])
     level, damping = [LEVEL], [DAMPING]
     for tick in ticks:
         # The integral of a walk, and the walk itself, over one tick.
-        bend = chosen.rate_walk * np.sqrt(tick) * rng.standard_normal(m)
-        rest = chosen.rate_walk * np.sqrt(tick**3 / 12) * rng.standard_normal(m)
+        bend = chosen.rate_walk * np.sqrt(tick) * _together(rng, RATE_COMMON)
+        rest = chosen.rate_walk * np.sqrt(tick**3 / 12) * _together(rng, RATE_COMMON)
         own = chosen.level_walk * np.sqrt(tick) * rng.standard_normal(m)
-        level.append(level[-1] + rate * tick + bend * tick / 2 + rest + own)
-        rate = rate + bend
+        far = -np.expm1(-decay * tick) / decay if decay else tick
+        level.append(level[-1] + rate * far + bend * tick / 2 + rest + own)
+        rate = rate * np.exp(-decay * tick) + bend
         damping.append(damping[-1] + DAMPING_WALK * np.sqrt(tick) * rng.standard_normal(m))
     return np.array(level), np.array(damping)
+
+
+def _ticks(travel: Array, seen: NDArray[np.bool_]) -> Array:
+    """Return the parts of a life between logs; the unit is their mean distance so far."""
+    ticks, before, count = [], 0.0, 0
+    for s, there in zip(travel[1:] - travel[0], seen[1:], strict=True):
+        count += int(there)
+        ticks.append((s - before) * count / s / LOGS_PER_LIFE if there else 0.0)
+        before = s if there else before
+    return np.array(ticks)
+
+
+def _together(rng: np.random.Generator, common: float) -> Array:
+    """Draw a standard normal number for each mode, with a share of variance in common."""
+    own = np.sqrt(1 - common) * rng.standard_normal(len(MODES))
+    return np.asarray(np.sqrt(common) * rng.standard_normal() + own)
+
+
+def _wander(
+    rng: np.random.Generator, chosen: Hyperparameters, std: Array, seen: NDArray[np.bool_]
+) -> Array:
+    """Draw the wander of both modes about their level, ``(n_logs, n_modes)``."""
+    size = float(chosen.wander[0] * np.exp(np.log(chosen.scales[0]).mean())) * std
+    keep = float(chosen.wander_keep[0])
+    found = [size * _together(rng, WANDER_COMMON)]
+    for there in seen[1:]:
+        new = np.sqrt(1 - keep**2) * size * _together(rng, WANDER_COMMON)
+        found.append(keep * found[-1] + new if there else found[-1])
+    return np.array(found)
 
 
 def _temperature(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
@@ -160,12 +199,16 @@ def without_common_errors(history: History) -> History:
 def banks(
     history: History, machine: Stage | None, setting: Hyperparameters
 ) -> Iterator[tuple[filter_bank.FilterBank, float]]:
-    """Filter log by log with one setting; yield the bank and the squared innovation."""
+    """Filter log by log with one setting; yield the bank and the squared innovation.
+
+    The lives have no outliers and the other programs know none: the filter looks for none either.
+    """
     model = FilterModel(StateSpace(history, machine))
     model.grid = replace(setting, log_prior=np.zeros(1))
     bank = filter_bank.initial(model)
     for k in range(len(history.logs)):
-        bank, innovation = filter_bank.update(model, filter_bank.predict(model, bank, k), k)
+        before = filter_bank.predict(model, bank, k)
+        bank, innovation = filter_bank.update(model, before, k, outliers=False)
         yield bank, float(innovation.nis)
 
 

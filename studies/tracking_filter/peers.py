@@ -7,12 +7,20 @@ from functools import partial
 from importlib.metadata import version
 from importlib.util import find_spec
 from typing import NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.constants import DAMPING_WALK, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking import constants
+from lmshealth.tracking.constants import (
+    DAMPING_WALK,
+    LN_F_STD,
+    LN_ZETA_STD,
+    LOGS_PER_LIFE,
+    WANDER_COMMON,
+)
 from lmshealth.tracking.covariates import Regressor
 from lmshealth.tracking.filter_bank import Hyperparameters
 from lmshealth.tracking.history import History
@@ -38,28 +46,36 @@ class Loop(NamedTuple):
 
 
 def filterpy_loop(
-    history: History, setting: Hyperparameters, life: float, regressed: tuple[Regressor, ...] = ()
+    history: History, setting: Hyperparameters, ticks: Array, regressed: tuple[Regressor, ...] = ()
 ) -> Loop:
-    """Filter one setting by filterpy, log by log: [ln f, rate, ln ζ, baseline, coefficients]."""
+    """Filter one setting by filterpy: [ln f, rate, ln ζ, baseline, wander, coefficients]."""
     m, n = len(history.modes), len(history.logs)
-    level, rate, damping, base = (slice(part * m, (part + 1) * m) for part in range(4))
-    size = (4 + len(regressed)) * m
+    level, rate, damping, base, own = (slice(part * m, (part + 1) * m) for part in range(5))
+    size = (5 + len(regressed)) * m
     kalman = KalmanFilter(dim_x=size, dim_z=2 * m)
-    prior = [LN_F_STD, setting.rate_std[0], LN_ZETA_STD, 0.0, *(r.prior_std for r in regressed)]
+    prior = [LN_F_STD, 0.0, LN_ZETA_STD, 0.0, 0.0, *(r.prior_std for r in regressed)]
     kalman.x = np.zeros(size)
     kalman.x[level], kalman.x[damping] = history.ln_frequency[0], history.ln_damping[0]
     kalman.P = np.diag(np.square(np.repeat(prior, m)))
     values = np.hstack([history.ln_frequency, history.ln_damping])
-    ticks = np.diff(history.travel, prepend=history.travel[0]) / life
     eye = np.eye(m)
+    common = constants.RATE_COMMON
+    alike = common + (1 - common) * eye
+    std = np.sqrt(np.diag(history.cov[0]))[:m] * setting.wander[0] * setting.scales[0, 0]
+    wander = np.outer(std, std) * (WANDER_COMMON + (1 - WANDER_COMMON) * eye)
+    kalman.P[rate, rate], kalman.P[own, own] = setting.rate_std[0] ** 2 * alike, wander
+    decay, there = float(setting.rate_decay[0]), np.isfinite(history.ln_frequency).any(axis=1)
     states, covs = np.empty((n, size)), np.empty((n, size, size))
     for k, tick in enumerate(ticks):
         f, q = np.eye(size), np.zeros((size, size))
-        bend = setting.rate_walk[0] ** 2
-        f[level, rate] = tick * eye
-        q[level, level] = (setting.level_walk[0] ** 2 * tick + bend * tick**3 / 3) * eye
-        q[level, rate] = q[rate, level] = bend * tick**2 / 2 * eye
-        q[rate, rate] = bend * tick * eye
+        bend = setting.rate_walk[0] ** 2 * alike
+        f[level, rate] = (-np.expm1(-decay * tick) / decay if decay else tick) * eye
+        f[rate, rate] = np.exp(-decay * tick) * eye
+        q[level, level] = setting.level_walk[0] ** 2 * tick * eye + bend * tick**3 / 3
+        q[level, rate] = q[rate, level] = bend * tick**2 / 2
+        q[rate, rate] = bend * tick
+        keep = setting.wander_keep[0] if k and there[k] else 1.0
+        f[own, own], q[own, own] = keep * eye, (1 - keep**2) * wander
         q[damping, damping] = DAMPING_WALK**2 * tick * eye
         kalman.predict(F=f, Q=q)
         if k == 0:
@@ -67,10 +83,10 @@ def filterpy_loop(
             copy[base, base], copy[base, level] = 0.0, eye
             kalman.x, kalman.P = copy @ kalman.x, copy @ kalman.P @ copy.T
         h = np.zeros((2 * m, size))
-        h[:m, level] = h[m:, damping] = eye
+        h[:m, level] = h[m:, damping] = h[:m, own] = eye
         noise = history.cov[k] * setting.scales[0, 0] ** 2
         for j, one in enumerate(regressed):
-            h[:m, (4 + j) * m : (5 + j) * m] = one.values[k] * eye
+            h[:m, (5 + j) * m : (6 + j) * m] = one.values[k] * eye
             noise = noise + np.diag(np.r_[np.full(m, one.unknown[k]), np.zeros(m)])
         rows = np.flatnonzero(np.isfinite(values[k]))
         if rows.size:
@@ -93,7 +109,7 @@ def deviation(rng: np.random.Generator, n: int, machine: Stage) -> dict[str, flo
     for _ in range(n):
         life = draw(rng)
         found, space = filtered(life, machine), StateSpace(life.history, machine)
-        book = filterpy_loop(life.history, life.setting, space.life, space.regressed)
+        book = filterpy_loop(life.history, life.setting, space.ticks, space.regressed)
         std = np.sqrt(np.einsum("kii->ki", found.cov["ln f"]))
         # Drifts of machines that hardly wander have next to no std, but numbers of ln f.
         wide = np.maximum(book.drift_std, 0.1 * std)
@@ -120,7 +136,12 @@ def long_life(n: int, m: int) -> History:
 def one_setting() -> Hyperparameters:
     """Return the setting that all of them can express."""
     return Hyperparameters(
-        np.array([LEVEL_WALK]), np.array([RATE_STD]), np.zeros(1), np.ones((1, 1)), np.zeros(1)
+        np.array([LEVEL_WALK]),
+        np.array([RATE_STD]),
+        np.zeros(1),
+        np.ones((1, 1)),
+        np.zeros(1),
+        *np.zeros((3, 1)),
     )
 
 
@@ -138,7 +159,7 @@ def by_simdkalman(history: History) -> tuple[Array, Array]:
     """Filter ln f of all modes as series of their own by simdkalman."""
     import simdkalman
 
-    tick = 1 / (len(history.logs) - 1)
+    tick = 1 / LOGS_PER_LIFE
     kalman = simdkalman.KalmanFilter(
         state_transition=np.array([[1.0, tick], [0.0, 1.0]]),
         process_noise=np.diag([LEVEL_WALK**2 * tick, 0.0]),
@@ -165,7 +186,7 @@ def by_statsmodels(history: History) -> tuple[Array, Array]:
     """
     from statsmodels.tsa.statespace.structural import UnobservedComponents
 
-    tick = 1 / (len(history.logs) - 1)
+    tick = 1 / LOGS_PER_LIFE
     prior = np.diag([LN_F_STD**2, (RATE_STD * tick) ** 2])
     means, stds = [], []
     for column in history.ln_frequency.T:
@@ -185,29 +206,31 @@ LOOP = "filterpy, one setting"
 def speed(n: int, m: int, repeats: int) -> Row:
     """Compare numbers and processor time on one long life; programs take turns."""
     history = long_life(n, m)
-    life = float(np.ptp(history.travel))
-    mean, std = bank_of_one(history)
-    there = {name: work for name, work in PEERS.items() if find_spec(name)}
-    others: dict[str, Callable[[], tuple[Array, Array]]] = {
-        LOOP: lambda: filterpy_loop(history, one_setting(), life)[:2],
-        **{name: partial(work, history) for name, work in there.items()},
-    }
-    works = {
-        LOOP: others[LOOP],
-        "bank, one setting": lambda: bank_of_one(history),
-        "track, all settings": lambda: track(history),
-        **others,
-    }
-    times = in_turns(works, repeats)
-    rows = []
-    for name, taken in times.items():
-        ratio = float(np.median(np.divide(taken, times[LOOP])))
-        row: Row = {"program": name, "cpu_s": min(taken), "times_filterpy": ratio}
-        if name in others:
-            other, other_std = others[name]()
-            row["deviation"] = float(np.abs((other - mean) / std).max())
-            row["deviation_of_std"] = float(np.abs(other_std / std - 1).max())
-        rows.append(row)
+    # The other programs take modes for independent: so do ours here.
+    with patch.object(constants, "RATE_COMMON", 0.0):
+        ticks = StateSpace(history, None).ticks
+        mean, std = bank_of_one(history)
+        there = {name: work for name, work in PEERS.items() if find_spec(name)}
+        others: dict[str, Callable[[], tuple[Array, Array]]] = {
+            LOOP: lambda: filterpy_loop(history, one_setting(), ticks)[:2],
+            **{name: partial(work, history) for name, work in there.items()},
+        }
+        works = {
+            LOOP: others[LOOP],
+            "bank, one setting": lambda: bank_of_one(history),
+            "track, all settings": lambda: track(history),
+            **others,
+        }
+        times = in_turns(works, repeats)
+        rows = []
+        for name, taken in times.items():
+            ratio = float(np.median(np.divide(taken, times[LOOP])))
+            row: Row = {"program": name, "cpu_s": min(taken), "times_filterpy": ratio}
+            if name in others:
+                other, other_std = others[name]()
+                row["deviation"] = float(np.abs((other - mean) / std).max())
+                row["deviation_of_std"] = float(np.abs(other_std / std - 1).max())
+            rows.append(row)
     versions = {name: version(name) for name in there}
     missing = [name for name in PEERS if name not in there]
     return {"epochs": n, "modes": m, "programs": rows, "missing": missing, "versions": versions}

@@ -38,7 +38,7 @@ def known_setting(rng: np.random.Generator, n: int, machine: Stage) -> Row:
     }
     for _ in range(n):
         life = lives.draw(rng)
-        k = int(rng.integers(1, len(life.history.logs)))
+        k, _ = one_log(rng, life)
         for kind, history in (("as reported", life.history), ("halved", halved(life.history))):
             found = lives.filtered(replace(life, history=history), machine)
             for name, truth in life.truth().items():
@@ -81,8 +81,12 @@ def moment(z: list[float]) -> Row:
 
 
 def one_log(rng: np.random.Generator, life: lives.Life) -> tuple[int, int]:
-    """Choose the log and the mode of a life that are judged: one, so that all are independent."""
-    return int(rng.integers(1, len(life.history.logs))), int(rng.integers(2))
+    """Choose the log and the mode of a life that are judged: one, so that all are independent.
+
+    A log without estimates is no choice: none since the baseline leaves a drift of exactly 0.
+    """
+    seen = np.flatnonzero(np.isfinite(life.history.ln_frequency).any(axis=1))
+    return int(rng.choice(seen[1:])), int(rng.integers(2))
 
 
 def averaged(rng: np.random.Generator, n: int, n_halved: int, machine: Stage) -> Row:

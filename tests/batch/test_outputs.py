@@ -8,10 +8,11 @@ from typing import Any
 
 import pytest
 
+from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.outputs import CsvRows, MachineRecord, Tables, machine_output
+from lmshealth.batch.outputs import MachineRecord, Tables, machine_output
 from lmshealth.io.log import Refusal
-from lmshealth.report.tables import COLUMNS
+from lmshealth.report.tables import COLUMNS, Row, refused_rows
 from tests.assessments import worn
 
 
@@ -21,16 +22,17 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def effect(mode: str, **more: Any) -> CsvRows:
+def effect(mode: str, **more: Any) -> bytes:
     """Give a row of effects.csv."""
-    return CsvRows.of("effects", [{"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, **more}])
+    row = {"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, "std": float("nan"), **more}
+    return pack({"effects": [row]})
 
 
 def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
     """In whichever order machines are done; those that never come leave the others their place."""
     with Tables(tmp_path, ["A", "B", "C", "D"]) as tables:
         for machine in ("C", "A", "D", "B"):
-            tables.add(machine, {"effects": effect(machine)})
+            tables.add(machine, effect(machine))
         tables.write()
     assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["A", "B", "C", "D"]
 
@@ -39,7 +41,7 @@ def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path
     """Rows of machines after one that failed are written nevertheless."""
     with Tables(tmp_path, ["A", "B", "C"]) as tables:
         for machine in ("C", "B"):
-            tables.add(machine, {"effects": effect(machine)})
+            tables.add(machine, effect(machine))
         tables.write()
     assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["B", "C"]
 
@@ -47,21 +49,21 @@ def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path
 def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
     """A column that only some rows have is empty in the others, and comes last."""
     with Tables(tmp_path, ["A", "B"]) as tables:
-        tables.add("A", {"effects": effect("roll", note='two\nlines, "quoted"')})
-        tables.add("B", {"effects": effect("pitch", other=1)})
+        tables.add("A", effect("roll", note='two\nlines, "quoted"'))
+        tables.add("B", effect("pitch", other=1))
         tables.write()
     one, two = read(tmp_path / "effects.csv")
     assert list(one) == [*COLUMNS["effects"].split(), "note", "other"]
     assert (one["note"], one["other"]) == ('two\nlines, "quoted"', "")
     assert (two["mode"], two["note"], two["other"]) == ("pitch", "", "1")
-    assert float(two["coefficient"]) == 0.1 + 0.2
+    assert (float(two["coefficient"]), two["std"]) == (0.1 + 0.2, "")
 
 
 def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
     """What ends a line elsewhere does not end the run, nor take another row along."""
     with Tables(tmp_path, ["A", "B"]) as tables:
-        tables.add("A", {"effects": effect("one\rtwo")})
-        tables.add("B", {"effects": effect("pitch")})
+        tables.add("A", effect("one\rtwo"))
+        tables.add("B", effect("pitch"))
         tables.write()
     lines = (tmp_path / "effects.csv").read_bytes().decode().split("\n")
     assert ["one\rtwo" in lines[1], "pitch" in lines[2]] == [True, True]
@@ -70,7 +72,7 @@ def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
 def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
     """Refused logs are listed, and tables without rows have their headers."""
     with Tables(tmp_path, []) as tables:
-        tables.add_refused([Refusal("a.h5", "empty", "0 bytes")])
+        tables.add("", pack({"refused": refused_rows([Refusal("a.h5", "empty", "0 bytes")])}))
         tables.write()
     assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
     for name, columns in COLUMNS.items():
@@ -82,7 +84,7 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
     """An interrupt leaves the last complete tables, and no other file in the folder."""
     (tmp_path / "effects.csv").write_text("as it was")
     with pytest.raises(KeyboardInterrupt), Tables(tmp_path, ["A"]) as tables:
-        tables.add("A", {"effects": effect("roll")})
+        tables.add("A", effect("roll"))
         raise KeyboardInterrupt
     assert [path.name for path in tmp_path.iterdir()] == ["effects.csv"]
     assert (tmp_path / "effects.csv").read_text() == "as it was"
@@ -96,6 +98,6 @@ def test_a_page_needs_no_logs(tmp_path: Path) -> None:
     assert output is not None
     summary = output.page.summary
     assert (summary.file, summary.identity) == ("M7-Y.html", "M7-Y")
-    assert output.tables == {}
+    assert unpack(output.tables, dict[str, list[Row]]) == {}
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", None, (), None)) is None

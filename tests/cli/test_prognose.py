@@ -88,7 +88,10 @@ def call(*words: object) -> Result:
 
 @pytest.mark.slow
 def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Path) -> None:
-    """The truth lies in the 90 % interval, who does not wear has no end; draws are kept."""
+    """The truth lies in the 90 % interval, who does not wear lasts longer; draws are kept.
+
+    No log excludes wear that begins later: a sound machine has dates, too.
+    """
     out, draws = tmp_path / "new" / "prognosis.csv", tmp_path / "life.nc"
     result = call(table, "--stage", toml, "--out", out, "--posterior", draws, "--by", "2026-05-01")
     assert result.exit_code == 0, result.output
@@ -96,9 +99,12 @@ def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Pat
     assert list(found.columns[: len(COLUMNS["prognosis"].split())]) == COLUMNS["prognosis"].split()
     worn, sound = (found[found["stage"] == stage].iloc[1] for stage in ("AX-1", "AX-2"))
     assert worn["rul_km_q05"] < LIMIT_KM < worn["rul_km_q95"]
-    assert (worn["service"], sound["service"]) == ("by", "later")
-    assert worn["service_risk"] <= 0.05
-    assert sound["censored_from"] == 0.05 and sound["probability_at_most"] < 0.05
+    assert worn["probability_beyond_horizon"] < 0.01 < 0.4 < sound["probability_beyond_horizon"]
+    assert sound["rul_km_q50"] > 2 * LIMIT_KM
+    for one in (worn, sound):
+        assert one["service"] == "by" and one["service_risk"] <= 0.05
+        assert one["inspect_by"] <= one["service_by"]
+    assert sound["probability_at_most"] < 0.5 * worn["probability_at_most"]
     assert worn["before"] == "2026-05-01"
     assert f"Service: by {worn['service_by']} (accepted risk 5 %)" in result.stdout
     assert f"{worn['rul_km_q50']:,.0f}" in result.stdout

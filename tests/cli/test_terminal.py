@@ -9,8 +9,7 @@ import sys
 
 import pytest
 
-from lmshealth.cli.progress import progress_bars
-from lmshealth.cli.terminal import print_json, print_refused, print_text
+from lmshealth.cli.terminal import print_json, print_refused, print_text, progress_bars
 
 NAN = float("nan")
 

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
+from lmshealth.health import constants
 from lmshealth.health.verdict import (
     degraded_below,
     degraded_words,
@@ -122,11 +123,12 @@ def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -
 
 
 def test_an_undeclared_step_is_the_verdict(stage: Stage) -> None:
-    """The word is step, with what jumped and what health is left; its odds are the evidence's."""
+    """The word is step, with what jumped and what health is left; it has stated prior odds."""
     health = make_health(around(0.99, 0.6))
     found = judge(stage, logs(8), health, stepped(evidence=3.0))
     assert found.verdict == "step"
-    assert found.probability == pytest.approx(1 / (1 + np.exp(-3.0)))
+    prior = constants.STEP_PROBABILITY / (1 - constants.STEP_PROBABILITY)
+    assert found.probability == pytest.approx(1 / (1 + np.exp(-3.0) / prior))
     assert "roll −3.0 %" in found.why
     assert "pitch +0.2 %" in found.why
     assert "Mount stiffness is at 60 %" in found.why

@@ -88,7 +88,6 @@ def book(history: History, density: LifeDensity, y: FloatArray, model_std: float
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
         slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
-        horizon=density.likelihood.data.stage.description.usage.horizon_km * 1000,
         model_std=model_std,
         intercept_std=constants.INTERCEPT_STD,
     )
@@ -447,7 +446,6 @@ def off_by_hand(
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
     belief = LifeBelief(
         slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
-        horizon=density.likelihood.data.horizon,
         model_std=MODEL_STD,
         intercept_std=constants.INTERCEPT_STD,
     )
@@ -473,7 +471,7 @@ def test_deviations_are_those_of_a_dense_gaussian(
             np.testing.assert_allclose(mean[i, m], known[0], rtol=1e-7, atol=1e-10)
             np.testing.assert_allclose(cov[i, m], known[1], rtol=1e-7, atol=1e-10)
     # From now on the variance grows as that of a Wiener process.
-    rate = with_deviation.deviation**2 / density.likelihood.data.horizon
+    rate = with_deviation.deviation**2 / density.likelihood.data.now
     np.testing.assert_allclose(mean[:, 3], mean[:, 2], rtol=1e-9)
     np.testing.assert_allclose(
         cov[:, 3] - cov[:, 2], np.tile(1.5 * now * rate * np.eye(2), (3, 1, 1))
@@ -511,7 +509,7 @@ def test_draws_of_deviations_have_their_mean_and_covariance(
     assert (np.abs(off[:, 1].mean(axis=0) - mean) < 5 * std / np.sqrt(n)).all()
     assert (np.abs(np.cov(off[:, 1].T) - cov) < 8 / np.sqrt(n) * np.outer(std, std)).all()
     assert (np.abs(off[:, 1].mean(axis=0) - 1.2 * mean) > 5 * std / np.sqrt(n)).any()
-    np.testing.assert_allclose(rate, with_deviation.deviation**2 / density.likelihood.data.horizon)
+    np.testing.assert_allclose(rate, with_deviation.deviation**2 / density.likelihood.data.now)
 
 
 def test_points_of_the_grid_are_drawn_by_their_weight(

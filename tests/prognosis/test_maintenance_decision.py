@@ -265,3 +265,33 @@ def test_without_a_prognosis_the_service_is_unknown() -> None:
     assert (service.kind, service.by, service.planned) == ("unknown", None, None)
     assert np.isnan([service.wait, service.risk, *service.planned_risk]).all()
     assert service.kept_risk == 0.1
+
+
+def missed(prognosis: Prognosis, every: float) -> float:
+    """Return the share of draws that end without a log after half of the loss, log by log."""
+    found = 0
+    for half, left in zip(prognosis.half, prognosis.remaining[:, -1], strict=True):
+        log = every
+        while log < half:
+            log += every
+        found += log >= left
+    return found / prognosis.half.size
+
+
+def test_logs_at_the_advised_interval_announce_the_end(rng: np.random.Generator) -> None:
+    """At most a fifth of the accepted risk ends unannounced; logs a tenth rarer would miss more."""
+    prognosis = aged(SCALE * rng.weibull(3.0, 4000), 2e5)
+    service = decide(prognosis, Decision())
+    assert service.inspect_by is not None and service.by is not None
+    assert service.earliest_end is not None
+    assert service.inspect_by <= service.by and service.earliest_end <= service.by
+    assert missed(prognosis, service.inspect_every) <= 0.01
+    assert missed(prognosis, service.inspect_every / 0.9) > 0.01
+    # Faster losses ask for more frequent logs; without an end no log is asked for.
+    late = replace(prognosis, half=0.95 * prognosis.remaining[:, -1])
+    steep = replace(prognosis, half=0.5 * prognosis.remaining[:, -1])
+    assert decide(steep, Decision()).inspect_every == service.inspect_every
+    assert 0 < decide(late, Decision()).inspect_every < 0.5 * service.inspect_every
+    endless = decide(aged(np.full(100, np.inf), 2e5), Decision())
+    assert (endless.inspect_by, endless.inspect_every) == (None, np.inf)
+    assert endless.earliest_end is None

@@ -17,13 +17,16 @@ from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import (
+    _beyond_laws,
     _usage,
     identifiable_limits,
     parameters_with_limit,
     prognose,
 )
 from lmshealth.prognosis.results import LawWeight, Prognosis
+from lmshealth.stage.degradation_laws import Accelerating, Linear
 from lmshealth.stage.description import Stage
+from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.history import History, Step
 from tests.lives import (
     FADING,
@@ -55,6 +58,8 @@ def small_grid() -> Iterator[None]:
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
         patch.setattr(constants, "DEVIATION_STDS", (0.0,))
         patch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
+        patch.setattr(constants, "UNSEEN_ONSETS", 1e-9)
+        patch.setattr(constants, "RATE_STD", 0.0)
         yield
 
 
@@ -337,10 +342,10 @@ def test_deviation_makes_life_less_certain(
     stage: Stage, fading: Prognosis, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A deviation widens what is left, and what is past is so of the health that is now."""
-    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.15,))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.08,))
     for rate, past_share in ((1.5e-4, 0.0), (0.4 / 1400, 0.5)):
         found = prognose(fading_life(rate), stage, 3)
-        assert found.deviation == pytest.approx(0.15)
+        assert found.deviation == pytest.approx(0.08)
         past = found.remaining[:, 0] <= 0
         np.testing.assert_array_equal(past, found.health[:, 0] <= 0.6)
         assert past.mean() == pytest.approx(past_share, abs=0.4)
@@ -386,3 +391,58 @@ def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
     """Parameters with a limit are found with their place among all."""
     stage = make_stage(tmp_path, (FOOT, PRELOAD))
     assert [(j, p.name) for j, p in parameters_with_limit(stage)] == [(1, "guide_preload")]
+
+
+def test_an_unseen_onset_has_the_hazard_of_none_in_the_travel_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Without an end by the law half of the onsets lie within three times the travel seen."""
+    monkeypatch.setattr(constants, "UNSEEN_ONSETS", 0.5)
+    monkeypatch.setattr(constants, "UNSEEN_GROWTH", Lognormal(0.2, 1e-9))
+    law, n, now = Linear(rate_per_km=Normal(0.0, 2e-4)), 20_000, 1e6
+    never = np.full(n, np.inf)
+    left, half = _beyond_laws(np.random.default_rng(1), law, never, never, now)
+    # The end at s_e comes 1.2 times as late as its onset s, with P(s > x) = sqrt(now / x).
+    for ahead in (0.5, 1.0, 3.0):
+        share = 1 - np.sqrt(1.2 / (1 + ahead))
+        assert abs(np.mean(left < ahead * now) - share) < 5 * np.sqrt(share / n)
+    onset = (left + now) / 1.2
+    np.testing.assert_allclose(half + now, onset * (1 + 0.2 * np.sqrt(0.5)), rtol=1e-6)
+    wrong = 1 - np.sqrt(1.2 / 2.0) * 0.9
+    assert abs(np.mean(left < now) - wrong) > 5 * np.sqrt(wrong / n)  # negative control
+
+
+def test_intervals_open_with_the_distance_beyond_the_travel_seen(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The rate of a law drifts with the logarithm of travel, most of one that accelerates."""
+    monkeypatch.setattr(constants, "RATE_STD", 0.075)
+    named = Linear(rate_per_km=Normal(0.0, 2e-4))
+    late = Accelerating(life_km=Lognormal(4000, 1.0), slow=Lognormal(0.1, 1.0))
+    for law, std in ((named, 0.075), (late, constants.ACCELERATION_STD)):
+        for ahead, doublings in ((1e5, np.log2(1.1)), (1e6, 1.0), (3e6, 2.0)):
+            left, half = np.full(4000, ahead), np.full(4000, ahead / 2)
+            found, halves = _beyond_laws(np.random.default_rng(2), law, left, half, 1e6)
+            assert np.log(found).std() == pytest.approx(std * np.sqrt(doublings), rel=0.06)
+            np.testing.assert_allclose(halves, found / 2)
+    past = np.full(10, -1e5)
+    np.testing.assert_array_equal(
+        _beyond_laws(np.random.default_rng(3), named, past, past, 1e6)[0], past
+    )
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.05])
+def test_the_posterior_does_not_depend_on_the_horizon(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float
+) -> None:
+    """Horizons of 2,500 and 160,000 km: the same health, and the same risks up to the nearer."""
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (deviation,))
+    stages = [
+        make_stage(tmp_path / str(km), (FADING,), tail=f"[usage]\nhorizon_km = {km}\n")
+        for km in (2500, 160_000)
+    ]
+    near, far = (prognose(fading_life(1.5e-4), stage, 3, chains=False) for stage in stages)
+    np.testing.assert_array_equal(near.health, far.health)
+    for level in (0.25, 0.5, 0.75):
+        travel = np.quantile(near.remaining[:, -1], level)
+        assert abs(np.mean(far.remaining[:, -1] <= travel) - level) < 0.035

@@ -6,7 +6,7 @@ import pickle
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +93,7 @@ def test_services_are_counted_by_month(tmp_path: Path) -> None:
 def test_no_date_can_break_the_calendar(tmp_path: Path) -> None:
     """A clock that was far off leaves a page all the same; without dates there is none."""
     rows = make_rows(N)
-    late = [replace(row, last_log=date.max) for row in rows]
+    late = [replace(row, recorded_at=datetime.max) for row in rows]
     assert bars(Page(write_index(tmp_path, late, ())))["now"] > 0
     undated = [row for row in rows if row.service.by is None]
     assert len(undated) > 10

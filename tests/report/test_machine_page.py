@@ -16,7 +16,7 @@ from msgspec import structs
 from lmshealth import examples
 from lmshealth._arrays import FloatArray
 from lmshealth.batch.assess import assess
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
@@ -24,7 +24,7 @@ from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.assessment import Assessment
-from lmshealth.report.changes import reported
+from lmshealth.report.assessment import summarise as summarise_machine
 from lmshealth.report.fleet_page import write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.text import GAP
@@ -84,7 +84,8 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
 @pytest.mark.usefixtures("blank")
 def test_what_is_new_follows_the_first_screen(make: Maker, tmp_path: Path) -> None:
     """The earlier report of this stage is compared with, another stage's is not."""
-    before = replace(reported(make(wear_km=400000, floor=0.98)), n_logs=28)
+    earlier = make(wear_km=400000, floor=0.98)
+    before = replace(summarise_machine(earlier, earlier.service()), n_logs=28)
     for identity, expected in (
         ("M7-Y", "Verdict: healthy (97 %) → loss of guide preload and mount stiffness (93 %)."),
         ("M8-Y", "This is the first report on this stage"),
@@ -92,7 +93,7 @@ def test_what_is_new_follows_the_first_screen(make: Maker, tmp_path: Path) -> No
         page = Page(write_report(tmp_path, [make()], (), earlier={identity: before})[0])
         text = words(page)
         place = text.index(expected)
-        assert text.index("Notes") < place < text.index("Tracked modes")
+        assert text.index("What was noticed") < place < text.index("Tracked modes")
         assert ("on 28 logs up to" in text) == (identity == "M7-Y")
 
 
@@ -262,7 +263,9 @@ def test_names_are_escaped(make: Maker, tmp_path: Path) -> None:
     evil = "../<script>alert(1)</script>"
     assessment = make(evil)
     refusal = Refusal(log=evil, reason=f'"{evil}', detail="'><img src=x onerror=alert(1)>")
-    assessment = replace(assessment, refused=(refusal,), notes=(evil,))
+    assessment = replace(
+        assessment, refused=(refusal,), notices=(Notice("new-baseline", "note", evil, evil, evil),)
+    )
     paths = write_report(tmp_path / "out", [assessment], [refusal])
     assert {path.parent for path in paths} == {tmp_path / "out"}
     for path in paths:
@@ -314,7 +317,7 @@ def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.M
     assessment, asked = make(), []
     decided = assessment.service()
     monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
-    make_page(assessment, "a.html", before=reported(assessment, decided))
+    make_page(assessment, "a.html", before=summarise_machine(assessment, decided))
     assert asked == [assessment]
 
 
@@ -430,7 +433,7 @@ def hostile(assessment: Assessment, evil: str) -> Assessment:
         track=replace(track, modes=modes, logs=logs, effects=effects),
         waterfall=replace(waterfall, lines=((line,), *waterfall.lines[1:])),
         refused=(Refusal(evil, evil, evil, mode=evil, channel=evil, source=evil),),
-        notes=(evil,),
+        notices=(Notice("new-baseline", "note", evil, evil, evil),),
         judgement=replace(assessment.judgement, stage=evil, why=evil),
     )
 
@@ -494,7 +497,7 @@ def test_the_prior_of_the_fleet_is_on_the_page(make: Maker, tmp_path: Path) -> N
         "above 99 %; 2 % per 1 000 km (−6.2 to 10 %)",
         "random walk of ln frequency 0.44 % 0.05 %",
         "factor on reported errors 1.07 1.50",
-        "deviation of health from its law 2.70 % 0.00 %",
+        "deviation of health from its law 0.88 % 0.00 %",
     ):
         assert expected in part, expected
 

@@ -72,6 +72,7 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
         limits=np.array([0.6, np.nan]),
         remaining=np.column_stack([remaining, remaining]),
         usage=np.full(n, usage),
+        half=remaining / 2,
         horizon=2e7,
         health=np.full((n, 1), 0.9),
         curve_travel=np.array([0.0, 1.0]),
@@ -285,7 +286,7 @@ def test_the_columns_are_those_of_the_contract() -> None:
         "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
         "delta_e_below_40hz_um mode source frequency_hz "
         "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
-        "flags",
+        "excitation_mm_s2 flags",
         "events": "stage recorded_at travel_km kind mode source size std evidence",
         "verdict": "stage recorded_at verdict probability",
         "refused": "log channel mode source reason detail",

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lmshealth.signal.harmonics import Harmonics, decompose
+from studies.common.harmonics import rebuild
 
 RATE = 2000.0
 SINES = ((3, 2.5e-6, 0.4), (117, 4e-8, -2.9), (250, 1e-6, 1.5))
@@ -49,7 +50,7 @@ def test_all_harmonics_together_are_the_record(n: int) -> None:
     """Summing every harmonic and the mean gives each sample back to rounding."""
     x = np.random.default_rng(2).normal(1.0, 1.0, n)
     found = decompose(x, RATE)
-    np.testing.assert_allclose(found.rebuild(np.arange(n // 2)), x, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rebuild(found, np.arange(n // 2)), x, rtol=0, atol=1e-12)
 
 
 @pytest.mark.parametrize("n", [400, 401])
@@ -62,7 +63,7 @@ def test_some_harmonics_are_the_sum_of_their_cosines(n: int) -> None:
         found.amplitude[i] * np.cos(2 * np.pi * found.frequency[i] * t + found.phase[i])
         for i in set(kept.tolist())
     )
-    np.testing.assert_allclose(found.rebuild(kept), added, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(rebuild(found, kept), added, rtol=0, atol=1e-12)
 
 
 def test_white_noise_has_its_density_in_every_harmonic() -> None:

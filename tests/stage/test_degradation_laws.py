@@ -12,6 +12,7 @@ import pytest
 from scipy.optimize import brentq
 
 from lmshealth.stage.degradation_laws import (
+    Accelerating,
     AnyLaw,
     HertzWear,
     Law,
@@ -27,8 +28,9 @@ WEAR = HertzWear(Lognormal(8000, 1.0), Uniform(0.7, 1.6))
 LOOSE = Loosening(Lognormal(4000, 1.0), Uniform(0.3, 1.0))
 POWER = Power(Lognormal(6000, 0.5), Uniform(0.5, 2.0))
 LINEAR = Linear(Normal(0.0, 2e-4))
-LAWS = [WEAR, LOOSE, POWER, LINEAR]
-NAMES = ["hertz-wear", "loosening", "power", "linear"]
+LATE = Accelerating(life_km=Lognormal(4000, 1.0), slow=Lognormal(0.1, 1.0))
+LAWS = [WEAR, LOOSE, POWER, LINEAR, LATE]
+NAMES = ["hertz-wear", "loosening", "power", "linear", "accelerating"]
 
 
 def natural_prior(law: AnyLaw, name: str) -> tuple[Prior, float]:

@@ -21,7 +21,7 @@ from lmshealth.tracking.change_detection import (
     threshold,
     unexplained_loop_changes,
 )
-from lmshealth.tracking.filter_bank import FilterModel, restart
+from lmshealth.tracking.filter_bank import FilterModel, hyperparameter_grid, restart
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track, track
@@ -266,25 +266,33 @@ def test_evidence_of_the_loop_needs_logs_on_both_sides() -> None:
 
 
 def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) -> None:
-    """Means and noise scales are kept; rates and weights have their priors again."""
+    """Means, noise scales and wander are kept; rates and weights have their priors again."""
     kept = run(rough_history(np.random.default_rng(32), n=30), stage)
     old = kept[-1][0].pruned()
     model = FilterModel(StateSpace(rough_history(np.random.default_rng(32), n=30), stage))
     new = restart(model, old)
     space, healthy = model.space, new.hyperparameters.healthy
     assert new.weight.sum() == pytest.approx(1.0)
-    assert new.weight[healthy].sum() == pytest.approx(constants.HEALTHY_PROBABILITY)
+    # No part runs in but those of a new machine or after work on it: their share is left out.
+    grid = hyperparameter_grid(1)
+    there = np.exp(grid.log_prior) * (grid.rate_decay == 0)
+    assert (new.hyperparameters.rate_decay == 0).all()
+    assert new.weight[healthy].sum() == pytest.approx(there[grid.healthy].sum() / there.sum())
     for scale in np.unique(new.hyperparameters.scales):
         share = new.weight[new.hyperparameters.scales[:, 0] == scale].sum()
         before = old.weight[old.hyperparameters.scales[:, 0] == scale].sum()
         assert share == pytest.approx(before, abs=1e-9)
     for still in (True, False):
         group = healthy == still
-        mean, cov = old[old.hyperparameters.healthy == still].collapse()
         rest = np.setdiff1d(np.arange(space.size), np.arange(space.rate.start, space.rate.stop))
-        np.testing.assert_allclose(new.mean[group][:, rest], np.tile(mean[rest], (group.sum(), 1)))
-        for own in new.cov[group]:
-            np.testing.assert_allclose(own[np.ix_(rest, rest)], cov[np.ix_(rest, rest)], atol=1e-18)
+        for own in np.flatnonzero(group):
+            disturbance = new.hyperparameters.disturbance[own]
+            same = (old.hyperparameters.disturbance == disturbance).all(axis=1)
+            also = same & (old.hyperparameters.healthy == still)
+            mean, cov = old[also if also.any() else same].collapse()
+            np.testing.assert_allclose(new.mean[own, rest], mean[rest])
+            part = np.ix_(rest, rest)
+            np.testing.assert_allclose(new.cov[own][part], cov[part], atol=1e-18)
     rates = np.einsum("gii->gi", new.cov[:, space.rate, space.rate])
     assert (rates[healthy] == 0).all()
     assert (rates[~healthy] >= new.hyperparameters.rate_std[~healthy, None] ** 2).all()
@@ -300,10 +308,11 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
     model = FilterModel(StateSpace(history, stage))
     old = run(history, stage, grid)[-1][0]
     new = restart(model, old)
-    np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12)
+    np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12, atol=1e-20)
     opened = np.zeros_like(old.cov)
     rate = np.arange(model.space.rate.start, model.space.rate.stop)
-    opened[:, rate, rate] = SETTINGS[0].rate ** 2
+    alike = constants.RATE_COMMON + (1 - constants.RATE_COMMON) * np.eye(rate.size)
+    opened[np.ix_([0], rate, rate)] = SETTINGS[0].rate ** 2 * alike
     np.testing.assert_allclose(new.cov, old.cov + opened, atol=1e-16)
     assert new.log_evidence == pytest.approx(0.0, abs=1e-12)
 

@@ -16,7 +16,7 @@ from lmshealth.tracking.history import (
     History,
     Series,
     build_history,
-    missing_mode_notes,
+    missing_mode_notices,
     sort_by_time,
 )
 from lmshealth.tracking.maintenance import Action
@@ -104,14 +104,14 @@ def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
 
 def test_a_jump_in_one_log_only_is_not_believed(stage: Stage) -> None:
     """A frequency that deviates in one log, also in the last, is refused with its mode."""
-    kept, refused = jumping([4.84, 4.84, 4.92, 4.84, 4.839, 4.70], stage)
+    kept, refused = jumping([4.84, 4.841, 4.92, 4.84, 4.839, 4.70], stage)
     assert kept == [True, True, False, True, True, False]
     assert refused == ["2", "5"]
 
 
 def test_a_jump_that_the_next_log_confirms_is_a_step(stage: Stage) -> None:
     """A step costs no log once the next log confirms it."""
-    kept, refused = jumping([4.84, 4.84, 4.84, 4.79, 4.79, 4.789, 4.79], stage)
+    kept, refused = jumping([4.84, 4.841, 4.839, 4.79, 4.791, 4.789, 4.79], stage)
     assert all(kept)
     assert not refused
 
@@ -221,9 +221,9 @@ def test_modes_that_stay_ambiguous_make_a_note(stage: Stage) -> None:
     doubts = [Refusal(str(k), "ambiguous", "", mode="roll") for k in range(5)]
     assert (
         "roll: the estimates of the last 3 logs are ambiguous"
-        in missing_mode_notes(history, doubts[2:])[0]
+        in missing_mode_notices(history, doubts[2:])[0].what
     )
-    assert missing_mode_notes(history, doubts[:4]) == []
+    assert missing_mode_notices(history, doubts[:4]) == []
 
 
 def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
@@ -233,10 +233,11 @@ def test_a_mode_that_is_no_longer_seen_is_told(stage: Stage) -> None:
         for day in range(1, 7)
     ]
     history, refused = build_history(logs, stage)
-    told = missing_mode_notes(history, refused)
-    assert told == ["pitch: no estimate in the last 3 logs; nothing new is known."]
+    told = missing_mode_notices(history, refused)
+    assert [(one.code, one.where) for one in told] == [("mode-missing", "pitch")]
+    assert told[0].what == "pitch: no estimate in the last 3 logs; nothing new is known."
     history, refused = build_history(logs[:5], stage)
-    assert missing_mode_notes(history, refused) == []
+    assert missing_mode_notices(history, refused) == []
 
 
 @pytest.fixture

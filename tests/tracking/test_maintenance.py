@@ -14,7 +14,7 @@ from lmshealth.tracking.maintenance import (
     STEPS,
     Action,
     Maintenance,
-    maintenance_notes,
+    maintenance_notices,
     read_actions,
     read_maintenance,
 )
@@ -114,13 +114,13 @@ def test_what_is_not_understood_is_told_to_the_machine_it_names(tmp_path: Path) 
     """The note is for the machine of the row, and for all machines if a table is unreadable."""
     (tmp_path / "maintenance.csv").write_text(HEAD + "A,2026-05-01T09:00:00Z,repainted\n")
     work = read_maintenance(tmp_path)
-    (note,) = maintenance_notes(work.of("A"), MOMENTS)
-    assert "line 2: action 'repainted' is unknown" in note
+    (note,) = maintenance_notices(work.of("A"), MOMENTS)
+    assert "line 2: action 'repainted' is unknown" in note.what
     assert work.of("B") == Maintenance()
     (tmp_path / "maintenance.csv").write_text("stage;recorded_at;action\n")
     for machine in ("A", "B"):
-        (note,) = maintenance_notes(read_maintenance(tmp_path).of(machine), MOMENTS)
-        assert "columns are stage;recorded_at;action" in note
+        (note,) = maintenance_notices(read_maintenance(tmp_path).of(machine), MOMENTS)
+        assert "columns are stage;recorded_at;action" in note.what
 
 
 def test_maintenance_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
@@ -137,25 +137,26 @@ def test_maintenance_out_of_the_folder_is_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize("action", RESETS)
 def test_work_on_guide_or_mount_opens_a_new_baseline(action: str) -> None:
     """The note states the use of earlier logs; a log at that moment is later."""
-    notes = maintenance_notes(Maintenance((done(action, 2),)), MOMENTS)
+    notes = maintenance_notices(Maintenance((done(action, 2),)), MOMENTS)
     assert len(notes) == 1
-    assert action in notes[0]
-    assert "2 earlier logs" in notes[0]
+    assert action in notes[0].what
+    assert "2 earlier logs" in notes[0].what
 
 
 def test_a_reset_without_later_logs_says_so() -> None:
     """The note states that no log follows the last work."""
     assert (
-        "no log since" in maintenance_notes(Maintenance((done("preload-adjust", 9),)), MOMENTS)[0]
+        "no log since"
+        in maintenance_notices(Maintenance((done("preload-adjust", 9),)), MOMENTS)[0].what
     )
 
 
 def test_a_reset_before_the_first_log_needs_no_word() -> None:
     """An action before the first log has no note."""
-    assert maintenance_notes(Maintenance((done("guide-replaced", -1),)), MOMENTS) == []
+    assert maintenance_notices(Maintenance((done("guide-replaced", -1),)), MOMENTS) == []
 
 
 @pytest.mark.parametrize("action", STEPS)
 def test_work_that_leaves_guide_and_mount_needs_no_word(action: str) -> None:
     """An action without a reset has no note; its step is an event."""
-    assert maintenance_notes(Maintenance((done(action, 2),)), MOMENTS) == []
+    assert maintenance_notices(Maintenance((done(action, 2),)), MOMENTS) == []

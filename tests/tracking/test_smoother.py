@@ -23,8 +23,10 @@ from tests.lives import (
     since,
 )
 from tests.oracles import Wander, batch
-from tests.tracking.test_filter_bank import ALONE, KNOWN, SETTINGS, one
+from tests.tracking.test_filter_bank import ALONE, KNOWN, SETTINGS, few, one, trusted
 from tests.tracking.test_track import quiet, std_of, still
+
+__all__ = ["few", "trusted"]  # fixtures
 
 
 @pytest.fixture(scope="module")
@@ -39,25 +41,30 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 def test_one_setting_is_the_joint_gaussian_given_all_logs(
     stage: Stage, wander: Wander, reopened: tuple[int, ...]
 ) -> None:
-    """Means and covariances of all epochs are those of the joint Gaussian, to 1e-6 of the std."""
+    """Means and covariances of all epochs are those of the joint Gaussian, to 1e-6 of the std.
+
+    Rates that have decayed are nearly singular, and cost two digits.
+    """
+    close = 1e-4 if wander.decay else 1e-6
     history = awkward_history(np.random.default_rng(1))
     space = StateSpace(history, stage, history.steps)
     model = FilterModel(space, reopened)
-    mean, cov = smooth_one(model, one(wander, model.sources))
+    mean, cov = smooth_one(model, one(wander, model.sources), np.ones(model.values.shape))
     book = batch(history, wander, replace(KNOWN, reopened=reopened), smoothed=True)
     variance = np.einsum("kpipi->kpi", book.cov)
     std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
     for part, at in enumerate((space.level, space.damping)):
-        assert np.abs((mean[:, at] - book.mean[:, part]) / std[:, part]).max() < 1e-6
+        assert np.abs((mean[:, at] - book.mean[:, part]) / std[:, part]).max() < close
         scale = std[:, part, :, None] * std[:, part, None]
-        assert (np.abs(cov[:, at, at] - book.cov[:, part, :, part]) / scale).max() < 1e-6
+        assert (np.abs(cov[:, at, at] - book.cov[:, part, :, part]) / scale).max() < close
     contrast = space.drift()
     judged = np.arange(len(history.logs)) >= history.baselines[0]
     drift = mean[:, : contrast.shape[1]] @ contrast.T
-    assert np.abs((drift - book.mean[:, 2]) / std[:, 2])[judged].max() < 1e-6
+    assert np.abs((drift - book.mean[:, 2]) / std[:, 2])[judged].max() < close
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("trusted", "few")
 def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
     """Mean and variance are those of the mixture over settings, given all logs."""
     history = replace(rough_history(np.random.default_rng(2)), covariates={})
@@ -70,6 +77,9 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
             float(grid.rate_std[g]),
             float(grid.rate_walk[g]),
             {"acc": float(grid.scales[g, 0])},
+            float(grid.rate_decay[g]),
+            float(grid.wander[g]),
+            float(grid.wander_keep[g]),
         )
         book = batch(history, wander, replace(ALONE, covariates=()), smoothed=True)
         books.append(book)
@@ -142,19 +152,21 @@ def test_a_step_that_was_found_stays_sharp(stage: Stage) -> None:
 
 @pytest.mark.parametrize("declared", [True, False])
 def test_only_what_nobody_declared_opens_rates_anew(stage: Stage, declared: bool) -> None:
-    """The last epoch equals the track's, for declared and detected steps."""
-    ln_f, ln_zeta = still(np.random.default_rng(8), 24)
-    ln_f -= 1e-3 * np.arange(24)[:, None] + 0.03 * (np.arange(24) >= 12)[:, None]
-    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
-    if declared:
-        history = replace(history, steps=(since("step", 12, 24),))
-    followed = track(history, stage)
-    assert [step.declared for step in followed.steps] == [declared]
-    found = smooth(history, followed, stage)
-    np.testing.assert_allclose(
-        found.drift[-1], followed.drift[-1], atol=0.4 * std_of(followed)[-1].min()
-    )
-    np.testing.assert_allclose(found.drift_std[-1], std_of(followed)[-1], rtol=0.1)
+    """The last epoch equals the track's, for declared and detected steps, of four lives."""
+    off, ratio = [], []
+    for seed in range(8, 12):
+        ln_f, ln_zeta = still(np.random.default_rng(seed), 24)
+        ln_f -= 1e-3 * np.arange(24)[:, None] + 0.03 * (np.arange(24) >= 12)[:, None]
+        history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
+        if declared:
+            history = replace(history, steps=(since("step", 12, 24),))
+        followed = track(history, stage)
+        assert [step.declared for step in followed.steps] == [declared]
+        found, std = smooth(history, followed, stage), std_of(followed)[-1]
+        off.append((found.drift[-1] - followed.drift[-1]) / std)
+        ratio.append(found.drift_std[-1] / std)
+    assert np.sqrt(np.mean(np.square(off))) < 0.3
+    np.testing.assert_allclose(ratio, 1, rtol=0.1)
 
 
 def test_nothing_is_said_before_the_baseline(stage: Stage) -> None:

@@ -16,6 +16,7 @@ from tests.lives import (
     PRELOAD,
     TWO,
     awkward_history,
+    cut,
     make_history,
     make_stage,
     rough_history,
@@ -49,9 +50,9 @@ def history() -> History:
 
 
 def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> None:
-    """Blocks of two modes follow one another: 4, three regressors, two biased series, steps."""
+    """Blocks of two modes follow one another: 5, three regressors, two biased series, steps."""
     space = StateSpace(history, stage, history.steps)
-    places = [space.level, space.rate, space.damping, space.base]
+    places = [space.level, space.rate, space.damping, space.base, space.wander]
     places += [space.regressor(j) for j in range(3)]
     assert [one.name for one in space.regressed] == [
         "temperature_c",
@@ -62,21 +63,34 @@ def test_the_state_is_laid_out_without_gaps(history: History, stage: Stage) -> N
     places += [space.jump(j) for j in range(5)]
     ends = [0, *(place.stop for place in places)]
     assert [place.start for place in places] == ends[:-1]
-    assert ends[-1] == space.size == 14 + 2 * 2 + 5 * 4
+    assert ends[-1] == space.size == 16 + 2 * 2 + 5 * 4
 
 
-def test_ticks_are_parts_of_the_horizon(history: History, stage: Stage) -> None:
-    """A life is the horizon of the stage, or without one the length of the history."""
-    gaps = np.diff(history.travel)
-    np.testing.assert_allclose(StateSpace(history, stage).ticks, np.r_[0, gaps / 1e7])
-    bare = StateSpace(history, None)
-    np.testing.assert_allclose(bare.ticks, np.r_[0, gaps / np.ptp(history.travel)])
+def test_ticks_are_in_mean_distances_of_the_logs_so_far(history: History, stage: Stage) -> None:
+    """A tick of 1/150 is the mean distance between logs so far; a log without estimates has none.
+
+    No tick depends on the horizon of the stage or on a later log.
+    """
+    empty = ~np.isfinite(history.ln_frequency).any(axis=1)
+    empty[0] = False
+    assert empty.any()
+    there = np.flatnonzero(~empty)
+    travel = history.travel[there] - history.travel[0]
+    expected = np.zeros(len(empty))
+    expected[there[1:]] = np.diff(travel) * np.arange(1, there.size) / travel[1:] / 150
+    for given in (stage, None):
+        np.testing.assert_allclose(StateSpace(history, given).ticks, expected)
+    np.testing.assert_allclose(StateSpace(cut(history, 9), stage).ticks, expected[:9])
 
 
 def test_without_odometer_ticks_are_of_time(history: History, stage: Stage) -> None:
-    """Rates are per length of the history where a horizon in km has no odometer."""
+    """The clock is the time of recording where there is no odometer: here a log a day."""
     timed = replace(history, travel=np.full(len(history.logs), np.nan))
-    np.testing.assert_allclose(StateSpace(timed, stage).ticks, np.r_[0, np.full(15, 1 / 15)])
+    ticks, seen = StateSpace(timed, stage).ticks, np.isfinite(history.ln_frequency).any(axis=1)
+    assert (ticks[~seen] == 0).all()
+    steady = seen & np.r_[False, seen[:-1]] & (np.cumsum(~seen) == 0)
+    assert steady.sum() > 1
+    np.testing.assert_allclose(ticks[steady], 1 / 150)
 
 
 def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:

@@ -300,9 +300,8 @@ def _first_text(values: list[object], n_before: int) -> str:
     return "text"
 
 
-def _is_text(head: bytes) -> bool:
-    return b"\0" not in head and not head.startswith((_GZIP_MAGIC, b"PAR1", b"\x89HDF"))
-
-
-CSV = Format("CSV", (".csv",), _is_text, _load)
+_BINARY = (_GZIP_MAGIC, b"PAR1", b"\x89HDF")
+CSV = Format(
+    "CSV", (".csv",), lambda head: b"\0" not in head and not head.startswith(_BINARY), _load
+)
 CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)

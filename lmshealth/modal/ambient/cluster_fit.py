@@ -22,6 +22,7 @@ from lmshealth.modal.ambient.cluster_modes import (
     FittedSpectrum,
     LineEstimate,
 )
+from lmshealth.modal.ambient.excitation import unsteadiness
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
 from lmshealth.modal.modes import Modes, Rejection, paired
@@ -419,7 +420,10 @@ def prepare(
     chosen = replace(spectra, spectra=cut).select(index)
     scaled = tuple(
         replace(
-            s, matrix=s.matrix / whiten, foreign=None if s.foreign is None else s.foreign / whiten
+            s,
+            matrix=s.matrix / whiten,
+            foreign=None if s.foreign is None else s.foreign / whiten,
+            transforms=None if s.transforms is None else s.transforms / unit,
         )
         for s in chosen.spectra
     )
@@ -593,20 +597,30 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     ratio = likelihood.signal_to_noise(p)
     residual = _residual(data, expected)
     dispersion = _dispersion(residual, f, zeta)
+    channels, shapes = data.spectra.channels, likelihood.shapes(p).T
+    observed = data.spectra.spectra, data.masks, expected
+    unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
+    # Squares of the ordinates near a mode are correlated where its excitation is not steady.
+    wider = np.sqrt([max(one.ratio, 1.0) for one in unsteady] * 2)
+    strength = data.unit**2 @ likelihood.strength(p)
     each = zip(targets, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
-    channels = data.spectra.channels
+    flags = tuple(
+        _flags(*one, residual.duration, unsteady=force.is_clear)
+        for one, force in zip(each, unsteady, strict=True)
+    )
     modes = Modes(
         names=names,
         sources=(data.spectra.source,) * n,
         channels=tuple(channels[c] for c in ratio.argmax(axis=0)),
         ln_frequency=estimate[:n],
         ln_damping=estimate[n:],
-        cov=cov,
+        cov=cov * np.outer(wider, wider),
         snr=ratio.sum(axis=0),
         dispersion=dispersion,
-        flags=tuple(_flags(*one, residual.duration) for one in each),
+        excitation=np.sqrt(strength * np.pi * f / (4 * zeta)),
+        flags=flags,
         shape_channels=channels,
-        shapes=_unit_shapes(data.unit * likelihood.shapes(p).T),
+        shapes=_unit_shapes(data.unit * shapes),
         lines=(),
         refused=(),
     )
@@ -654,7 +668,9 @@ def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArr
     return np.where(n >= constants.LEAST_ORDINATES, near @ squares / n.clip(1), np.nan)
 
 
-def _flags(target: Target, f: float, zeta: float, dispersion: float, duration: float) -> str:
+def _flags(
+    target: Target, f: float, zeta: float, dispersion: float, duration: float, *, unsteady: bool
+) -> str:
     """Return the flags of a mode in segments of this duration."""
     shift = abs(np.log(f / (target.nominal or target.frequency))) / np.log1p(target.search)
     low, high = _damping_bounds(target)
@@ -663,6 +679,7 @@ def _flags(target: Target, f: float, zeta: float, dispersion: float, duration: f
         "resolution-limited": 2 * zeta * f * duration < constants.RESOLVED,
         "at-bound": shift > bound or not low / bound < zeta < high * bound,
         "loose-fit": dispersion > constants.LOOSE_FIT,
+        "unsteady": unsteady,
     }
     return " ".join(name for name, raised in flags.items() if raised)
 

@@ -125,8 +125,12 @@ def _explain(
         candidates = [
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
-        model = _select(spectra, candidates, low, high)
-        harmonic = find_harmonic(model, recording, harmonics)
+        model = _start(_bin(spectra, candidates, low, high), candidates).refined(6)
+        # Clear harmonics are seen before modes are selected, which takes most of the time.
+        harmonic = find_harmonic(model, recording)
+        if harmonic is None:
+            model = _select(model)
+            harmonic = find_harmonic(model, recording, harmonics)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
             return model, tuple(harmonics), spectra, poles
         harmonics.append(harmonic)
@@ -148,11 +152,8 @@ def _consistent(model: JointModel) -> list[int]:
     return kept
 
 
-def _select(
-    spectra: LogSpectra, candidates: list[Candidate], low: float, high: float
-) -> JointModel:
+def _select(model: JointModel) -> JointModel:
     """Select the modes that the cross spectra need, by stepwise maximum likelihood."""
-    model = _start(_bin(spectra, candidates, low, high), candidates).refined(6)
     for _ in range(_ROUNDS):
         model = _prune(model)
         more = _grow(model)

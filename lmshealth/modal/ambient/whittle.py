@@ -220,12 +220,19 @@ class Likelihood:
             phi[tuple(_columns(self.layout.shape))] = p[self.layout.shapes]
         return phi
 
+    def strength(self, p: FloatArray) -> FloatArray:
+        """PSD of each modal force in each channel, shape ``(n_channels, n_modes)``."""
+        return self._at_modes(p).strength
+
     def signal_to_noise(self, p: FloatArray) -> FloatArray:
         """Modal signal-to-noise ratios S φ² / (4 ζ² N), shape ``(n_channels, n_modes)``."""
+        m, point = self.layout.n_modes, self._at_modes(p)
+        return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
+
+    def _at_modes(self, p: FloatArray) -> _Point:
         m = self.layout.n_modes
         at = MeanOrdinates(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
-        point = _Point(self, p, at)
-        return point.strength / (4 * np.exp(2 * p[m : 2 * m]) * point.floor)
+        return _Point(self, p, at)
 
     def minimise(self, start: FloatArray) -> FloatArray:
         """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""

@@ -285,7 +285,8 @@ def mean_of(values: np.ndarray, count: int) -> CrossSpectrum:
         for k in range(count)
     ]
     mean = np.mean([part.matrix for part in parts], axis=0)
-    return replace(parts[0], matrix=mean, count=count)
+    transforms = np.concatenate([part.transforms for part in parts if part.transforms is not None])
+    return replace(parts[0], matrix=mean, count=count, transforms=transforms)
 
 
 def fit_mean(

@@ -189,7 +189,7 @@ def flags(
     """List the flags of both modes."""
     values = zip(modes.frequency, modes.damping_ratio, modes.dispersion, strict=True)
     return [
-        _flags(target, *value, duration).split()
+        _flags(target, *value, duration, unsteady=False).split()
         for target, value in zip(targets, values, strict=True)
     ]
 

@@ -1,0 +1,98 @@
+"""Notices: what was noticed about a machine that its reader must take into account."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from lmshealth.io.log import Notice
+from lmshealth.report import constants, figures
+from lmshealth.report.assessment import Assessment, summarise_life
+from lmshealth.report.text import spell
+
+_SEVERITIES = "serious", "caution", "note"
+
+
+def notices(assessment: Assessment) -> tuple[Notice, ...]:
+    """Return the notices about a machine, the serious ones first: rows of ``warnings.csv``."""
+    found = [*assessment.notices, *_of_track(assessment), *_of_health(assessment)]
+    found += _of_laws(assessment)
+    return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
+
+
+def _of_track(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about names of modes, flags of their estimates, and the filter."""
+    if assessment.doubt:
+        yield Notice("names-in-doubt", "serious", "", assessment.doubt)
+    latest = assessment.latest
+    flags = () if latest is None else zip(latest.modes.names, latest.modes.flags, strict=True)
+    by_flag: dict[str, list[str]] = {}
+    for mode, own in flags:
+        for flag in own.split():
+            by_flag.setdefault(flag, []).append(mode)
+    for flag, modes in by_flag.items():
+        names = " and ".join(map(spell, dict.fromkeys(modes)))
+        what = f"The last log has the flag {flag} at {names}."
+        yield Notice(
+            flag, "caution", names, what, "Its meaning is in the column flags of modes.csv."
+        )
+    track = assessment.track
+    if track is not None and not track.consistency().holds:
+        p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
+        widened = track.widening[-1]
+        what = f"The logs do not vary as the filter of the modes expects (p = {p})"
+        what += f"; its intervals are {widened:.1f} times as wide." if widened > 1 else "."
+        to_do = "Look for a cause that the logs do not contain: payload, temperature, tuning."
+        yield Notice("filter-inconsistent", "caution", "", what, to_do)
+
+
+def _of_health(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about the posterior of the last epoch."""
+    health = assessment.latest_health
+    if health is None:
+        return
+    if not health.converged[-1]:
+        what = "The sampler of health did not converge, so no value is published."
+        yield Notice("not-converged", "serious", "", what, "Record further logs.")
+    if not health.explained:
+        what = f"No state on the map explains the drifts of the modes (p = {health.fit[-1]:.1g})."
+        to_do = "Check what else moved the modes, and the map."
+        yield Notice("unexplained-drifts", "serious", "", what, to_do)
+    for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
+        if edge:
+            what = f"The interval of {spell(name)} ends at an end of the map, which bounds it."
+            yield Notice("end-of-map", "caution", name, what, "Extend the map.")
+
+
+def _of_laws(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about the laws: their fit, and whether they agree with the last epoch."""
+    prognosis, health = assessment.prognosis, assessment.latest_health
+    if prognosis is None:
+        return
+    for name in prognosis.unidentifiable:
+        what = f"The limit of {spell(name)} is left out of the life: the modes do not show it."
+        yield Notice("limit-not-included", "caution", name, what)
+    dof = prognosis.degrees_of_freedom
+    if dof > 0 and prognosis.chi_square > figures.chi_square_band(np.array(float(dof)))[1]:
+        what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof})."
+        to_do = (
+            "Do not rely on the remaining life; use the last epoch, and record further logs soon."
+        )
+        yield Notice("laws-do-not-fit", "serious", "", what, to_do)
+    if health is None:
+        return
+    limits = {one.parameter: one for one in summarise_life(prognosis, assessment.stage).limits}
+    determined = health.publishable_parameters()
+    own = health.latest(np.array(constants.LEVELS))
+    for j, name in enumerate(health.parameters):
+        if name not in limits or not determined[j]:
+            continue
+        (low, _, high), (least, _, most) = limits[name].health, own[:, j]
+        if low <= most and least <= high:
+            continue
+        what = f"{spell(name).capitalize()} is {100 * least:.0f} to {100 * most:.0f} % by the last "
+        what += f"epoch alone, and {100 * low:.0f} to {100 * high:.0f} % by the laws of all logs."
+        yield Notice(
+            "methods-disagree", "serious", name, what, "Trust the lower; record a log soon."
+        )
