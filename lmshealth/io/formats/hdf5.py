@@ -2,8 +2,9 @@
 
 Nothing outside the file is opened: links, external storage and virtual datasets are refused. The
 HDF5 library loops without end on a damaged heap of strings (HDFGroup/hdf5 issue 1707; still so in
-2.0.0), and crashes Python at its end after a virtual dataset that cannot be opened. `Guarded`
-checks what the library reads before it gets it.
+2.0.0), clears as many bytes as a text claims, up to 4 GB, before it looks for the text, and crashes
+Python at its end after a virtual dataset that cannot be opened. `Guarded` checks what the library
+reads before it gets it.
 """
 
 from __future__ import annotations
@@ -41,6 +42,10 @@ class Guarded(FileIO):
     now: Literal["columns", "texts", "samples"] = "columns"
     trouble: Unusable | None = None
 
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self._headers: list[bytes] = []
+
     def readinto(self, buffer: Any) -> int:
         """Read for the library; zeros in the place of damaged bytes."""
         if self.now == "samples":
@@ -49,6 +54,8 @@ class Guarded(FileIO):
         n_read = super().readinto(buffer)
         content = bytes(buffer)
         is_heap = content.startswith(_HEAP)
+        if self.now == "columns":
+            self._headers.append(content)
         if self.trouble is None and self.now == "columns" and (is_heap or _NO_FILES in content):
             self.trouble = Unusable("escapes", "a column keeps its samples in other files")
         elif self.trouble is None and is_heap:
@@ -56,6 +63,17 @@ class Guarded(FileIO):
         if self.trouble is not None:
             buffer[:] = bytes(len(buffer))
         return n_read
+
+    def claimed_length(self, key: str) -> int:
+        """How long a text of variable length says it is; 0 in layouts with checksums."""
+        for content in self._headers:
+            at = content.find(key.encode() + b"\0")
+            # Sizes of name, type and shape, then these, each filled up to 8 bytes.
+            if at >= 8 and content[at - 8] == 1:
+                sizes = np.frombuffer(content, "<u2", 3, at - 6).astype(int)
+                start = at + int((-(-sizes // 8) * 8).sum())
+                return int.from_bytes(content[start : start + 4], "little")
+        return 0
 
     def _damage(self, start: int) -> Unusable | None:
         """Follow the objects of a heap as the library does."""
@@ -90,10 +108,11 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 
 def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
-    names = list(file)
+    # A name that is no text comes as bytes.
+    names = [n.decode("utf-8", "replace") if isinstance(n, bytes) else n for n in file]
     chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
     stream.now = "texts"
-    metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
+    metadata = {key: _attribute(file, stream, key) for key in KEYS if key in file.attrs}
     stored = stream.seek(0, SEEK_END)
     check_size(8 * sum(dataset.size for dataset in chosen.values()), stored)
     stream.now = "samples"
@@ -133,7 +152,7 @@ def _dataset(file: Any, name: str) -> Any:
     return item
 
 
-def _attribute(file: Any, key: str) -> str:
+def _attribute(file: Any, stream: Guarded, key: str) -> str:
     """Read an attribute of any plain type as text."""
     import h5py
 
@@ -141,8 +160,12 @@ def _attribute(file: Any, key: str) -> str:
     # Its type is checked before it is read: the library crashes on damaged types of other classes.
     plain = h5py.h5t.TypeStringID, h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeEnumID
     kind = attribute.get_type()
-    is_plain = isinstance(kind, plain) and kind.get_size() <= constants.LONGEST_ATTRIBUTE
-    if not is_plain or attribute.shape not in ((), (1,)):
+    is_variable = isinstance(kind, h5py.h5t.TypeStringID) and kind.is_variable_str()
+    length = stream.claimed_length(key) if is_variable else kind.get_size()
+    if length > constants.LONGEST_ATTRIBUTE:
+        most = constants.LONGEST_ATTRIBUTE
+        raise Unusable("metadata", f"{key} claims {length} bytes; at most {most} are read")
+    if not isinstance(kind, plain) or attribute.shape not in ((), (1,)):
         raise Unusable("metadata", f"{key} is no single text or number; write it as text")
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
     if isinstance(value, bytes):

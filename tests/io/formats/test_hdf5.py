@@ -55,6 +55,25 @@ def test_heap_that_claims_gigabytes(log):
         load(log, ColumnMap())
 
 
+def test_text_that_claims_gigabytes(log):
+    """The library would clear 4 GB before it looks for the text; later layouts have checksums."""
+    data = log.read_bytes()
+    at = data.index((9000).to_bytes(4, "little"))
+    log.write_bytes(data[:at] + ((1 << 32) - 1).to_bytes(4, "little") + data[at + 4 :])
+    with pytest.raises(Unusable, match="servo_id claims 4294967295 bytes|checksum"):
+        load(log, ColumnMap())
+
+
+def test_name_that_is_no_text(tmp_path):
+    """A column whose name is not UTF-8 is passed over, and named."""
+    with h5py.File(tmp_path / "log.h5", "w") as file:
+        file[b"\xff\xfe"] = np.arange(4.0)
+        file["delta_e_um"] = np.random.default_rng(0).normal(size=100)
+    content = load(tmp_path / "log.h5", ColumnMap())
+    assert list(content.columns) == ["delta_e_um"]
+    assert content.present == ("delta_e_um", "\ufffd\ufffd")
+
+
 def test_samples_with_the_bytes_of_a_heap(log):
     """Samples with the bytes of a heap refuse nothing."""
     with h5py.File(log, "a") as file:
