@@ -60,7 +60,7 @@ def test_text_that_claims_gigabytes(log):
     data = log.read_bytes()
     at = data.index((9000).to_bytes(4, "little"))
     log.write_bytes(data[:at] + ((1 << 32) - 1).to_bytes(4, "little") + data[at + 4 :])
-    with pytest.raises(Unusable, match="servo_id claims 4294967295 bytes|checksum"):
+    with pytest.raises(Unusable, match=r"servo_id claims 4294967295 bytes|checksum"):
         load(log, ColumnMap())
 
 
