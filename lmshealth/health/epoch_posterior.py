@@ -33,20 +33,25 @@ class MachineDrifts:
     def log_likelihood(self, x: FloatArray) -> FloatArray:
         """Return the log likelihood of all ln parameters inside the map, shape ``(n_points,)``."""
         chi_square, log_det = self.misfit(x)
-        return -0.5 * (chi_square + log_det)
+        log_prior = np.log([weight for _, weight in self.stage.map_errors])
+        terms = log_prior[:, None] - 0.5 * (chi_square + log_det)
+        return np.asarray(np.logaddexp.reduce(terms, axis=0))
 
     def misfit(self, x: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Return χ² of the drifts and the log determinant of their covariance, ``(n_points,)``."""
+        """Return χ² of the drifts and the log determinant of their covariance.
+
+        Both ``(n_map_errors, n_points)``, for the possible errors of the map.
+        """
         own = x[:, self.columns]
         n, n_parameters = own.shape
         drift = self.stage.drift(with_single_changes(self.stage, own), self.modes)
         drift = drift.reshape(n_parameters + 1, n, -1)
-        model_std = self.stage.description.map.model_std if self.stage.description.map else 0.0
-        error = model_std**2 * np.sum(drift[1:] ** 2, axis=0)
-        cov = self.cov + error[:, :, None] * np.eye(len(self.modes))
+        variance = np.array([std for std, _ in self.stage.map_errors])[:, None, None] ** 2
+        error = variance * np.sum(drift[1:] ** 2, axis=0)
+        cov = self.cov + error[..., None] * np.eye(len(self.modes))
         off = self.drift - drift[0]
-        solved = np.linalg.solve(cov, off[..., None])[..., 0]
-        return np.sum(off * solved, axis=1), np.linalg.slogdet(cov)[1]
+        solved = np.linalg.solve(cov, np.broadcast_to(off, error.shape)[..., None])[..., 0]
+        return np.sum(off * solved, axis=-1), np.linalg.slogdet(cov)[1]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,8 +84,10 @@ class EpochPosterior:
         The degrees of freedom are the number of drifts, without the parameters, which priors may
         hold: an upper bound of the p value.
         """
-        smallest = np.min(np.sum([machine.misfit(x)[0] for machine in self.machines], axis=0))
-        return float(chdtrc(sum(len(machine.modes) for machine in self.machines), smallest))
+        total = np.sum([machine.misfit(x)[0] for machine in self.machines], axis=0)
+        weights = [weight for _, weight in self.machines[0].stage.map_errors]
+        degrees = sum(len(machine.modes) for machine in self.machines)
+        return float(weights @ chdtrc(degrees, total.min(axis=1)))
 
     def at_edge(self, x: FloatArray) -> BoolArray:
         """Return which parameters' draws end at an end of the map, shape ``(n_parameters,)``."""

@@ -47,8 +47,11 @@ RATE_STD, ACCELERATION_STD = 0.075, 1.0
 intervals open with distance. The second is of a loss that accelerates: logs up to now determine
 neither its exponent nor whether the acceleration lasts."""
 UNSEEN_ONSETS = 0.5
-"""Onsets of a fast end in the travel seen, in place of the none that happened: the Gamma shape of
-the hazard by Jeffreys's prior [Jeffreys1946]. A life of twice the travel seen is not certain."""
+"""Onsets of a fast end in the travel proven without one, in place of the none that happened: the
+Gamma shape of the hazard by Jeffreys's prior [Jeffreys1946]."""
+EARLY_LIFE = 0.05
+"""Share of the machines of a description, or of a fleet, that have ended by the travel which counts
+as proven without an onset, beside the machine's own."""
 UNSEEN_GROWTH = Lognormal(0.2, 1.0)
 """Travel from such an onset to the end over the travel at the onset: 4 % to 100 % (90 %), sudden
 breaks to wear that doubles its rate once."""

@@ -128,7 +128,7 @@ class NodeBasis(ReadOnly):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid(Rows):
-    """Data whitened at the points of a grid of walk, noise scale and deviation.
+    """Data whitened at the points of a grid of walk, noise scale, deviation and map error.
 
     `design` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``; `target` is
     Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest` the χ² that no life explains, and `log_weight` the log
@@ -138,6 +138,7 @@ class Grid(Rows):
     walk: FloatArray
     noise_scale: FloatArray
     deviation: FloatArray
+    map_std: FloatArray
     design: FloatArray
     target: FloatArray
     rest: FloatArray
@@ -158,7 +159,9 @@ class Grid(Rows):
             log_weight = np.log(p * q * r) - np.sum(np.log(np.diag(factor)))
             design = basis_r.T.reshape(len(data.modes), -1, target.size)
             rest = np.sum(u**2) - np.sum(target**2)
-            points.append((walk, scale, deviation, design, target, rest, log_weight))
+            for map_std, weight in data.stage.map_errors:
+                whole = log_weight + np.log(weight)
+                points.append((walk, scale, deviation, map_std, design, target, rest, whole))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
 
 
@@ -243,9 +246,8 @@ class LifeLikelihood:
         white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
         white = white.reshape(-1, n_modes, n_paths, n, grid.target.shape[1])
         r = grid.target[:, None] - white[:, :, 0].sum(axis=1)
-        modal_map = self.data.stage.description.map
-        model_std = modal_map.model_std if modal_map else 0.0
-        v = np.moveaxis(model_std * white[:, :, 1:], 3, 1).reshape(*r.shape[:2], -1, r.shape[2])
+        white = grid.map_std[:, None, None, None, None] * white[:, :, 1:]
+        v = np.moveaxis(white, 3, 1).reshape(*r.shape[:2], -1, r.shape[2])
         return r, v, np.eye(v.shape[2]) + v @ np.swapaxes(v, 2, 3)
 
 

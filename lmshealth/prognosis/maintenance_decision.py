@@ -91,9 +91,8 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     planned_risk = unknown if planned is None else _any_risk(prognosis, planned)
     every, earliest = _inspection(prognosis, decision)
     next_log = day_after(prognosis, every / float(np.median(prognosis.usage)))
-    dates = [day for day in (next_log, by) if day is not None]
-    log_by = min(dates) if dates else None
     end = day_after(prognosis, earliest)
+    log_by = min((day for day in (next_log, by, end) if day is not None), default=None)
     return Service(kind, by, wait, risk, planned, planned_risk, *criterion, log_by, every, end)
 
 

@@ -25,6 +25,7 @@ _KM = 1000.0
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 # Grid points up to 1.5 times the passage of the law alone, and from there to the horizon.
 _NEAR, _FAR, _BEYOND = 24, 12, 1.5
+_N_LIVES = 2000  # of the prior of a law
 _RARE = 1e-9  # bounds of the mean and shape of the inverse Gaussian
 
 
@@ -165,7 +166,10 @@ def _passages(
                 path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
             )
             if path.law.names:
-                opened = _beyond_laws(rng, path.law, columns[-1], halves[-1], now)
+                proven = now + _early_life(path.law, limit, rng)
+                opened = _beyond_laws(
+                    rng, path.law, columns[-1], halves[-1], now=now, proven=proven
+                )
                 columns[-1], halves[-1] = opened
         first = np.argmin(columns, axis=0)[None]
         half = np.take_along_axis(np.array(halves), first, axis=0)[0]
@@ -182,22 +186,36 @@ def rate_std(law: Law) -> float:
     return constants.ACCELERATION_STD if late else constants.RATE_STD
 
 
+def _early_life(law: Law, limit: float, rng: np.random.Generator) -> float:
+    """Return the travel in m before which few machines of the description reach a limit."""
+    path = DegradationPath(law, 0.0, ())
+    lives = path.passage(path.natural(path.draw(rng, _N_LIVES, _KM), _KM), limit)
+    return float(np.quantile(lives, constants.EARLY_LIFE, method="inverted_cdf"))
+
+
 def _beyond_laws(
-    rng: np.random.Generator, law: Law, left: FloatArray, half: FloatArray, now: float
+    rng: np.random.Generator,
+    law: Law,
+    left: FloatArray,
+    half: FloatArray,
+    *,
+    now: float,
+    proven: float,
 ) -> tuple[FloatArray, FloatArray]:
     """Open passages by a law, in m from now: README.md, "Beyond the laws".
 
-    The rate of the law drifts, and an end that no log shows yet may come sooner. For the travel
-    left and that to half of the loss, shape ``(n,)`` each.
+    The rate of the law drifts, and an end that no log shows yet may come sooner: `proven` is the
+    travel in m without such an onset. For the travel left and that to half of the loss, shape
+    ``(n,)`` each.
     """
     ahead = np.where(np.isfinite(left), np.maximum(left, 0.0), 0.0)
     factor = np.exp(
         rate_std(law) * np.sqrt(np.log2(1 + ahead / now)) * rng.standard_normal(left.size)
     )
     with np.errstate(over="ignore"):
-        onset = now * np.expm1(rng.exponential(size=left.size) / constants.UNSEEN_ONSETS)
+        onset = proven * np.expm1(rng.exponential(size=left.size) / constants.UNSEEN_ONSETS)
     growth = constants.UNSEEN_GROWTH.quantile(rng.uniform(1e-9, 1 - 1e-9, left.size))
-    growth = (now + onset) * growth
+    growth = (proven + onset) * growth
     sooner = left * factor > onset + growth
     half = np.where(sooner, onset + np.sqrt(0.5) * growth, half * factor)
     return np.where(sooner, onset + growth, left * factor), half

@@ -248,6 +248,12 @@ class Stage:
         priors = tuple(parameter.prior for parameter in self.parameters)
         return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
+    @property
+    def map_errors(self) -> tuple[tuple[float, float], ...]:
+        """Possible relative errors of the map's sensitivities, with their prior probabilities."""
+        declared = self.description.map.model_std if self.description.map else 0.0
+        return tuple((scale * declared, weight) for scale, weight in constants.MAP_ERRORS)
+
     def matches(self, metadata: Metadata) -> bool:
         """Return whether the description applies to a log."""
         if metadata.description is not None:

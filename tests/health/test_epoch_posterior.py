@@ -9,6 +9,7 @@ import pytest
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.epoch_posterior import EpochPosterior, with_single_changes
+from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage
 from tests.lives import AXES, make_stage, true_drift
 from tests.oracles import epoch_log_posterior
@@ -25,18 +26,23 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 
 def book(x: FloatArray, stage_std: float = 0.05, drift: FloatArray | None = None) -> float:
-    """Log posterior at one point by the formula behind the map."""
+    """Log posterior at one point by the formula behind the map, over the errors of the map."""
     alone = np.array([true_drift(NAMES, np.where(np.arange(2) == j, x, 0.0)) for j in range(2)])
-    return epoch_log_posterior(
-        x,
-        true_drift(NAMES, TRUTH)[:2] if drift is None else drift,
-        COV,
-        predicted=true_drift(NAMES, x)[:2],
-        alone=alone[:, :2],
-        model_std=stage_std,
-        medians=(1.0, 1.0),
-        sigmas=(0.3, 0.3),
-    )
+    terms = [
+        np.log(weight)
+        + epoch_log_posterior(
+            x,
+            true_drift(NAMES, TRUTH)[:2] if drift is None else drift,
+            COV,
+            predicted=true_drift(NAMES, x)[:2],
+            alone=alone[:, :2],
+            model_std=scale * stage_std,
+            medians=(1.0, 1.0),
+            sigmas=(0.3, 0.3),
+        )
+        for scale, weight in MAP_ERRORS
+    ]
+    return float(np.logaddexp.reduce(terms))
 
 
 def inside(n: int, seed: int = 1) -> FloatArray:

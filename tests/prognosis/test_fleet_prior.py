@@ -376,8 +376,12 @@ def test_a_law_that_is_ruled_out_changes_its_share_alone(small_grid: None, stage
     assert prior == Lognormal(8000, 1.0)
 
 
-def test_an_unidentifiable_limit_needs_no_fleet_prior(small_grid: None, tmp_path: Path) -> None:
+@pytest.mark.usefixtures("small_grid")
+def test_an_unidentifiable_limit_needs_no_fleet_prior(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A part that the modes cannot see stays unknown for ever: that is no question of age."""
+    monkeypatch.setattr("lmshealth.stage.constants.MAP_ERRORS", ((1.0, 1.0),))
     blind = make_stage(tmp_path, (PRELOAD, STILL_MOUNT, LIMITED_FOOT))
     posterior = fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), blind)
     evidence = machine_evidence(blind, posterior)

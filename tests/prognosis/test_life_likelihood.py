@@ -15,6 +15,7 @@ from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.scenarios import Scenario
+from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from tests.lives import (
@@ -86,19 +87,28 @@ def book(history: History, density: LifeDensity, y: FloatArray, model_std: float
     """Log likelihood of one set of coordinates by the dense oracle."""
     x = np.log(healths(density.scenario, y, history.clock()[history.baseline :]))
     alone = np.stack([true_drift(NAMES, x * (np.arange(2) == j))[:, :2] for j in range(2)])
-    belief = LifeBelief(
-        slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
-        model_std=model_std,
-        intercept_std=constants.INTERCEPT_STD,
-    )
+    beliefs = [
+        LifeBelief(
+            slopes=np.array([SENSITIVITY[name][:2] for name in NAMES]),
+            model_std=scale * model_std,
+            intercept_std=constants.INTERCEPT_STD,
+        )
+        for scale, _ in MAP_ERRORS
+    ]
     scales = zip(constants.NOISE_SCALES, constants.NOISE_SCALE_PRIOR, strict=True)
     deviations = zip(constants.DEVIATION_STDS, constants.DEVIATION_PRIOR, strict=True)
     grid = [
         LifeSetting(walk, scale, deviation, p * q)
         for walk, (scale, p), (deviation, q) in product(constants.WALK_STDS, scales, deviations)
     ]
-    found = life_log_likelihood(history, true_drift(NAMES, x)[:, :2], alone, belief, grid)
-    return found + density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
+    drift = true_drift(NAMES, x)[:, :2]
+    found = np.logaddexp.reduce(
+        [
+            np.log(weight) + life_log_likelihood(history, drift, alone, belief, grid)
+            for belief, (_, weight) in zip(beliefs, MAP_ERRORS, strict=True)
+        ]
+    )
+    return float(found) + density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
 
 
 @pytest.fixture
@@ -433,6 +443,7 @@ def with_deviation(monkeypatch: pytest.MonkeyPatch) -> LifeSetting:
     monkeypatch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
     monkeypatch.setattr(constants, "DEVIATION_STDS", (0.4,))
     monkeypatch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
+    monkeypatch.setattr("lmshealth.stage.constants.MAP_ERRORS", ((1.0, 1.0),))
     return LifeSetting(1.5e-3, 1.0, 0.4)
 
 

@@ -18,6 +18,7 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import (
     _beyond_laws,
+    _early_life,
     _usage,
     identifiable_limits,
     parameters_with_limit,
@@ -393,23 +394,30 @@ def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
     assert [(j, p.name) for j, p in parameters_with_limit(stage)] == [(1, "guide_preload")]
 
 
-def test_an_unseen_onset_has_the_hazard_of_none_in_the_travel_seen(
+def test_an_unseen_onset_has_the_hazard_of_none_in_the_travel_proven(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Without an end by the law half of the onsets lie within three times the travel seen."""
+    """Without an end by the law half of the onsets lie within three times the travel proven."""
     monkeypatch.setattr(constants, "UNSEEN_ONSETS", 0.5)
     monkeypatch.setattr(constants, "UNSEEN_GROWTH", Lognormal(0.2, 1e-9))
-    law, n, now = Linear(rate_per_km=Normal(0.0, 2e-4)), 20_000, 1e6
-    never = np.full(n, np.inf)
-    left, half = _beyond_laws(np.random.default_rng(1), law, never, never, now)
-    # The end at s_e comes 1.2 times as late as its onset s, with P(s > x) = sqrt(now / x).
+    law, n, proven = Linear(rate_per_km=Normal(0.0, 2e-4)), 20_000, 1e6
+    never, rng = np.full(n, np.inf), np.random.default_rng(1)
+    left, half = _beyond_laws(rng, law, never, never, now=3e5, proven=proven)
+    # The end at s_e comes 1.2 times as late as its onset s, with P(s > x) = sqrt(proven / x).
     for ahead in (0.5, 1.0, 3.0):
         share = 1 - np.sqrt(1.2 / (1 + ahead))
-        assert abs(np.mean(left < ahead * now) - share) < 5 * np.sqrt(share / n)
-    onset = (left + now) / 1.2
-    np.testing.assert_allclose(half + now, onset * (1 + 0.2 * np.sqrt(0.5)), rtol=1e-6)
+        assert abs(np.mean(left < ahead * proven) - share) < 5 * np.sqrt(share / n)
+    onset = (left + proven) / 1.2
+    np.testing.assert_allclose(half + proven, onset * (1 + 0.2 * np.sqrt(0.5)), rtol=1e-6)
     wrong = 1 - np.sqrt(1.2 / 2.0) * 0.9
-    assert abs(np.mean(left < now) - wrong) > 5 * np.sqrt(wrong / n)  # negative control
+    assert abs(np.mean(left < proven) - wrong) > 5 * np.sqrt(wrong / n)  # negative control
+
+
+def test_early_lives_of_a_description_count_as_proven() -> None:
+    """A twentieth of the rates of N(0, 2e-4) per km exceeds 3.29e-4: 1,216 km to a limit of 0.6."""
+    law = Linear(rate_per_km=Normal(0.0, 2e-4))
+    found = _early_life(law, 0.6, np.random.default_rng(1))
+    assert found == pytest.approx(0.4 / 3.29e-4 * 1e3, rel=0.06)
 
 
 def test_intervals_open_with_the_distance_beyond_the_travel_seen(
@@ -422,13 +430,14 @@ def test_intervals_open_with_the_distance_beyond_the_travel_seen(
     for law, std in ((named, 0.075), (late, constants.ACCELERATION_STD)):
         for ahead, doublings in ((1e5, np.log2(1.1)), (1e6, 1.0), (3e6, 2.0)):
             left, half = np.full(4000, ahead), np.full(4000, ahead / 2)
-            found, halves = _beyond_laws(np.random.default_rng(2), law, left, half, 1e6)
+            found, halves = _beyond_laws(
+                np.random.default_rng(2), law, left, half, now=1e6, proven=1e9
+            )
             assert np.log(found).std() == pytest.approx(std * np.sqrt(doublings), rel=0.06)
             np.testing.assert_allclose(halves, found / 2)
     past = np.full(10, -1e5)
-    np.testing.assert_array_equal(
-        _beyond_laws(np.random.default_rng(3), named, past, past, 1e6)[0], past
-    )
+    of_past = _beyond_laws(np.random.default_rng(3), named, past, past, now=1e6, proven=1e6)
+    np.testing.assert_array_equal(of_past[0], past)
 
 
 @pytest.mark.parametrize("deviation", [0.0, 0.05])
