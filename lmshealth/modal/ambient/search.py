@@ -125,12 +125,9 @@ def _explain(
         candidates = [
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
-        model = _start(_bin(spectra, candidates, low, high), candidates).refined(6)
-        # Clear harmonics are seen before modes are selected, which takes most of the time.
-        harmonic = find_harmonic(model, recording)
-        if harmonic is None:
-            model = _select(model)
-            harmonic = find_harmonic(model, recording, harmonics)
+        # Before the selection the direction of a harmonic is too uncertain to leave it out.
+        model = _select(_start(_bin(spectra, candidates, low, high), candidates).refined(6))
+        harmonic = find_harmonic(model, recording, harmonics)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
             return model, tuple(harmonics), spectra, poles
         harmonics.append(harmonic)
