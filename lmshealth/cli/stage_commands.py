@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 def stage(described: Stage, style: str) -> None:
     """Check a stage description and the identifiability of its parameters.
 
-    STAGE is a .toml file or a shipped name. Reports errors with line and key; else the range and
+    STAGE is a .toml file or a shipped name. Reports errors with their key; else the range and
     surrogate error of the modal map, the sensitivities of the modes, and which parameters logs can
     determine at best (Cramér-Rao bound of vibration at constant velocity).
     """

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from lmshealth._arrays import FloatArray
-from lmshealth._toml import Keys, decode, place
+from lmshealth._toml import decode
 from lmshealth.errors import BadStage
 from lmshealth.io.log import Metadata
 from lmshealth.stage import constants
@@ -324,78 +324,78 @@ def load_stage(reference: str) -> Stage:
         raise BadStage(f"{path}: cannot read the stage description: {error.strerror}") from error
     except ValueError as error:
         raise BadStage(f"{path}: {error}") from error
-    _refuse(path, content, _faults(description))
+    _refuse(path, _faults(description))
     digest = hashlib.sha256(content)
     modal_map = None
     if description.map is not None and description.parameter:
         map_path = path.parent / description.map.file
         names = tuple(parameter.name for parameter in description.parameter)
         if not map_path.is_file():
-            _refuse(path, content, [(("map", "file"), f"there is no file {map_path}")])
+            raise BadStage(f"{path}: map.file: there is no file {map_path}")
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())
-        _refuse(path, content, _map_faults(description, modal_map))
+        _refuse(path, _map_faults(description, modal_map))
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
-def _refuse(path: Path, content: bytes, faults: Iterable[tuple[Keys, str]]) -> None:
+def _refuse(path: Path, faults: Iterable[tuple[str, str]]) -> None:
     """Raise the first of the faults, if there is any."""
-    for keys, fault in faults:
-        raise BadStage(f"{path}: {place(content, *keys)}: {fault}")
+    for key, fault in faults:
+        raise BadStage(f"{path}: {key}: {fault}")
 
 
-def _faults(description: Description) -> Iterator[tuple[Keys, str]]:
+def _faults(description: Description) -> Iterator[tuple[str, str]]:
     """Find contradictions between the parts of a description; yield key and message."""
     for k, one in enumerate(description.channel):
         if not any(one.direction):
-            yield ("channel", k, "direction"), f"the direction of {one.name} has no length"
+            yield f"channel[{k}].direction", f"the direction of {one.name} has no length"
     yield from _common_faults(description)
     for k, parameter in enumerate(description.parameter):
         yield from _parameter_faults(k, parameter)
 
 
-def _common_faults(description: Description) -> Iterator[tuple[Keys, str]]:
+def _common_faults(description: Description) -> Iterator[tuple[str, str]]:
     """Find faults of bands, names, map and decision."""
-    bands: list[tuple[Keys, tuple[float, float]]] = [
-        (("watch", k), (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
+    bands: list[tuple[str, tuple[float, float]]] = [
+        (f"watch[{k}]", (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
     ]
     if description.health_band_hz is not None:
-        bands.append((("health_band_hz",), description.health_band_hz))
-    for keys, (low, high) in bands:
+        bands.append(("health_band_hz", description.health_band_hz))
+    for key, (low, high) in bands:
         if not low < high:
-            yield keys, f"reaches from {low:g} to {high:g} Hz: needed low < high"
+            yield key, f"reaches from {low:g} to {high:g} Hz: needed low < high"
     for kind in ("mode", "parameter", "covariate", "channel"):
         names = [part.name for part in getattr(description, kind)]
         for k, name in enumerate(names):
             if name in names[:k]:
-                yield (kind, k, "name"), f"[[{kind}]] names must be unique, twice: {name!r}"
+                yield f"{kind}[{k}].name", f"[[{kind}]] names must be unique, twice: {name!r}"
     if description.parameter and description.map is None:
-        yield ("parameter", 0), "[[parameter]] needs a [map] of its effect on the modes"
+        yield "parameter[0]", "[[parameter]] needs a [map] of its effect on the modes"
     risk, ratio = description.decision.max_risk, description.decision.cost_ratio
     if risk is not None and ratio is not None:
         fault = f"cost_ratio = {ratio:g} and max_risk = {risk:g} each choose a service date"
-        yield ("decision", "cost_ratio"), f"{fault}: state one of them"
+        yield "decision.cost_ratio", f"{fault}: state one of them"
 
 
-def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[Keys, str]]:
+def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[str, str]]:
     """Find faults of the k-th parameter."""
     if parameter.word in constants.RESERVED_WORDS or "+" in parameter.word:
         fault = f"{parameter.word!r} cannot name a parameter in verdict.csv, nor can anything with "
         fault += (
             f"'+' or {', '.join(constants.RESERVED_WORDS)}: choose another name, or set verdict"
         )
-        yield ("parameter", k, "verdict" if parameter.verdict else "name"), fault
+        yield f"parameter[{k}].{'verdict' if parameter.verdict else 'name'}", fault
     kinds = [law.kind for law in parameter.laws]
     for j, kind in enumerate(kinds):
         if kind in kinds[:j]:
-            yield ("parameter", k, "law", j), f"{parameter.name}: two laws of the kind {kind!r}"
+            yield f"parameter[{k}].law[{j}]", f"{parameter.name}: two laws of the kind {kind!r}"
     if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
         wrong = f"limit {parameter.limit.below:g} must lie below the baseline"
         fault = f"{parameter.name}: {wrong} {parameter.baseline:g}"
-        yield ("parameter", k, "limit", "below"), fault
+        yield f"parameter[{k}].limit.below", fault
 
 
-def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[Keys, str]]:
+def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[str, str]]:
     """Find contradictions between a description and its map."""
     ends = np.array([modal_map.low, modal_map.high])
     for k, parameter in enumerate(description.parameter):
@@ -405,11 +405,11 @@ def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple
                 f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal"
             )
             covered = f"{np.exp(low):.4g} to {np.exp(high):.4g}"
-            yield ("parameter", k, "baseline"), f"{fault} map, which covers {covered}"
+            yield f"parameter[{k}].baseline", f"{fault} map, which covers {covered}"
         try:
             JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
         except BadStage as error:
-            yield ("parameter", k, "prior"), str(error)
+            yield f"parameter[{k}].prior", str(error)
     if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
         fault = f"the map has modes {list(modal_map.modes)}, but none of them is a tracked [[mode]]"
-        yield ("map", "file"), f"{fault} ({[mode.name for mode in description.mode]})"
+        yield "map.file", f"{fault} ({[mode.name for mode in description.mode]})"
