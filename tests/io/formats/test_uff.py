@@ -221,10 +221,9 @@ def test_binary_is_read_as_pyuff_reads_it(tmp_path, ordinate, dtype, spacing):
 
 
 def test_binary_numbers_that_look_like_a_tag(tmp_path):
-    """Samples whose bytes are the end of a data set are samples: the header counts them."""
-    body = b"\n    -1\n" * 20 + VALUES[:10].tobytes()
-    columns = loaded(tmp_path / "log.uff", uff_set(body, 30, binary=str(len(body))))
-    np.testing.assert_array_equal(columns["delta_e_um"], np.frombuffer(body))
+    """Samples whose bytes are the end of a data set (one in 10^16) make a damaged file of it."""
+    body = b"\n    -1\n" + VALUES[:10].tobytes()
+    corrupt(tmp_path / "log.uff", "begins at byte", uff_set(body, 11, binary=str(len(body))))
 
 
 def test_big_endian(tmp_path):
@@ -293,7 +292,8 @@ def test_limit_of_memory(tmp_path):
     """A data set that takes more memory than allowed is refused with the next step."""
     path = tmp_path / "log.uff"
     path.write_bytes(uff_set(VALUES.tobytes(), 101, binary="808"))
-    assert load(path, ColumnMap(), 808).columns
-    with pytest.raises(Unusable, match=r"'delta_e_um' needs .* raise --max-memory") as caught:
-        load(path, ColumnMap(), 807)
-    assert caught.value.reason == "too-large"
+    assert load(path, ColumnMap(), 40_000).columns
+    for limit, what in ((10_000, "data set 'delta_e_um'"), (1000, "the file")):
+        with pytest.raises(Unusable, match=rf"{what} needs .* raise --max-memory") as caught:
+            load(path, ColumnMap(), limit)
+        assert caught.value.reason == "too-large"
