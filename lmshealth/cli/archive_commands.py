@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from lmshealth.batch.run import Settings
+from lmshealth.batch.run import report as write_pages
+from lmshealth.batch.run import run as run_pipeline
+from lmshealth.batch.store import Store
 from lmshealth.cli import options, terminal, views
 from lmshealth.report.rendering import write_pdfs
-
-if TYPE_CHECKING:
-    from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage
 
 
 @options.command(
@@ -48,9 +50,6 @@ def run(
     ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
-    from lmshealth.batch.run import Settings
-    from lmshealth.batch.run import run as run_pipeline
-
     pdf = given.pop("pdf")
     with terminal.progress_bars() as progress:
         result = run_pipeline(logs, stages, out, Settings(**given), progress)
@@ -82,10 +81,6 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
 
     The pages are those that `run` wrote last for each machine, byte for byte.
     """
-    from lmshealth.batch.run import Settings
-    from lmshealth.batch.run import report as write_pages
-    from lmshealth.batch.store import Store
-
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")

@@ -7,20 +7,30 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import BadLog
+from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Log, Refusal
-
-if TYPE_CHECKING:
-    from lmshealth.io.manifest import Manifest
-    from lmshealth.modal.frf.measured import MeasuredResponse
-    from lmshealth.modal.identification import AmbientReading
-    from lmshealth.report.tables import Row
-    from lmshealth.tracking.history import LogEstimates
+from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_beside
+from lmshealth.io.reading import read_log
+from lmshealth.modal.acceleration_survey import survey
+from lmshealth.modal.free_decay.identification import identify_decays
+from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
+from lmshealth.modal.frf.measured import FORMATS, MeasuredResponse, read_responses
+from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.mode_shapes import mode_shapes
+from lmshealth.modal.naming import compare, name_response, why_unnamed
+from lmshealth.report import log_figures, tables
+from lmshealth.report.tables import Row
+from lmshealth.signal.acceleration_levels import find_growth
+from lmshealth.signal.following_error import loop_error, read_error
+from lmshealth.stage.description import ModeSpec
+from lmshealth.stage.skeleton import searches, write_skeleton
+from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
 
@@ -75,12 +85,6 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     json also lists complex mode shapes, their phase collinearity (MPC), the modal assurance
     criterion (MAC) of each pair of modes, and spectral lines.
     """
-    from lmshealth.modal.mode_shapes import mode_shapes
-    from lmshealth.modal.naming import compare
-    from lmshealth.report.tables import modes_rows, shapes_rows
-    from lmshealth.signal.following_error import loop_error
-    from lmshealth.tracking.history import LogEstimates
-
     stage, band = given["stage"], given["band"]
     _check_outputs(given)
 
@@ -89,17 +93,16 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     def estimate(log: Log) -> LogEstimates:
         with terminal.progress_bars(_PATIENCE) as report:
             reading = _read_modes(log, given, report)
-        shapes, mac = shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
+        shapes, mac = tables.shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes
         content["mac"] += mac
         if given["plot"]:
-            from lmshealth.report.log_figures import modes_figure, write_figure
-
-            write_figure(given["plot"], modes_figure(log, reading, stage, band=band))
+            figure = log_figures.modes_figure(log, reading, stage, band=band)
+            log_figures.write_figure(given["plot"], figure)
         return LogEstimates(log.name, log.digest, log.metadata, reading.modes, loop_error(log))
 
     found, lost = _each(ctx, estimate)
-    rows = [row for one in found for row in modes_rows(one)]
+    rows = [row for one in found for row in tables.modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
     pairs = [(r.log, one) for r in found if stage for one in compare(r.modes, stage)]
@@ -122,15 +125,11 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
 
 def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
     """Identify the modes of a log by the chosen part of it."""
-    from lmshealth.modal.free_decay.identification import identify_decays
-    from lmshealth.modal.identification import AmbientReading, read_ambient
-    from lmshealth.report.log_figures import settling_spectra
-
     chosen: Any = {"channels": given["channels"], "band": given["band"]}
     if given["part"] == "constant":
         return read_ambient(log, given["stage"], **chosen, progress=report)
     found = identify_decays(log, given["stage"], **chosen)
-    return AmbientReading(found, settling_spectra(log, given["channels"]))
+    return AmbientReading(found, log_figures.settling_spectra(log, given["channels"]))
 
 
 def _check_outputs(given: dict[str, Any]) -> None:
@@ -154,9 +153,6 @@ def _check_outputs(given: dict[str, Any]) -> None:
 
 def _save(path: Path, found: LogEstimates) -> None:
     """Write the skeleton of a stage description."""
-    from lmshealth.stage.description import ModeSpec
-    from lmshealth.stage.skeleton import searches, write_skeleton
-
     modes, specs = found.modes, []
     for k, search in enumerate(searches(modes.frequency.tolist())):
         frequency, damping = float(modes.frequency[k]), float(modes.damping_ratio[k])
@@ -190,14 +186,11 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     Statistics are of all samples, harmonics of the longest segment without gaps. The sum of the
     listed harmonics (json) reconstructs the following error.
     """
-    from lmshealth.report.tables import error_row, harmonics_rows
-    from lmshealth.signal.following_error import read_error
-
     analysis = {"count": given["count"], "floor": 1e-9 * given["floor_nm"], "part": given["part"]}
     found, lost = _each(ctx, lambda log: (log, read_error(log, **analysis)))
     pairs = [(log.name, one) for log, own in found for one in own]
-    rows = [error_row(*pair) for pair in pairs]
-    harmonics = [row for pair in pairs for row in harmonics_rows(*pair)]
+    rows = [tables.error_row(*pair) for pair in pairs]
+    harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
     _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, lost, show)
@@ -224,19 +217,15 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     10 Hz. The magnitude is the amplitude of the strongest harmonic of a band. The test for spectral
     lines has a false-alarm probability of 1 % per channel.
     """
-    from lmshealth.modal.acceleration_survey import survey
-    from lmshealth.report.tables import growth_rows, magnitudes_rows
-    from lmshealth.signal.acceleration_levels import find_growth
-
     stage, band, part = given["stage"], given["band"], given["part"]
     found, lost = _each(ctx, lambda log: survey(log, stage, band, part=part))
     magnitudes = [item for own in found for item in own.magnitudes]
     growth = find_growth(magnitudes)
     of_logs = [(own.log, line) for own in found for line in own.lines]
-    rows = magnitudes_rows(magnitudes, growth, of_logs)
+    rows = tables.magnitudes_rows(magnitudes, growth, of_logs)
     lines = _line_rows((own.log, own.lines) for own in found)
     refused = [refusal for own in found for refusal in own.refused]
-    content = {"magnitudes": rows, "growth": growth_rows(growth), "lines": lines}
+    content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
     _publish(ctx, content, refused, lost, show)
     _exit(ctx, found, lost)
@@ -293,12 +282,6 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
     json also the response with H1, H2, Hv and coherence. With a stage, a mode is named
     if it is the only one in its search band.
     """
-    from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
-    from lmshealth.modal.frf.measured import MeasuredResponse
-    from lmshealth.modal.naming import name_response, why_unnamed
-    from lmshealth.report.tables import fit_row, frf_rows, modes_rows
-    from lmshealth.tracking.history import LogEstimates
-
     stage, band, period = given["stage"], given["band"], given["period"]
     source, output = given["source"], given["output"]
     _check_outputs(given)
@@ -318,14 +301,14 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         named = name_response(own.modes, stage) if stage else own.modes
         estimates.append(LogEstimates(log.name, log.digest, log.metadata, named))
         if given["plot"]:
-            from lmshealth.report.log_figures import response_figure, write_figure
-
-            write_figure(given["plot"], response_figure(log, own, named, stage))
-    rows = [row for one in estimates for row in modes_rows(one)]
+            log_figures.write_figure(
+                given["plot"], log_figures.response_figure(log, own, named, stage)
+            )
+    rows = [row for one in estimates for row in tables.modes_rows(one)]
     content = {
         "modes": rows,
-        "fit": [fit_row(log.name, own) for log, own in found],
-        "frf": [row for log, own in found for row in frf_rows(log.name, own)],
+        "fit": [tables.fit_row(log.name, own) for log, own in found],
+        "frf": [row for log, own in found for row in tables.frf_rows(log.name, own)],
         "lines": _line_rows((log.name, own.modes.lines) for log, own in found),
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
@@ -345,10 +328,6 @@ def _responses(
     source: str | None, output: str | None, path: Path, **reading: Any
 ) -> list[Log | MeasuredResponse]:
     """Read the measured responses of a file that are asked for, or its log."""
-    from lmshealth.io.formats.registry import format_name
-    from lmshealth.io.reading import read_log
-    from lmshealth.modal.frf.measured import FORMATS, read_responses
-
     named = source is not None and output is not None
     measured = read_responses(path, **reading) if named or format_name(path) in FORMATS else ()
     used = [r for r in measured if output in (None, r.output) and source in (None, r.input)]
@@ -377,23 +356,19 @@ def _publish(
 
     Tables list refused parts of logs, but not lost logs.
     """
-    from lmshealth.report.tables import COLUMNS, LOG_COLUMNS, frame, refused_rows
-
     if ctx.params["style"] == "csv":
         name, rows = next(iter(content.items()))
-        table = frame({**COLUMNS, **LOG_COLUMNS}[name], rows)
+        table = tables.frame({**tables.COLUMNS, **tables.LOG_COLUMNS}[name], rows)
         click.echo(table.to_csv(index=False), nl=False)
     elif ctx.params["style"] == "json":
-        terminal.print_json({**content, "refused": refused_rows([*lost, *refused])})
+        terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     else:
-        show(refused_rows(refused))
+        show(tables.refused_rows(refused))
 
 
 def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:
     """Return the spectral lines of logs, with the log in the first column."""
-    from lmshealth.report.tables import lines_rows
-
-    return [{"log": log, **row} for log, own in lines for row in lines_rows(own)]
+    return [{"log": log, **row} for log, own in lines for row in tables.lines_rows(own)]
 
 
 def _each(
@@ -405,9 +380,6 @@ def _each(
 
     ``read`` reads what a file holds, where that is not one log.
     """
-    from lmshealth.io.manifest import MANIFEST, NOT_LOGS, read_manifest_beside
-    from lmshealth.io.reading import read_log
-
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}

@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 from msgspec.structs import replace
@@ -16,17 +16,25 @@ from lmshealth._files import write_draws, write_text
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
-
-if TYPE_CHECKING:
-    from lmshealth.health.results import Health
-    from lmshealth.io.log import Refusal
-    from lmshealth.prognosis.life_posterior import LifePosterior
-    from lmshealth.prognosis.results import Prognosis
-    from lmshealth.report.tables import Row
-    from lmshealth.stage.description import Decision
-    from lmshealth.tracking.history import History
-    from lmshealth.tracking.read_tables import Drifts
-
+from lmshealth.health.ensemble_sampling import seed_of
+from lmshealth.health.inference import epochs_to_infer, infer_together
+from lmshealth.health.inference import infer as infer_health
+from lmshealth.health.results import Health
+from lmshealth.health.verdict import doubt_of_names
+from lmshealth.io.log import Refusal
+from lmshealth.prognosis.life_posterior import LifePosterior
+from lmshealth.prognosis.maintenance_decision import decide, probability_before
+from lmshealth.prognosis.remaining_life import prognose_with_posterior
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report import tables
+from lmshealth.report.assessment import summarise_life
+from lmshealth.report.tables import Row
+from lmshealth.stage.description import Decision, load_stage
+from lmshealth.tracking.history import History, missing_mode_notices
+from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
+from lmshealth.tracking.smoother import smooth
+from lmshealth.tracking.track import accepted_estimates, outlier_refusals
+from lmshealth.tracking.track import track as track_modes
 
 Progress = Callable[[str, int, int], None]
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
@@ -59,12 +67,6 @@ def track(table: Path, **given: Any) -> None:
     every row has it, else the time. Without mode names the modes are found from the estimates;
     without --stage every covariate column is regressed about its median.
     """
-    from lmshealth.report import tables
-    from lmshealth.tracking.read_tables import read_machines
-    from lmshealth.tracking.smoother import smooth
-    from lmshealth.tracking.track import accepted_estimates, outlier_refusals
-    from lmshealth.tracking.track import track as track_modes
-
     stage, targets = given["stage"], given | {"track": given["out"]}
     more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
     machines, notes = read_machines(table, stage, **more)
@@ -89,8 +91,6 @@ def track(table: Path, **given: Any) -> None:
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Return what the reader of a track must take into account."""
-    from lmshealth.tracking.history import missing_mode_notices
-
     notes = [notice.what for notice in missing_mode_notices(history, refused)]
     if not history.has_odometer:
         notes.append("not every log has travel_km: the clock is the time")
@@ -120,7 +120,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 @click.option(
     "--with",
     "others",
-    type=(options.TABLE, options.stage_file),
+    type=(options.TABLE, load_stage),
     multiple=True,
     metavar="TRACK.csv STAGE",
     help="Another machine that shares a part with the first; see --shared.",
@@ -138,15 +138,13 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     --shared, machines that share a part (such as one guide in two configurations) are inferred
     together, at the epochs of the first.
     """
-    from lmshealth.report.tables import health_rows
-
     if bool(given["others"]) != bool(given["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
     with progress_bars() as progress:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
-    rows = [row for health in found for row in health_rows(health)]
+    rows = [row for health in found for row in tables.health_rows(health)]
     _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
 
 
@@ -154,9 +152,6 @@ def _infer_machines(
     table: Path, given: dict[str, Any], progress: Progress
 ) -> tuple[list[Health], list[str]]:
     """Infer all machines of a table; return results, and reasons of those that have none."""
-    from lmshealth.health.ensemble_sampling import seed_of
-    from lmshealth.health.inference import epochs_to_infer, infer, infer_together
-
     stage, machines = given["stage"], _read_drifts(table, given["cov"])
     if given["others"]:
         others = [(_single(path, _read_drifts(path, None)), own) for path, own in given["others"]]
@@ -172,7 +167,7 @@ def _infer_machines(
         try:
             epochs = epochs_to_infer(drifts, stage, given["epochs"])
             mapper = partial(_counting_map, drifts.stage, progress)
-            found.append(infer(drifts, stage, seed, epochs=epochs, mapper=mapper))
+            found.append(infer_health(drifts, stage, seed, epochs=epochs, mapper=mapper))
         except NotEnoughData as why:
             lost.append(str(why))
     return found, lost
@@ -188,8 +183,6 @@ def _counting_map(
 
 
 def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
-    from lmshealth.tracking.read_tables import read_drifts
-
     default = table.with_name("track_cov.csv")
     found, notes = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
     print_notes(f"{table}: {note}" for note in notes)
@@ -235,12 +228,6 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km.
     --max-risk and --cost-ratio replace [decision] of the stage description.
     """
-    from lmshealth.prognosis.maintenance_decision import decide, probability_before
-    from lmshealth.report.assessment import summarise_life
-    from lmshealth.report.tables import prognosis_rows
-    from lmshealth.tracking.history import missing_mode_notices
-    from lmshealth.tracking.read_tables import read_machines
-
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
     more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
@@ -261,7 +248,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             note = f"{life.stage}: --by {by} is not after the last log ({last}): no probability"
             print_notes([f"{note} is given for that day"])
         views.print_life(life, service, before)
-        rows += prognosis_rows(life, service, before)
+        rows += tables.prognosis_rows(life, service, before)
     _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost)
 
 
@@ -278,12 +265,6 @@ def _prognose_machines(
     histories: list[History], given: dict[str, Any], progress: Progress
 ) -> tuple[list[tuple[Prognosis, LifePosterior | None]], list[str]]:
     """Prognose all machines of a table; return results, and reasons of those that have none."""
-    from lmshealth.health.ensemble_sampling import seed_of
-    from lmshealth.health.verdict import doubt_of_names
-    from lmshealth.prognosis.remaining_life import prognose_with_posterior
-    from lmshealth.tracking.track import accepted_estimates
-    from lmshealth.tracking.track import track as track_modes
-
     found, lost, stage = [], [], given["stage"]
     for k, history in enumerate(histories):
         try:
@@ -303,9 +284,7 @@ def _prognose_machines(
 
 
 def _write(target: Path, name: str, rows: list[Row]) -> None:
-    from lmshealth.report.tables import COLUMNS, frame
-
-    write_text(target, frame(COLUMNS[name], rows).to_csv(index=False))
+    write_text(target, tables.frame(tables.COLUMNS[name], rows).to_csv(index=False))
 
 
 def _finish(

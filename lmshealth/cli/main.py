@@ -8,20 +8,46 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+from importlib import import_module
 from typing import Any
 
 import click
 
-from lmshealth.cli.archive_commands import report, run
-from lmshealth.cli.log_commands import error, frf, modes, spectrum
-from lmshealth.cli.machine_commands import infer, prognose, track
-from lmshealth.cli.stage_commands import plan, stage
 from lmshealth.cli.terminal import print_errors
 from lmshealth.errors import LmshealthError
+
+# Module of each command, and the text of the list of commands, which is printed without scipy.
+_COMMANDS = {
+    "error": ("log_commands", "Analyse the following error."),
+    "frf": ("log_commands", "Measure a frequency response and identify its modes."),
+    "infer": ("machine_commands", "Infer the health parameters from a track."),
+    "modes": ("log_commands", "Identify the modes of single logs."),
+    "plan": ("stage_commands", "Plan the logs that are needed to detect a loss."),
+    "prognose": ("machine_commands", "Predict the remaining life and the service date."),
+    "report": ("archive_commands", "Write the pages of all machines in a store."),
+    "run": ("archive_commands", "Analyse a folder of logs: tables, verdicts and report."),
+    "spectrum": ("log_commands", "Measure accelerations per mode and velocity."),
+    "stage": ("stage_commands", "Check a stage description."),
+    "track": ("machine_commands", "Track modes through a table of estimates."),
+}
 
 
 class _Group(click.Group):
     """Group that reports errors in one line on standard error, with exit status 1."""
+
+    def list_commands(self, ctx: click.Context) -> list[str]:
+        return list(_COMMANDS)
+
+    def get_command(self, ctx: click.Context, cmd_name: str) -> click.Command | None:
+        if cmd_name not in _COMMANDS:
+            return None
+        module = import_module(f"lmshealth.cli.{_COMMANDS[cmd_name][0]}")
+        command: click.Command = getattr(module, cmd_name)
+        return command
+
+    def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:
+        with formatter.section("Commands"):
+            formatter.write_dl([(name, text) for name, (_, text) in _COMMANDS.items()])
 
     def invoke(self, ctx: click.Context) -> Any:
         try:
@@ -44,7 +70,3 @@ class _Group(click.Group):
 @click.version_option(package_name="lmshealth")
 def main() -> None:
     """Estimate the remaining guide preload and mount stiffness of linear-motor stages."""
-
-
-for _command in (run, modes, error, spectrum, frf, stage, plan, track, infer, prognose, report):
-    main.add_command(_command)

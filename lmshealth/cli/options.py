@@ -8,16 +8,14 @@ from collections.abc import Callable
 from datetime import date, datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
+from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
-
-if TYPE_CHECKING:
-    from lmshealth.io.column_map import ColumnMap
-    from lmshealth.stage.description import Stage
+from lmshealth.stage.description import load_stage
 
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
@@ -45,16 +43,7 @@ def day(value: str) -> date:
         raise click.BadParameter(detail) from error
 
 
-def stage_file(value: str) -> Stage:
-    """Load a stage description: a .toml file or a shipped name."""
-    from lmshealth.stage.description import load_stage  # late: --help needs no scipy
-
-    return load_stage(value)
-
-
 def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
-    from lmshealth.io.column_map import load_columns
-
     return None if path is None else load_columns(path)
 
 
@@ -85,7 +74,7 @@ LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type
 stage_option = partial(
     click.option,
     "--stage",
-    type=stage_file,
+    type=load_stage,
     metavar="TEXT",
     help="Stage description: a .toml file or a shipped name.",
 )

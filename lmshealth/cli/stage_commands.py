@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import click
 
 from lmshealth.cli import options, terminal, views
-
-if TYPE_CHECKING:
-    from lmshealth.stage.description import Stage
+from lmshealth.report.tables import plan_rows, stage_rows
+from lmshealth.stage.check import check_stage, diagnose
+from lmshealth.stage.constants import DURATIONS
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.planning import plan as make_plan
 
 
 @options.command("stage lms-y", "stage my-stage.toml --format json")
-@click.argument("described", metavar="STAGE", type=options.stage_file)
+@click.argument("described", metavar="STAGE", type=load_stage)
 @options.format_option("table", "json")
 def stage(described: Stage, style: str) -> None:
     """Check a stage description and the identifiability of its parameters.
@@ -22,9 +24,6 @@ def stage(described: Stage, style: str) -> None:
     surrogate error of the modal map, the sensitivities of the modes, and which parameters logs can
     determine at best (Cramér-Rao bound of vibration at constant velocity).
     """
-    from lmshealth.report.tables import stage_rows
-    from lmshealth.stage.check import check_stage, diagnose
-
     checked = check_stage(described)
     content = stage_rows(checked, diagnose(checked))
     if style == "json":
@@ -84,10 +83,6 @@ def plan(
     Lower bound for vibration at constant velocity (Cramér-Rao): logs of the present are compared
     with baseline logs of equal length, at the same temperature.
     """
-    from lmshealth.report.tables import plan_rows
-    from lmshealth.stage.constants import DURATIONS
-    from lmshealth.stage.planning import plan as make_plan
-
     durations = seconds or DURATIONS
     plans = [make_plan(stage, *one, durations=durations, **given) for one in detections]
     content = plan_rows(plans)

@@ -6,12 +6,15 @@ import math
 from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
-from typing import TYPE_CHECKING
 
 import click
 
 from lmshealth.cli.terminal import cells, print_refused, print_table, print_text, short_names
+from lmshealth.health.results import Health
+from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
+from lmshealth.report.assessment import Life, ParameterHealth, Summary
+from lmshealth.report.tables import Row, health_rows, track_rows
 from lmshealth.report.text import (
     GAP,
     change,
@@ -26,13 +29,7 @@ from lmshealth.report.text import (
     signed,
     spell,
 )
-
-if TYPE_CHECKING:  # so that --help does not import pandas and scipy
-    from lmshealth.health.results import Health
-    from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
-    from lmshealth.report.assessment import Life, ParameterHealth, Summary
-    from lmshealth.report.tables import Row
-    from lmshealth.tracking.track import Track
+from lmshealth.tracking.track import Track
 
 _KM = 1000.0
 _MATRIX = 6  # columns of a matrix that fit on a terminal
@@ -415,8 +412,6 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
 
 def print_track(track: Track) -> None:
     """Print the latest modes of a machine, its events and the consistency of the filter."""
-    from lmshealth.report.tables import track_rows
-
     rows = []
     for row in track_rows(track, epochs=[len(track.logs) - 1]):
         damping = f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
@@ -462,8 +457,6 @@ def _consistency(track: Track) -> str:
 
 def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
-    from lmshealth.report.tables import health_rows
-
     rows = health_rows(health)[-len(health.parameters) :]
     for row in rows:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
