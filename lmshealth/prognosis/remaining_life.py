@@ -166,7 +166,7 @@ def _passages(
                 path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
             )
             if path.law.names:
-                proven = now + _early_life(path.law, limit, rng)
+                proven = now + early_life(path.law, limit, rng)
                 opened = _beyond_laws(
                     rng, path.law, columns[-1], halves[-1], now=now, proven=proven
                 )
@@ -186,7 +186,7 @@ def rate_std(law: Law) -> float:
     return constants.ACCELERATION_STD if late else constants.RATE_STD
 
 
-def _early_life(law: Law, limit: float, rng: np.random.Generator) -> float:
+def early_life(law: Law, limit: float, rng: np.random.Generator) -> float:
     """Return the travel in m before which few machines of the description reach a limit."""
     path = DegradationPath(law, 0.0, ())
     lives = path.passage(path.natural(path.draw(rng, _N_LIVES, _KM), _KM), limit)

@@ -9,9 +9,16 @@ from datetime import UTC, datetime, timedelta
 import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, Series, Step
 
 START = datetime(2026, 3, 1, tzinfo=UTC)
+
+
+def map_std(rng: np.random.Generator, machine: Stage) -> float:
+    """Draw by how much the map of a machine is wrong: as declared, or by more."""
+    stds, weights = zip(*machine.map_errors, strict=True)
+    return float(rng.choice(stds, p=weights))
 
 
 def make_history(

@@ -14,7 +14,7 @@ from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History
-from studies.common.histories import make_history
+from studies.common.histories import make_history, map_std
 from studies.sbc_life.lives import Part
 
 Array = NDArray[np.float64]
@@ -149,9 +149,8 @@ def _modes(
     rng: np.random.Generator, fleet: Stage, names: tuple[str, ...], clock: Array, path: Array
 ) -> Array:
     """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
-    assert fleet.description.map is not None
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
-    error = fleet.description.map.model_std * rng.standard_normal(len(names))
+    error = map_std(rng, fleet) * rng.standard_normal(len(names))
     level = (1 + error) * fleet.drift(path, names)
     walk = rng.choice(constants.WALK_STDS, p=_shares(fleet, "walk"))
     steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])

@@ -94,7 +94,6 @@ def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> R
     the same density, evaluated by the surrogate over many more steps.
     """
     machine, view = stage_named("lms-y"), posterior.machines[0]
-    model_std = view.stage.description.map.model_std  # type: ignore[union-attr]
     base = guide_frequencies(machine, 1.0, 1.0)
 
     def drift(preload: float, mount: float) -> Array:
@@ -107,9 +106,13 @@ def plain_loop(posterior: EpochPosterior, seed: int, steps: int, long: int) -> R
             return -np.inf
         preload, mount = np.exp(x)
         own = drift(preload, 1.0) ** 2 + drift(1.0, mount) ** 2
-        cov = view.cov + model_std**2 * np.diag(own)
         off = view.drift - drift(preload, mount)
-        return prior - 0.5 * float(off @ np.linalg.solve(cov, off) + np.linalg.slogdet(cov)[1])
+        terms = []
+        for model_std, weight in view.stage.map_errors:
+            cov = view.cov + model_std**2 * np.diag(own)
+            misfit = off @ np.linalg.solve(cov, off) + np.linalg.slogdet(cov)[1]
+            terms.append(np.log(weight) - 0.5 * float(misfit))
+        return prior + float(np.logaddexp.reduce(terms))
 
     state = start_of(posterior, seed)
     few = state.coords[:5]

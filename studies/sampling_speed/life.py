@@ -102,8 +102,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     density = replace(density, grid=grid[np.arange(n_kept) == np.argmax(value)])
     walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
     prior = scenario.log_prior(y)
-    assert stage.description.map is not None
-    model_std = stage.description.map.model_std
+    model_std = float(density.grid.map_std[0])
 
     def loop() -> Array:
         x, _ = ln_health(stage, scenario, y[:looped], history.clock())

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, track
-from studies.common.histories import make_history
+from studies.common.histories import make_history, map_std
 
 Array = NDArray[np.float64]
 
@@ -39,14 +39,13 @@ def draw(rng: np.random.Generator, machine: Stage, n_epochs: int) -> Life:
     The relative errors of the map's sensitivities, one per parameter and mode, are those of the
     life; parameters and the errors of the drifts are drawn again at every epoch.
     """
-    assert machine.description.map is not None
     followed = track(history(rng, machine), machine)
     n = len(followed.logs)
     epochs = tuple(np.linspace(n - 1, 0, n_epochs, endpoint=False).round().astype(int)[::-1])
     names = [name for name in machine.informative if name in followed.modes]
     columns = np.array([followed.modes.index(name) for name in names])
     shape = len(machine.parameters), columns.size
-    error = machine.description.map.model_std * rng.standard_normal(shape)
+    error = map_std(rng, machine) * rng.standard_normal(shape)
     truth = parameters(rng, machine, n_epochs)
     drift = followed.drift.copy()
     for k, x in zip(epochs, truth, strict=True):

@@ -4,7 +4,7 @@ Method
     Simulation-based calibration. The covariance of the drifts is that of the real tracker, of 8 to
     80 logs whose estimates have errors of 0.02 to 0.5 %, with temperature and in half of the lives
     payload. ln parameters are drawn from the priors of the description, inside the map, and a
-    relative error of the map's sensitivities per parameter and mode by `model_std`; drifts are
+    relative error of the map's sensitivities per parameter and mode by `Stage.map_errors`; drifts are
     those of the map, with these errors, and with noise of that covariance: one epoch of Y, three
     epochs of a life that share one error of the map, one epoch of X. Draws of `EpochPosterior` are
     by importance sampling; those of `infer`, on some of the same lives, are its chains. Ranks among

@@ -8,13 +8,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.prognosis import constants
-from lmshealth.prognosis.remaining_life import rate_std
+from lmshealth.prognosis.remaining_life import early_life, rate_std
 from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Series, Step
-from studies.common.histories import make_history
+from studies.common.histories import make_history, map_std
 
 Array = NDArray[np.float64]
 N_LOGS = 60
@@ -50,10 +50,11 @@ class Part:
             return left
         if left <= horizon:
             left *= rng.lognormal(0.0, rate_std(self.law) * np.sqrt(np.log2(1 + left / now)))
-        hazard = rng.gamma(constants.UNSEEN_ONSETS) / now
+        proven = now + early_life(self.law, limit, rng)
+        hazard = rng.gamma(constants.UNSEEN_ONSETS) / proven
         onset = rng.exponential() / hazard if hazard > 0 else np.inf
         growth = constants.UNSEEN_GROWTH
-        end = onset + (now + onset) * rng.lognormal(np.log(growth.median), growth.sigma)
+        end = onset + (proven + onset) * rng.lognormal(np.log(growth.median), growth.sigma)
         return min(left, float(end))
 
     def _left_by_law(
@@ -183,13 +184,12 @@ def _modes(
     rng: np.random.Generator, machine: Stage, names: tuple[str, ...], clock: Array, path: Array
 ) -> Array:
     """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
-    assert machine.description.map is not None
     x = np.log(path)
-    level = machine.drift(x, names)
+    level, wrong_by = machine.drift(x, names), map_std(rng, machine)
     for j in range(x.shape[1]):
         alone = np.tile(machine.baseline_point, (clock.size, 1))
         alone[:, j] = x[:, j]
-        error = machine.description.map.model_std * rng.standard_normal(len(names))
+        error = wrong_by * rng.standard_normal(len(names))
         level = level + error * machine.drift(alone, names)
     walk = rng.choice(constants.WALK_STDS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     level = level + np.cumsum(walk[:, None] * rng.standard_normal(level.shape), axis=0)

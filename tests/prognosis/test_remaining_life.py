@@ -18,8 +18,8 @@ from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import (
     _beyond_laws,
-    _early_life,
     _usage,
+    early_life,
     identifiable_limits,
     parameters_with_limit,
     prognose,
@@ -416,7 +416,7 @@ def test_an_unseen_onset_has_the_hazard_of_none_in_the_travel_proven(
 def test_early_lives_of_a_description_count_as_proven() -> None:
     """A twentieth of the rates of N(0, 2e-4) per km exceeds 3.29e-4: 1,216 km to a limit of 0.6."""
     law = Linear(rate_per_km=Normal(0.0, 2e-4))
-    found = _early_life(law, 0.6, np.random.default_rng(1))
+    found = early_life(law, 0.6, np.random.default_rng(1))
     assert found == pytest.approx(0.4 / 3.29e-4 * 1e3, rel=0.06)
 
 

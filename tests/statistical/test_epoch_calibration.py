@@ -16,7 +16,8 @@ from lmshealth._arrays import FloatArray
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw, infer_together
-from lmshealth.stage.description import load_stage
+from lmshealth.stage.description import Stage, load_stage
+from studies.common.histories import map_std
 from studies.common.metrics import place
 from studies.one_guide.run import SHARED, drifts_of
 from studies.sbc_epoch.lives import believing
@@ -31,12 +32,12 @@ NAMES = ("guide_preload", "mount_stiffness")
 COV = 4e-7 * (0.7 * np.eye(3) + 0.3)
 
 
-def seen(rng: np.random.Generator, x: FloatArray) -> FloatArray:
-    """Drifts at ln parameters, by a map whose sensitivities are wrong by 5 %, with noise."""
-    drift = true_drift(NAMES, x)
+def seen(rng: np.random.Generator, stage: Stage, x: FloatArray) -> FloatArray:
+    """Drifts at ln parameters, by a map whose sensitivities are wrong, with noise."""
+    wrong_by, drift = map_std(rng, stage), true_drift(NAMES, x)
     for j in range(2):
         alone = true_drift(NAMES, x * (np.arange(2) == j))
-        drift = drift + 0.05 * rng.standard_normal(3) * alone
+        drift = drift + wrong_by * rng.standard_normal(3) * alone
     return rng.multivariate_normal(drift, COV)
 
 
@@ -64,7 +65,7 @@ def test_health_is_calibrated(rng: np.random.Generator, claims: Claims, tmp_path
     proud = make_stage(tmp_path / "proud", n_modes=3, model_std=0.0)
     found, wrong = [], []
     for x in stage.prior.draw(rng, claims.trials):
-        drift = seen(rng, x)
+        drift = seen(rng, stage, x)
         found.append(marginals(EpochPosterior.of(stage, MODES, drift, COV), x))
         wrong.append(marginals(EpochPosterior.of(proud, MODES, drift, COV), x))
     for j, name in enumerate(claims.part.claims):
@@ -82,7 +83,7 @@ def test_chains_are_as_calibrated_as_grids(
     stage = make_stage(tmp_path, n_modes=3)
     errors = []
     for k, x in enumerate(stage.prior.draw(rng, claims.trials)):
-        posterior = EpochPosterior.of(stage, MODES, seen(rng, x), COV)
+        posterior = EpochPosterior.of(stage, MODES, seen(rng, stage, x), COV)
         found, _ = draw(posterior, stream(int(rng.integers(1 << 32)), k))
         middle = np.median(found.flat, axis=0)
         closer = middle + 0.75 * (found.flat - middle)
@@ -125,7 +126,7 @@ def test_the_fit_is_seldom_improbable(
     def improbable(n: int, off: float) -> int:
         below = 0
         for x in stage.prior.draw(rng, n):
-            drift = seen(rng, x) + off * np.array([1, -1, 1])
+            drift = seen(rng, stage, x) + off * np.array([1, -1, 1])
             posterior = EpochPosterior.of(stage, MODES, drift, COV)
             begin = stage.prior.draw(rng, 200)
             near = begin[np.argsort(-posterior.log_probability(begin))[:20]]

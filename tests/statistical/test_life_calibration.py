@@ -20,6 +20,7 @@ from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import _usage, remaining_travel
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
+from studies.common.histories import map_std
 from studies.common.metrics import place
 from studies.common.ranks import N_DRAWS
 from studies.fleet_prior.lives import YOUNG, draw_fleet
@@ -52,7 +53,7 @@ from tests.statistical.evidence import uniform
 N_LOGS = 12
 
 
-def draw_history(rng: np.random.Generator, model_std: float) -> tuple[History, float, float]:
+def draw_history(rng: np.random.Generator, stage: Stage) -> tuple[History, float, float]:
     """Draw a life of a fading preload, its loss by the law and its health now, from all priors."""
     travel = np.cumsum(np.r_[1e5, rng.uniform(5e4, 4e5, N_LOGS - 1)])
     clock = travel - travel[0]
@@ -61,7 +62,7 @@ def draw_history(rng: np.random.Generator, model_std: float) -> tuple[History, f
     while not low < 1 - (loss := rng.normal(0, 2e-7) * now) < high:
         pass
     drift = true_drift(("guide_preload",), np.log(1 - loss * clock / now)[:, None])[:, :2]
-    drift = drift * (1 + model_std * rng.standard_normal(2))
+    drift = drift * (1 + map_std(rng, stage) * rng.standard_normal(2))
     temperature = 21 + 4 * rng.standard_normal(N_LOGS)
     drift += np.outer(temperature - 21, rng.normal(0, 1e-3, 2))
     steps = np.sqrt(np.diff(clock) / now)[:, None] * rng.standard_normal((N_LOGS - 1, 2))
@@ -118,7 +119,7 @@ def test_losses_by_laws_are_calibrated(
     proud = make_stage(tmp_path / "proud", (FADING,), model_std=0.0, tail=TEMPERATURE)
     found, health, wrong = [], [], []
     for _ in range(claims.trials):
-        history, loss, left = draw_history(rng, 0.2)
+        history, loss, left = draw_history(rng, honest)
         density = density_of(history, honest)
         found.append(cdf_at(*integrated(density), loss))
         health.append(level_of_health(density, rng, left))
@@ -143,7 +144,7 @@ def test_health_off_its_law_is_calibrated(
     stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=TEMPERATURE)
     found, wrong = [], []
     for _ in range(claims.trials):
-        history, _, left = draw_history(rng, 0.2)
+        history, _, left = draw_history(rng, stage)
         density = density_of(history, stage)
         found.append(level_of_health(density, rng, left))
         lawful = replace(density, grid=density.grid[density.grid.deviation == 0])
