@@ -4,14 +4,15 @@ Method
     Simulation-based calibration. The covariance of the drifts is that of the real tracker, of 8 to
     80 logs whose estimates have errors of 0.02 to 0.5 %, with temperature and in half of the lives
     payload. ln parameters are drawn from the priors of the description, inside the map, and a
-    relative error of the map's sensitivities per parameter and mode by `Stage.map_errors`; drifts are
-    those of the map, with these errors, and with noise of that covariance: one epoch of Y, three
-    epochs of a life that share one error of the map, one epoch of X. Draws of `EpochPosterior` are
-    by importance sampling; those of `infer`, on some of the same lives, are its chains. Ranks among
-    127 draws, ties at random, are compared with the simultaneous band of their distribution at 99.9
-    %, coverages with their 99.9 % Clopper-Pearson interval. Controls that must fail: half of all
-    covariances is stated, those of the drifts and of the map's error; a map is taken as exact that
-    is wrong by 5 %. Beside them: half of the covariance of the drifts alone.
+    relative error of the map's sensitivities per parameter and mode as the description and
+    `MAP_ERRORS` have it; drifts are those of the map, with these errors, and with noise of that
+    covariance: one epoch of Y, three epochs of a life that share one error of the map, one epoch of
+    X. Draws of `EpochPosterior` are by importance sampling; those of `infer`, on some of the same
+    lives, are its chains. Ranks among 127 draws, ties at random, are compared with the simultaneous
+    band of their distribution at 99.9 %, coverages with their 99.9 % Clopper-Pearson interval.
+    Controls that must fail: half of all covariances is stated, those of the drifts and of the map's
+    error; a map is taken as exact that is wrong by 5 %. Beside them: half of the covariance of the
+    drifts alone.
 Answer
     Yes. Half the covariance of the drifts alone is not detected in 1,000 lives: of what is unknown
     after so many logs most is the error of the map.
