@@ -28,12 +28,16 @@ from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
 from models.recordings.recording import record
 from studies.common.cost import in_turns, wall_s
-from studies.harness.claims import Claim, number
+from studies.harness.claims import Claim, Older, number
 from studies.harness.study import Row, Study
 from studies.identification.cases import CASES
 from studies.identification.records import describe
 
 STEP = "identify"
+
+OLDER = {
+    "result": Older("3812515e44b2", "standard deviations allowed for an unsteady excitation"),
+}
 
 CASE = next(case for case in CASES if case.name == "three modes, three channels, 60 s")
 SECONDS = 60.0

@@ -31,11 +31,15 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.read_tables import Drifts
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
-from studies.harness.claims import Claim, at_level, covered, percents
+from studies.harness.claims import Claim, Older, at_level, covered, percents
 from studies.harness.command_line import short_chains
 from studies.harness.study import Row, Study, judge_places
 
 STEP = "infer"
+
+OLDER = {
+    "result": Older("bc0037068c58", "a map could be wrong by more than it declares"),
+}
 
 Array = NDArray[np.float64]
 SEED = 20261123

@@ -37,11 +37,15 @@ from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, thinned, uniform
-from studies.harness.claims import Claim, ranked
+from studies.harness.claims import Claim, Older, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import Life, believing, draw
 
 STEP = "infer"
+
+OLDER = {
+    "result": Older("8c3cb6ca9f93", "a map could be wrong by more than it declares"),
+}
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")

@@ -28,13 +28,17 @@ from collections.abc import Iterable, Iterator
 
 import numpy as np
 
-from studies.harness.claims import Claim, at_level, covered, number, percents, span
+from studies.harness.claims import Claim, Older, at_level, covered, number, percents, span
 from studies.harness.study import Row, Study
 from studies.tracking_filter.lives import stage
 from studies.tracking_filter.peers import deviation, speed
 from studies.tracking_filter.trials import averaged, known_setting, two_sources
 
 STEP = "track"
+
+OLDER = {
+    "result": Older("009b31f897a1", "wander and outliers were part of the tracker"),
+}
 
 SEED = 20260401
 # Largest differences from filterpy and from others, in standard deviations.

@@ -35,7 +35,7 @@ from lmshealth.tracking import constants
 from studies.common import lives
 from studies.common.lives import DAMAGED, HEALTHY, Estimates, Life, plan_of, rng_of
 from studies.common.metrics import clopper_pearson
-from studies.harness.claims import Claim, counted, covered, number
+from studies.harness.claims import Claim, Older, counted, covered, number
 from studies.harness.study import LEVEL, Row, Study, Trials
 from studies.tracking_lives.trials import (
     DECLARED_RATE,
@@ -50,6 +50,11 @@ from studies.tracking_lives.trials import (
 )
 
 STEP = "track"
+
+OLDER = {
+    "result": Older("58e6b3afe43a", "wander and outliers were part of the tracker"),
+    "raw": Older("7823c8b5e466", "wander and outliers were part of the tracker"),
+}
 EVENTS = ("crash", "sudden-loosening", "servo-retuning, undeclared", "regreasing, undeclared")
 CASES = [("lms-y", kind) for kind in HEALTHY + DAMAGED] + [("lms-x", kind) for kind in HEALTHY]
 _QUICK = ("healthy", "servo-retuning", "temperature-only", "payload-change", "crash")
