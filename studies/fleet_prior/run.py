@@ -275,7 +275,8 @@ def claims(answer: Row) -> Iterator[Claim]:
     gain = own["crps_km_over_learned"]
     score = measured(learned["crps_km"], "km")
     yield Claim(
-        f"score (CRPS) of the remaining life of {answer['young']} young machines",
+        f"score (CRPS) of the remaining life of {answer['young']} young machines of fleets "
+        "drawn from the estimator's own model",
         *score,
         f"{measured(own['crps_km'], 'km')[0]} by the description, "
         f"{' '.join(measured(gain, 'km'))} more",

@@ -190,7 +190,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     kinds = dict.fromkeys(row["case"] for row in rows)
     short = {row["case"] for row in rows if not row["coverage"]["holds"]}
     yield Claim(
-        "kinds of records whose 95 % intervals of f and ζ cover",
+        "kinds of records (stationary Gaussian white force) whose 95 % intervals of f and ζ cover",
         f"{len(kinds) - len(short)} of {len(kinds)}",
         "99.9 %",
         met=not short,

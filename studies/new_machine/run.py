@@ -198,7 +198,8 @@ def claims(answer: Row) -> Iterator[Claim]:
         met=passed["what is shown comes out"],
     )
     yield counted(
-        "stiffness of a real coupling inside its 90 % intervals, sound and made to lose 7 %",
+        "epochs of a real coupling (one recording cut into logs, its loss a false sample "
+        "rate) inside their 90 % intervals",
         sum(row["inside"] for row in rows),
         len(rows),
         "half the loss: outside at the end",

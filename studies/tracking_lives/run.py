@@ -297,7 +297,12 @@ def _lives(answer: Row) -> Iterator[Claim]:
         met=passed["intervals of healthy lives cover at least"],
     )
     for what, own, beside, asked in (
-        ("healthy lives that alarm", healthy, "1 % declared", "healthy lives alarm as declared"),
+        (
+            "healthy lives that alarm (errors as stated; no wander, lag or outliers)",
+            healthy,
+            "1 % declared",
+            "healthy lives alarm as declared",
+        ),
         ("damaged lives that alarm", damaged, "", "damage alarms"),
     ):
         yield _counted(what, [row["alarms"] for row in own], beside, met=passed[asked])
