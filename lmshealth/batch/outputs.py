@@ -1,18 +1,16 @@
 """Output of a run: a page and rows of tables for each machine, one machine at a time.
 
-Memory holds rows of the index and the machines in progress, however many machines there are.
+Memory holds the packed rows of all machines, and besides them only the machines in progress.
 """
 
 from __future__ import annotations
 
 import csv
 import threading
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from tempfile import TemporaryFile
-from typing import Self
 
 from lmshealth._files import replacing, write_text
 from lmshealth._serialize import pack, unpack
@@ -85,49 +83,28 @@ def _output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
     return reason_if_failed(lambda: machine_output(record), record.machine)
 
 
-class Tables:
-    """Tables of a run, whose rows are kept in a file until all machines are done.
+def write_tables(folder: Path, machines: Sequence[str], packed: Mapping[str, bytes]) -> None:
+    """Replace the tables of a run, all at its end: an interrupted run leaves those before.
 
-    They replace older tables at the end: an interrupted run leaves those of the run before.
+    Of some machines there are packed rows by table; those of no machine (``""``) come first.
     """
+    parts = [packed[machine] for machine in ("", *machines) if machine in packed]
+    columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
+    for name, row in _rows(parts):
+        columns[name] |= dict.fromkeys(row)
+    with ExitStack() as stack:
+        writers = {}
+        for name, own in columns.items():
+            target = stack.enter_context(replacing(folder / f"{name}.csv"))
+            writers[name] = csv.DictWriter(target, own, lineterminator="\n")
+            writers[name].writeheader()
+        for name, row in _rows(parts):
+            # NaN is a missing value.
+            writers[name].writerow({key: cell for key, cell in row.items() if cell == cell})
 
-    def __init__(self, folder: Path, machines: Sequence[str]) -> None:
-        self._folder = folder
-        self._order = ("", *machines)  # what belongs to no machine comes first
-        self._places: dict[str, tuple[int, int]] = {}
 
-    def __enter__(self) -> Self:
-        self._file = TemporaryFile(dir=self._folder)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._file.close()
-
-    def add(self, machine: str, tables: bytes) -> None:
-        """Add the packed rows of a machine by table, or those of none, whose name is empty."""
-        self._places[machine] = self._file.tell(), len(tables)
-        self._file.write(tables)
-
-    def _rows(self) -> Iterator[tuple[str, Row]]:
-        """Read the table and the cells of each row, in the order of the machines."""
-        for machine in self._order:
-            if machine in self._places:
-                place, size = self._places[machine]
-                self._file.seek(place)
-                for name, rows in unpack(self._file.read(size), dict[str, list[Row]]).items():
-                    yield from ((name, row) for row in rows)
-
-    def write(self) -> None:
-        """Replace the tables in the folder."""
-        columns = {name: dict.fromkeys(text.split()) for name, text in COLUMNS.items()}
-        for name, row in self._rows():
-            columns[name] |= dict.fromkeys(row)
-        with ExitStack() as stack:
-            writers = {}
-            for name, own in columns.items():
-                target = stack.enter_context(replacing(self._folder / f"{name}.csv"))
-                writers[name] = csv.DictWriter(target, own, lineterminator="\n")
-                writers[name].writeheader()
-            for name, row in self._rows():
-                # NaN is a missing value.
-                writers[name].writerow({key: cell for key, cell in row.items() if cell == cell})
+def _rows(parts: Iterable[bytes]) -> Iterator[tuple[str, Row]]:
+    """Yield the table and the cells of each row."""
+    for part in parts:
+        for name, rows in unpack(part, dict[str, list[Row]]).items():
+            yield from ((name, row) for row in rows)

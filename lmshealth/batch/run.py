@@ -12,7 +12,7 @@ from lmshealth._serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Resources, ingest
-from lmshealth.batch.outputs import MachineRecord, Tables, write_pages
+from lmshealth.batch.outputs import MachineRecord, write_pages, write_tables
 from lmshealth.batch.store import Store, StoreError, default_url
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -245,32 +245,30 @@ def _report(
     rows, excluded = dict[str, Summary](), set[str]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    with Tables(out, names) as tables:
-        tables.add("", pack({"refused": refused_rows(refused)}))
-        left = list(machines)
-        for attempt in range(constants.ASSESSMENT_ATTEMPTS):
-            if attempt:
-                failed |= assess_all(left, resources, force=True)
-            force = {machine.name for machine in left} if attempt else ()
-            keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
-            not_updated |= not_recomputed
-            records = (
-                _record(m.name, keys[m.name], files[m.name], store, packed_logs(m, store))
-                for m in left
-            )
-            for name, output in write_pages(records, resources.pool, out):
-                if isinstance(output, str):
-                    failed[name] = output
-                    continue
-                store.publish(name, (keys[name], own_keys[name]), refused_key)
-                tables.add(name, output.tables)
-                excluded.update(output.excluded)
-                rows[name] = output.page.summary
-                resources.progress("reporting", len(rows), len(machines))
-            left = [m for m in left if m.name not in rows and m.name not in failed]
-            if not left:
-                break
-        tables.write()
+    packed = {"": pack({"refused": refused_rows(refused)})}
+    left = list(machines)
+    for attempt in range(constants.ASSESSMENT_ATTEMPTS):
+        if attempt:
+            failed |= assess_all(left, resources, force=True)
+        force = {machine.name for machine in left} if attempt else ()
+        keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
+        not_updated |= not_recomputed
+        records = (
+            _record(m.name, keys[m.name], files[m.name], store, packed_logs(m, store)) for m in left
+        )
+        for name, output in write_pages(records, resources.pool, out):
+            if isinstance(output, str):
+                failed[name] = output
+                continue
+            store.publish(name, (keys[name], own_keys[name]), refused_key)
+            packed[name] = output.tables
+            excluded.update(output.excluded)
+            rows[name] = output.page.summary
+            resources.progress("reporting", len(rows), len(machines))
+        left = [m for m in left if m.name not in rows and m.name not in failed]
+        if not left:
+            break
+    write_tables(out, names, packed)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     return rows, excluded, not_updated | unread | failed
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable
 from datetime import date, datetime
 from functools import partial
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from loky import cpu_count
 
 from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
@@ -45,13 +45,6 @@ def day(value: str) -> date:
 
 def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
     return None if path is None else load_columns(path)
-
-
-def _processors() -> int:
-    """Return the number of processors that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _band(
@@ -115,7 +108,7 @@ SEED = click.option(
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1),
-    callback=lambda ctx, option, count: count or _processors(),
+    callback=lambda ctx, option, count: count or cpu_count(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")

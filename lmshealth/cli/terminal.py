@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 import time
 from collections import Counter
@@ -15,10 +13,10 @@ from textwrap import wrap
 from typing import TYPE_CHECKING, Any
 
 import click
+import msgspec
 from rich import box, progress
 from rich.console import Console
 from rich.table import Table
-from rich.text import Text
 
 from lmshealth.report.text import fixed, number, percent, plain
 
@@ -33,15 +31,9 @@ _NAME = 16
 
 def print_json(content: dict[str, list[Row]]) -> None:
     """Print JSON with null where a number is missing."""
-    click.echo(json.dumps(_without_nan(content), indent=1, allow_nan=False))
-
-
-def _without_nan(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _without_nan(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_without_nan(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    # msgspec writes null for NaN and infinity.
+    encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
+    click.echo(msgspec.json.format(encoded, indent=1))
 
 
 def print_notes(notes: Iterable[str]) -> None:
@@ -125,17 +117,6 @@ def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
     return [row | {"log": names[row["log"]]} for row in rows]
 
 
-class _Rate(progress.ProgressColumn):
-    """Rate per second, or per minute below one per second."""
-
-    def render(self, task: progress.Task) -> Text:
-        """Return the rate; empty until it is measured."""
-        speed = task.finished_speed or task.speed
-        if not speed:
-            return Text("")
-        return Text(f"{speed:.1f}/s" if speed >= 1 else f"{60 * speed:.1f}/min")
-
-
 @contextmanager
 def progress_bars(delay: float = 0.0) -> Iterator[Any]:
     """Show progress bars on standard error if it is a terminal; yield their callback.
@@ -147,7 +128,6 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
-        _Rate(),
         progress.TimeRemainingColumn(),
         console=Console(stderr=True),
         disable=not sys.stderr.isatty(),
@@ -158,7 +138,6 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
             if time.monotonic() < shown_from:
                 return
             if what not in tasks:
-                # Work that is done at the start was cached and does not count for the rate.
                 tasks[what] = bars.add_task(what, total=total, completed=done)
             bars.update(tasks[what], completed=done, total=total)
 

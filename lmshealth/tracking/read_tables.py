@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -97,7 +96,7 @@ def read_estimates(
         _log(path, str(log), rows, known, shapes, terms)
         for (_, log), rows in table.groupby(["stage", "log"], sort=False)
     ]
-    return logs, [*notes, *_order_notes(logs), *_term_notes(table, terms)]
+    return logs, [*notes, *_order_notes(table), *_term_notes(table, terms)]
 
 
 def read_machines(
@@ -223,16 +222,13 @@ def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
         )
 
 
-def _order_notes(logs: Sequence[LogEstimates]) -> list[str]:
+def _order_notes(table: pd.DataFrame) -> list[str]:
     """List machines whose logs are not in the order of time."""
-    machines: dict[str, list[datetime]] = {}
-    for one in logs:
-        if one.metadata.recorded_at is not None:
-            machines.setdefault(str(one.metadata.stage), []).append(one.metadata.recorded_at)
+    logs = table.drop_duplicates(["stage", "log"])
     return [
         f"{machine}: the logs are not in the order of time; they are sorted"
-        for machine, moments in machines.items()
-        if any(a > b for a, b in pairwise(moments))
+        for machine, moments in logs.groupby("stage", sort=False)["recorded_at"]
+        if not moments.is_monotonic_increasing
     ]
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.outputs import MachineRecord, Tables, machine_output
+from lmshealth.batch.outputs import MachineRecord, machine_output, write_tables
 from lmshealth.io.log import Refusal
 from lmshealth.report.tables import COLUMNS, Row, refused_rows
 from tests.assessments import worn
@@ -30,28 +30,22 @@ def effect(mode: str, **more: Any) -> bytes:
 
 def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
     """In whichever order machines are done; those that never come leave the others their place."""
-    with Tables(tmp_path, ["A", "B", "C", "D"]) as tables:
-        for machine in ("C", "A", "D", "B"):
-            tables.add(machine, effect(machine))
-        tables.write()
+    packed = {machine: effect(machine) for machine in ("C", "A", "D", "B")}
+    write_tables(tmp_path, ["A", "B", "C", "D"], packed)
     assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["A", "B", "C", "D"]
 
 
 def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path) -> None:
     """Rows of machines after one that failed are written nevertheless."""
-    with Tables(tmp_path, ["A", "B", "C"]) as tables:
-        for machine in ("C", "B"):
-            tables.add(machine, effect(machine))
-        tables.write()
+    packed = {machine: effect(machine) for machine in ("C", "B")}
+    write_tables(tmp_path, ["A", "B", "C"], packed)
     assert [row["mode"] for row in read(tmp_path / "effects.csv")] == ["B", "C"]
 
 
 def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
     """A column that only some rows have is empty in the others, and comes last."""
-    with Tables(tmp_path, ["A", "B"]) as tables:
-        tables.add("A", effect("roll", note='two\nlines, "quoted"'))
-        tables.add("B", effect("pitch", other=1))
-        tables.write()
+    one, two = effect("roll", note='two\nlines, "quoted"'), effect("pitch", other=1)
+    write_tables(tmp_path, ["A", "B"], {"A": one, "B": two})
     one, two = read(tmp_path / "effects.csv")
     assert list(one) == [*COLUMNS["effects"].split(), "note", "other"]
     assert (one["note"], one["other"]) == ('two\nlines, "quoted"', "")
@@ -61,19 +55,15 @@ def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
 
 def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
     """What ends a line elsewhere does not end the run, nor take another row along."""
-    with Tables(tmp_path, ["A", "B"]) as tables:
-        tables.add("A", effect("one\rtwo"))
-        tables.add("B", effect("pitch"))
-        tables.write()
+    write_tables(tmp_path, ["A", "B"], {"A": effect("one\rtwo"), "B": effect("pitch")})
     lines = (tmp_path / "effects.csv").read_bytes().decode().split("\n")
     assert ["one\rtwo" in lines[1], "pitch" in lines[2]] == [True, True]
 
 
 def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
     """Refused logs are listed, and tables without rows have their headers."""
-    with Tables(tmp_path, []) as tables:
-        tables.add("", pack({"refused": refused_rows([Refusal("a.h5", "empty", "0 bytes")])}))
-        tables.write()
+    refused = pack({"refused": refused_rows([Refusal("a.h5", "empty", "0 bytes")])})
+    write_tables(tmp_path, [], {"": refused})
     assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
     for name, columns in COLUMNS.items():
         head = (tmp_path / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -81,11 +71,10 @@ def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
 
 
 def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> None:
-    """An interrupt leaves the last complete tables, and no other file in the folder."""
+    """An error leaves the last complete tables, and no other file in the folder."""
     (tmp_path / "effects.csv").write_text("as it was")
-    with pytest.raises(KeyboardInterrupt), Tables(tmp_path, ["A"]) as tables:
-        tables.add("A", effect("roll"))
-        raise KeyboardInterrupt
+    with pytest.raises(ValueError):
+        write_tables(tmp_path, ["A", "B"], {"A": effect("roll"), "B": b"damaged"})
     assert [path.name for path in tmp_path.iterdir()] == ["effects.csv"]
     assert (tmp_path / "effects.csv").read_text() == "as it was"
 
