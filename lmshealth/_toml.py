@@ -42,7 +42,7 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
         message = _explained(str(error), table, type_info(kind))
-        raise ValueError(message.lstrip(".")) from error
+        raise ValueError(message.lstrip(".: ")) from error
 
 
 def _explained(error: str, table: Any, schema: Type) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
 from fnmatch import fnmatchcase
@@ -19,6 +19,7 @@ from lmshealth._arrays import FloatArray
 from lmshealth._toml import decode
 from lmshealth.errors import BadStage
 from lmshealth.io.log import Metadata
+from lmshealth.io.refusal import repeated
 from lmshealth.stage import constants
 from lmshealth.stage.degradation_laws import AnyLaw, Unchanging
 from lmshealth.stage.modal_map import ModalMap, read_map
@@ -62,11 +63,19 @@ class ModeSpec(_Part, frozen=True):
         return hash((self.name, self.frequency_hz))
 
 
+def _expect_ascending(name: str, low: float, high: float) -> None:
+    if not low < high:
+        raise ValueError(f"{name} reaches from {low:g} to {high:g} Hz: needed low < high")
+
+
 class WatchedBand(_Part, frozen=True):
     """A narrow band of which only the acceleration level is reported."""
 
     low_hz: Positive
     high_hz: Positive
+
+    def __post_init__(self) -> None:
+        _expect_ascending("the band", self.low_hz, self.high_hz)
 
 
 class Limit(_Part, frozen=True):
@@ -89,6 +98,19 @@ class ParameterSpec(_Part, frozen=True):
     limit: Limit | None = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
     verdict: Name = ""
+
+    def __post_init__(self) -> None:
+        if self.word in constants.RESERVED_WORDS or "+" in self.word:
+            reserved = f"'+' or {', '.join(constants.RESERVED_WORDS)}"
+            raise ValueError(
+                f"{self.word!r} cannot name a parameter in verdict.csv, nor can anything with "
+                f"{reserved}: choose another name, or set verdict"
+            )
+        if twice := repeated(law.kind for law in self.laws):
+            raise ValueError(f"{self.name}: two laws of the kind {twice[0]!r}")
+        if self.limit is not None and self.limit.below >= self.baseline:
+            wrong = f"limit {self.limit.below:g} must lie below the baseline {self.baseline:g}"
+            raise ValueError(f"{self.name}: {wrong}")
 
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
@@ -120,7 +142,11 @@ class ChannelSpec(_Part, frozen=True):
 
     name: Name
     position_m: tuple[float, float, float]
-    direction: tuple[float, float, float]  # of any length
+    direction: tuple[float, float, float]  # of any length but 0
+
+    def __post_init__(self) -> None:
+        if not any(self.direction):
+            raise ValueError(f"the direction of {self.name} has no length")
 
 
 class Covariate(_Part, frozen=True):
@@ -151,6 +177,11 @@ class Decision(_Part, frozen=True):
     max_risk: Share | None = None
     cost_ratio: CostRatio | None = None
     next_service: date | None = None
+
+    def __post_init__(self) -> None:
+        if self.max_risk is not None and self.cost_ratio is not None:
+            both = f"cost_ratio = {self.cost_ratio:g} and max_risk = {self.max_risk:g}"
+            raise ValueError(f"{both} each choose a service date: state one of them")
 
     @property
     def accepted(self) -> float | None:
@@ -185,6 +216,15 @@ class Description(_Part, frozen=True):
     baseline: Baseline = Baseline()
     decision: Decision = Decision()
     usage: Usage = Usage()
+
+    def __post_init__(self) -> None:
+        if self.health_band_hz is not None:
+            _expect_ascending("health_band_hz", *self.health_band_hz)
+        for kind in ("mode", "parameter", "covariate", "channel"):
+            if twice := repeated(part.name for part in getattr(self, kind)):
+                raise ValueError(f"[[{kind}]] names must be unique, twice: {twice[0]!r}")
+        if self.parameter and self.map is None:
+            raise ValueError("[[parameter]] needs a [map] of its effect on the modes")
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,7 +364,6 @@ def load_stage(reference: str) -> Stage:
         raise BadStage(f"{path}: cannot read the stage description: {error.strerror}") from error
     except ValueError as error:
         raise BadStage(f"{path}: {error}") from error
-    _refuse(path, _faults(description))
     digest = hashlib.sha256(content)
     modal_map = None
     if description.map is not None and description.parameter:
@@ -334,65 +373,9 @@ def load_stage(reference: str) -> Stage:
             raise BadStage(f"{path}: map.file: there is no file {map_path}")
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())
-        _refuse(path, _map_faults(description, modal_map))
+        for key, fault in _map_faults(description, modal_map):
+            raise BadStage(f"{path}: {key}: {fault}")
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
-
-
-def _refuse(path: Path, faults: Iterable[tuple[str, str]]) -> None:
-    """Raise the first of the faults, if there is any."""
-    for key, fault in faults:
-        raise BadStage(f"{path}: {key}: {fault}")
-
-
-def _faults(description: Description) -> Iterator[tuple[str, str]]:
-    """Find contradictions between the parts of a description; yield key and message."""
-    for k, one in enumerate(description.channel):
-        if not any(one.direction):
-            yield f"channel[{k}].direction", f"the direction of {one.name} has no length"
-    yield from _common_faults(description)
-    for k, parameter in enumerate(description.parameter):
-        yield from _parameter_faults(k, parameter)
-
-
-def _common_faults(description: Description) -> Iterator[tuple[str, str]]:
-    """Find faults of bands, names, map and decision."""
-    bands: list[tuple[str, tuple[float, float]]] = [
-        (f"watch[{k}]", (band.low_hz, band.high_hz)) for k, band in enumerate(description.watch)
-    ]
-    if description.health_band_hz is not None:
-        bands.append(("health_band_hz", description.health_band_hz))
-    for key, (low, high) in bands:
-        if not low < high:
-            yield key, f"reaches from {low:g} to {high:g} Hz: needed low < high"
-    for kind in ("mode", "parameter", "covariate", "channel"):
-        names = [part.name for part in getattr(description, kind)]
-        for k, name in enumerate(names):
-            if name in names[:k]:
-                yield f"{kind}[{k}].name", f"[[{kind}]] names must be unique, twice: {name!r}"
-    if description.parameter and description.map is None:
-        yield "parameter[0]", "[[parameter]] needs a [map] of its effect on the modes"
-    risk, ratio = description.decision.max_risk, description.decision.cost_ratio
-    if risk is not None and ratio is not None:
-        fault = f"cost_ratio = {ratio:g} and max_risk = {risk:g} each choose a service date"
-        yield "decision.cost_ratio", f"{fault}: state one of them"
-
-
-def _parameter_faults(k: int, parameter: ParameterSpec) -> Iterator[tuple[str, str]]:
-    """Find faults of the k-th parameter."""
-    if parameter.word in constants.RESERVED_WORDS or "+" in parameter.word:
-        fault = f"{parameter.word!r} cannot name a parameter in verdict.csv, nor can anything with "
-        fault += (
-            f"'+' or {', '.join(constants.RESERVED_WORDS)}: choose another name, or set verdict"
-        )
-        yield f"parameter[{k}].{'verdict' if parameter.verdict else 'name'}", fault
-    kinds = [law.kind for law in parameter.laws]
-    for j, kind in enumerate(kinds):
-        if kind in kinds[:j]:
-            yield f"parameter[{k}].law[{j}]", f"{parameter.name}: two laws of the kind {kind!r}"
-    if parameter.limit is not None and parameter.limit.below >= parameter.baseline:
-        wrong = f"limit {parameter.limit.below:g} must lie below the baseline"
-        fault = f"{parameter.name}: {wrong} {parameter.baseline:g}"
-        yield f"parameter[{k}].limit.below", fault
 
 
 def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[str, str]]:
