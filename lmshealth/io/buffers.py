@@ -81,28 +81,19 @@ def blocks(
 class Spool:
     """Collects the samples of one column in blocks.
 
-    Up to a minute of an expected number of samples need no concatenation. The temporary file of a
-    long column has no name and is deleted with the last `Stored` of it.
+    The temporary file of a long column has no name and is deleted with the last `Stored` of it.
     """
 
-    def __init__(self, expected: int = 0) -> None:
-        self._memory = np.empty(expected if 0 < expected <= MINUTE else 0)
+    def __init__(self) -> None:
         self._parts: list[FloatArray] = []
         self._file: IO[bytes] | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        start, self.size = self.size, self.size + block.size
-        # A whole column is kept as it is: to copy it may take longer than to read it.
-        is_whole = block.size == self._memory.size and block.flags.c_contiguous
+        self.size += block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size <= self._memory.size and not is_whole:
-                self._memory[start : self.size] = block
-                return
-            if self._memory.size:
-                self._parts, self._memory = [self._memory[:start]] if start else [], np.empty(0)
             self._parts.append(np.asarray(block, dtype=np.float64))
         if self._file is not None or self.size > MINUTE:
             self._write()
@@ -112,8 +103,6 @@ class Spool:
         if self._file is not None:
             self._file.flush()
             return Stored(self._file, self.size)
-        if self._memory.size:
-            return self._memory[: self.size]
         if len(self._parts) != 1:
             self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
         return self._parts[0]
@@ -138,15 +127,15 @@ class Spool:
 
 def as_samples(values: np.ndarray) -> Samples:
     """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
-    spool = Spool(values.size)
+    spool = Spool()
     spool.append(values)
     return spool.samples()
 
 
 @contextmanager
-def spools(names: Iterable[str], *, expected: int = 0) -> Iterator[dict[str, Spool]]:
+def spools(names: Iterable[str]) -> Iterator[dict[str, Spool]]:
     """Make a spool for each column; where reading fails, their files are closed."""
-    opened = {name: Spool(expected) for name in names}
+    opened = {name: Spool() for name in names}
     try:
         yield opened
     except BaseException:

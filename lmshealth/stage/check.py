@@ -235,39 +235,31 @@ def diagnose(checked: StageCheck) -> tuple[Diagnostic, ...]:
 
 
 def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
-    name, prior = parameter.name, _share(parameter.prior_std)
-    after, unlimited = _share(parameter.usual_std), _share(parameter.endless_std)
-    logs = f"{checked.n_logs} logs of {constants.TYPICAL_DURATION:g} s"
-    if parameter.verdict == "told":
-        text = (
-            f"{name} is identifiable: {logs} reduce its standard deviation to {after}, from "
-            f"{prior} in the prior."
-        )
-    elif parameter.verdict == "longer-logs":
-        text = (
-            f"{name} is identifiable by more or longer logs only: {logs} reduce its standard "
-            f"deviation to {after}, unlimited logs to {unlimited}, from {prior} in the prior."
-        )
+    name, logs = parameter.name, f"{checked.n_logs} logs of {constants.TYPICAL_DURATION:g} s"
+    what, step = "is identifiable", ""
+    if parameter.verdict == "longer-logs":
+        what = "is identifiable by more or longer logs only"
     elif parameter.verdict == "together":
-        text = (
-            f"{name} is identifiable only together with others: {_combination(checked, parameter)} "
-            f"has a standard deviation of {_share(parameter.known_std)}, {name} by itself "
-            f"{unlimited} even after unlimited logs and {prior} in the prior. Track a mode that "
-            "depends on the parameters in another proportion."
+        what = (
+            f"is identifiable only together with others: {_combination(checked, parameter)} has a "
+            f"standard deviation of {_share(parameter.known_std)}, {name} by itself"
         )
-    else:
-        text = (
-            f"{name} is not identifiable: its standard deviation is {after} after {logs}, "
-            f"{unlimited} after unlimited logs and {prior} in the prior. "
-        )
+        step = " Track a mode that depends on the parameters in another proportion."
+    elif parameter.verdict == "not-told":
+        what = "is not identifiable"
+        step = " The modes hardly depend on it: track a mode that depends on it more."
         if parameter.variance_removed(parameter.exact_map_std) >= constants.INFORMED:
-            text += (
-                "Its effect on the modes is less than the map's error (model_std) in the effects "
+            step = (
+                " Its effect on the modes is less than the map's error (model_std) in the effects "
                 f"of the others; with an exact map it would be {_share(parameter.exact_map_std)}. "
                 "Track a mode that depends on it more, or make a better map."
             )
-        else:
-            text += "The modes hardly depend on it: track a mode that depends on it more."
+    std = "" if parameter.verdict == "together" else ": its standard deviation is"
+    text = (
+        f"{name} {what}{std} {_share(parameter.usual_std)} after {logs}, "
+        f"{_share(parameter.endless_std)} after unlimited logs and {_share(parameter.prior_std)} "
+        f"in the prior.{step}"
+    )
     return Diagnostic("parameters", parameter.verdict == "told", text)
 
 

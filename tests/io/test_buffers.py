@@ -124,13 +124,3 @@ def test_a_full_disk_is_refused_with_the_next_step(monkeypatch):
     with pytest.raises(Unusable, match=r"96\d+ bytes .*No space left.*TMPDIR") as caught:
         filled(MINUTE + 1)
     assert caught.value.reason == "too-large"
-
-
-@pytest.mark.parametrize("expected", [10, 300_000, 250_000, 2 * MINUTE])
-def test_a_wrong_expectation_costs_no_sample(expected):
-    """Whatever number of samples a file claims, those that come are kept, and only those."""
-    spool = Spool(expected)
-    for start in range(0, 250_000, 100_000):
-        spool.append(np.arange(start, min(start + 100_000, 250_000)))
-    np.testing.assert_array_equal(spool.samples()[0:250_000], np.arange(250_000))
-    assert spool.samples().size == 250_000

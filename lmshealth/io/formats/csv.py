@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import MINUTE, Samples, spools
+from lmshealth.io.buffers import Samples, spools
 from lmshealth.io.column_map import ColumnMap, CsvLayout
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.refusal import Unusable, corrupt
@@ -265,8 +265,7 @@ def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str,
 def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
     """Read the rows block by block."""
     n_rows = 0
-    # The number of rows is unknown: memory for a minute is touched only as it is filled.
-    with spools(places, expected=MINUTE) as taken, read() as blocks:
+    with spools(places) as taken, read() as blocks:
         for table in blocks:
             text.pending = 0
             for extra in table.columns[text.n_fields :]:

@@ -133,9 +133,8 @@ def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
     for name, channel in wanted.items():
         if channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
-    lengths = [len(channel) for channel in wanted.values()]
-    check_size(8 * sum(lengths), stored)
-    with spools(wanted, expected=max(lengths, default=0)) as taken:
+    check_size(8 * sum(len(channel) for channel in wanted.values()), stored)
+    with spools(wanted) as taken:
         for chunk in file.data_chunks() if wanted else ():
             for name, channel in wanted.items():
                 samples = chunk[channel.group_name][channel.name]
