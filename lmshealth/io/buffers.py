@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import tempfile
 import weakref
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
-from copy import copy
+from collections.abc import Iterator
 from typing import IO
 
 import numpy as np
@@ -21,12 +19,10 @@ BLOCK = 1 << 18
 
 
 class Stored:
-    """Samples in a file of float64, sliced as an array is; the file closes with the last view."""
+    """Samples in a file of float64, sliced as an array is; the file closes with them."""
 
     def __init__(self, file: IO[bytes], size: int) -> None:
-        self._file = file
-        self._factor, self._limit = 1.0, np.inf
-        self._viewed: Stored | None = None
+        self.file = file
         self.size = size
         weakref.finalize(self, file.close)
 
@@ -35,29 +31,11 @@ class Stored:
         start, stop, step = stretch.indices(self.size)
         if step != 1:
             raise ValueError(f"step is {step}, needed consecutive samples")
-        self._file.seek(8 * start)
-        values = np.fromfile(self._file, dtype=np.float64, count=max(stop - start, 0))
-        return in_unit(values, self._factor, self._limit)
-
-    def scaled(self, factor: float, limit: float) -> Stored:
-        """View the samples times a factor, as NaN from the limit on."""
-        view = copy(self)
-        view._factor, view._limit, view._viewed = self._factor * factor, limit, self
-        return view
+        self.file.seek(8 * start)
+        return np.fromfile(self.file, dtype=np.float64, count=max(stop - start, 0))
 
 
 Samples = FloatArray | Stored
-
-
-def in_unit(values: FloatArray, factor: float, limit: float) -> FloatArray:
-    """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    # A damaged float may be so large that its SI value is infinite: missing, without a warning.
-    with np.errstate(over="ignore", invalid="ignore"):
-        scaled = values * factor
-        missing = ~(np.abs(scaled) < limit)
-    if missing.any():
-        scaled[missing] = np.nan
-    return scaled
 
 
 def blocks(
@@ -81,12 +59,12 @@ def blocks(
 class Spool:
     """Collects the samples of one column in blocks.
 
-    The temporary file of a long column has no name and is deleted with the last `Stored` of it.
+    The temporary file of a long column has no name and is deleted with the `Stored` of it.
     """
 
     def __init__(self) -> None:
         self._parts: list[FloatArray] = []
-        self._file: IO[bytes] | None = None
+        self._stored: Stored | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
@@ -95,29 +73,26 @@ class Spool:
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
             self._parts.append(np.asarray(block, dtype=np.float64))
-        if self._file is not None or self.size > MINUTE:
+        if self._stored is not None or self.size > MINUTE:
             self._write()
 
     def samples(self) -> Samples:
         """Return all samples."""
-        if self._file is not None:
-            self._file.flush()
-            return Stored(self._file, self.size)
+        if self._stored is not None:
+            self._stored.file.flush()
+            self._stored.size = self.size
+            return self._stored
         if len(self._parts) != 1:
             self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
         return self._parts[0]
 
-    def close(self) -> None:
-        """Discard the samples."""
-        if self._file is not None:
-            self._file.close()
-
     def _write(self) -> None:
         try:
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+            if self._stored is None:
+                file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+                self._stored = Stored(file, 0)
             for values in self._parts:
-                self._file.write(np.ascontiguousarray(values).data)
+                self._stored.file.write(np.ascontiguousarray(values).data)
         except OSError as error:
             found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
             needed = "set TMPDIR to a folder on a larger disk"
@@ -132,13 +107,13 @@ def as_samples(values: np.ndarray) -> Samples:
     return spool.samples()
 
 
-@contextmanager
-def spools(names: Iterable[str]) -> Iterator[dict[str, Spool]]:
-    """Make a spool for each column; where reading fails, their files are closed."""
-    opened = {name: Spool() for name in names}
-    try:
-        yield opened
-    except BaseException:
-        for spool in opened.values():
-            spool.close()
-        raise
+def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
+    """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
+    spool = Spool()
+    for _, values in blocks(samples):
+        # A damaged float may be so large that its SI value is infinite: missing, no warning.
+        with np.errstate(over="ignore", invalid="ignore"):
+            scaled = values * factor
+            scaled[~(np.abs(scaled) < limit)] = np.nan
+        spool.append(scaled)
+    return spool.samples()

@@ -6,7 +6,6 @@ import hashlib
 import stat
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -14,7 +13,7 @@ import numpy as np
 
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Stored, in_unit
+from lmshealth.io.buffers import Samples, in_unit
 from lmshealth.io.channel_checks import check_signal, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
@@ -191,8 +190,7 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
         limit = np.inf if signal.role == "time" else constants.LARGEST_MAGNITUDE
-        scaled = values.scaled if isinstance(values, Stored) else partial(in_unit, values)
-        series.append(_Series(signal, scaled(signal.factor, limit)))
+        series.append(_Series(signal, in_unit(values, signal.factor, limit)))
     if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
     if not any(item.signal.role in _DYNAMIC for item in series):

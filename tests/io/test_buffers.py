@@ -37,11 +37,9 @@ def test_no_sample_is_passed_over() -> None:
         stored(np.arange(4.0))[::2]
 
 
-def test_a_view_in_another_unit_keeps_the_first() -> None:
-    """Factors multiply, what reaches the limit is NaN, and the file stays open for all views."""
-    on_disk = stored(np.array([1.0, -2.0, 3000.0, np.inf]))
-    scaled = on_disk.scaled(1e-3, 2.0).scaled(2.0, 5.0)
-    del on_disk
+def test_samples_on_disk_are_converted() -> None:
+    """The factor multiplies, and what reaches the limit is NaN."""
+    scaled = in_unit(stored(np.array([1.0, -2.0, 3000.0, np.inf])), 2e-3, 5.0)
     np.testing.assert_allclose(scaled[:], [2e-3, -4e-3, np.nan, np.nan])
 
 
@@ -116,6 +114,9 @@ class Full:
     def write(self, data):
         """Fail as the system does."""
         raise OSError(errno.ENOSPC, "No space left on device")
+
+    def close(self):
+        """Close."""
 
 
 def test_a_full_disk_is_refused_with_the_next_step(monkeypatch):

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, spools
+from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, CsvLayout
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.refusal import Unusable, corrupt
@@ -265,7 +265,8 @@ def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str,
 def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
     """Read the rows block by block."""
     n_rows = 0
-    with spools(places) as taken, read() as blocks:
+    taken = {name: Spool() for name in places}
+    with read() as blocks:
         for table in blocks:
             text.pending = 0
             for extra in table.columns[text.n_fields :]:

@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, MINUTE, spools
+from lmshealth.io.buffers import BLOCK, MINUTE, Spool
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
 from lmshealth.io.metadata import KEYS, as_text
@@ -116,15 +116,15 @@ def _content(file: Any, stream: Guarded, columns: ColumnMap) -> Content:
     stored = stream.seek(0, SEEK_END)
     check_size(8 * sum(dataset.size for dataset in chosen.values()), stored)
     stream.now = "samples"
-    with spools(chosen) as taken:
-        for name, dataset in chosen.items():
-            # Beyond a minute in parts of whole chunks: each is unpacked only once.
-            step = max(1, dataset.size)
-            if dataset.size > MINUTE:
-                chunk = dataset.chunks[0] if dataset.chunks else 1
-                step = -(-BLOCK // chunk) * chunk
-            for start in range(0, dataset.size, step):
-                taken[name].append(dataset[start : start + step])
+    taken = {name: Spool() for name in chosen}
+    for name, dataset in chosen.items():
+        # Beyond a minute in parts of whole chunks: each is unpacked only once.
+        step = max(1, dataset.size)
+        if dataset.size > MINUTE:
+            chunk = dataset.chunks[0] if dataset.chunks else 1
+            step = -(-BLOCK // chunk) * chunk
+        for start in range(0, dataset.size, step):
+            taken[name].append(dataset[start : start + step])
     read = {name: spool.samples() for name, spool in taken.items()}
     return Content(read, metadata, tuple(names))
 

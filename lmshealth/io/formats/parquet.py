@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-from lmshealth.io.buffers import BLOCK, MINUTE, spools
+from lmshealth.io.buffers import BLOCK, MINUTE, Spool
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size, library, not_numeric, wanted
 
@@ -39,10 +39,10 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         # Up to a minute at once, beyond it in blocks; nulls become NaN.
         size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
         batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
-        with spools(chosen) as taken:
-            for batch in batches:
-                for name, spool in taken.items():
-                    spool.append(batch.column(name).to_numpy(zero_copy_only=False))
+        taken = {name: Spool() for name in chosen}
+        for batch in batches:
+            for name, spool in taken.items():
+                spool.append(batch.column(name).to_numpy(zero_copy_only=False))
     read = {name: spool.samples() for name, spool in taken.items()}
     return Content(read, metadata, tuple(schema.names))
 

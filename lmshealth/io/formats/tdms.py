@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, spools
+from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
@@ -134,17 +134,17 @@ def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
         if channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
     check_size(8 * sum(len(channel) for channel in wanted.values()), stored)
-    with spools(wanted) as taken:
-        for chunk in file.data_chunks() if wanted else ():
-            for name, channel in wanted.items():
-                samples = chunk[channel.group_name][channel.name]
-                if len(samples):
-                    taken[name].append(samples[:])
+    taken = {name: Spool() for name in wanted}
+    for chunk in file.data_chunks() if wanted else ():
         for name, channel in wanted.items():
-            if taken[name].size != len(channel):
-                found = f"{taken[name].size} of {len(channel)} samples are there"
-                raise Unusable("corrupt", f"{name}: {found}")
-        return {name: spool.samples() for name, spool in taken.items()}
+            samples = chunk[channel.group_name][channel.name]
+            if len(samples):
+                taken[name].append(samples[:])
+    for name, channel in wanted.items():
+        if taken[name].size != len(channel):
+            found = f"{taken[name].size} of {len(channel)} samples are there"
+            raise Unusable("corrupt", f"{name}: {found}")
+    return {name: spool.samples() for name, spool in taken.items()}
 
 
 TDMS = Format("TDMS", (".tdms",), lambda head: head.startswith(_MAGIC), _load)
