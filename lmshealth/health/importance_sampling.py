@@ -14,7 +14,7 @@ from lmshealth.health.laplace import LogProbability
 
 # Degrees of freedom of the proposal's Student's t: heavier tails than a posterior has.
 _FREEDOM = 5
-_N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 3
+_N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
 # Effective share of the draws at which the proposal is good enough for the last round.
 _GOOD_SHARE = 0.3
 
@@ -61,7 +61,7 @@ def importance_sample_to_ess(
 ) -> WeightedDraws:
     """Repeat `importance_sample` with three times the draws until 400 of them are effective.
 
-    Raises `NotConverged`, with the points, if the third attempt has fewer.
+    Raises `NotConverged`, with the points, if the fourth attempt has fewer.
     """
     for _ in range(_MAX_ATTEMPTS):
         found = importance_sample(log_probability, start, rng, n)

@@ -162,9 +162,9 @@ def test_too_few_draws_are_repeated() -> None:
 
 
 def test_what_stays_too_little_is_refused_with_its_points() -> None:
-    """After three times less than 400 effective draws are an error with their number."""
+    """After four times less than 400 effective draws are an error with their number."""
     with pytest.raises(NotConverged, match=r"of 270 by importance.*needed are 400") as caught:
-        importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 30)
+        importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 10)
     assert np.shape(caught.value.chains) == (270, 2)
 
 
