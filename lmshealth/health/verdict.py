@@ -99,7 +99,7 @@ def judge(
     >>> health = lmshealth.infer(track, stage, seed=0, epochs=[len(track.recorded_at) - 1])
     >>> judgement = lmshealth.judge(stage, history, health, track)
     >>> print(f"{judgement.verdict}, {judgement.probability:.1%}")
-    both, 95.5%
+    both, 94.1%
     >>> judgement.why.split(".")[0]
     'Guide preload is at 71 % of its baseline value (90 %: 67 to 74 %)'
     >>> lmshealth.judge(stage, history, None).why

@@ -91,7 +91,7 @@ def test_identifiable_health_is_sharp(health: Health) -> None:
     low, high = health.quantile(np.array([0.005, 0.995]))
     assert ((low[-1] < np.exp(TRUTH)) & (np.exp(TRUTH) < high[-1])).all()
     assert health.converged.all()
-    assert (health.informed > 0.9).all()
+    assert (health.informed > 0.8).all()  # the map may be wrong by 15 %
     assert (health.samples[0].mean(axis=0) > health.samples[1].mean(axis=0)).all()
 
 
@@ -312,9 +312,16 @@ def make_stage_with(stage: Stage, low: float, high: float = 1.2) -> Stage:
 def test_the_influence_of_the_prior_is_reported(
     tmp_path: Path, worn: Track, health: Health
 ) -> None:
-    """Priors twice as wide hardly move informed parameters, and widen others by two."""
+    """Priors twice as wide hardly move informed parameters, and widen others by two.
+
+    A doubtful map leaves more to the prior than an exact one.
+    """
     assert (np.abs(health.prior_shift) < 0.2).all()
-    assert (np.abs(health.prior_ratio - 1) < 0.05).all()
+    assert (np.abs(health.prior_ratio - 1) < 0.25).all()
+    exact = infer(worn, make_stage(tmp_path / "exact", model_std=0.0), 5)
+    assert (np.abs(exact.prior_shift) < 0.05).all()
+    assert (np.abs(exact.prior_ratio - 1) < 0.02).all()
+    assert (exact.informed > 0.9).all()
     blind = infer(worn, make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)), 6, epochs=[2])
     ratio = blind.prior_ratio[0, 2]
     # The foot has no sensitivity; its doubled prior is cut a little at the map.
@@ -491,8 +498,9 @@ def test_unexplained_drifts_inform_no_parameter(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_posterior_at_the_edge_of_the_map_is_a_bound(stage: Stage) -> None:
+def test_a_posterior_at_the_edge_of_the_map_is_a_bound(tmp_path: Path) -> None:
     """Drifts further than the map reaches pile up at its end, reported by parameter."""
+    stage = make_stage(tmp_path, model_std=0.0)
     edge = np.log([AXES["guide_preload"][0], 0.9])
     beyond = infer(epochs([1.3 * true_drift(NAMES, edge)[:2]], COV), stage, 1)
     assert beyond.at_edge[-1].tolist() == [True, False]

@@ -146,9 +146,9 @@ def test_laws_and_health_are_those_of_importance_sampling(
     density = LifeDensity(likelihood, scenario, likelihood.grid)
     rng = np.random.default_rng(5)
     drawn = importance_sample_to_ess(
-        density.log_probability, density.scenario.draw(rng, 600), rng, 4000
+        density.log_probability, density.scenario.draw(rng, 600), rng, 12000
     )
-    y = drawn.resampled(rng, 4000)
+    y = drawn.resampled(rng, 12000)
     now = np.array([likelihood.data.now])
     theta = scenario.natural(y)
     health = scenario.health(theta, now) * np.exp(density.deviations(y, now, rng)[0])
@@ -156,7 +156,7 @@ def test_laws_and_health_are_those_of_importance_sampling(
     (way,) = found.scenarios
     draws = np.concatenate([found.health, way.chains[..., :2]], axis=2).reshape(-1, 4)
     # Drawn twice: with weights, then by these.
-    ess = both_ess(found.ess, both_ess(drawn.ess, 4000))
+    ess = both_ess(found.ess, both_ess(drawn.ess, 12000))
     assert ess > 500
     assert agree(known, draws, ess)
     assert not agree(known, 1.01 * draws, ess)  # negative control
@@ -243,7 +243,7 @@ def test_health_is_its_law_times_its_deviation(found: LifePosterior) -> None:
     np.testing.assert_allclose(by_law * np.exp(off), found.health.reshape(-1, 2), rtol=1e-12)
     np.testing.assert_array_equal(way.chains.reshape(-1, 4), theta)
     moving = rate[:, 0] > 0
-    assert 0.02 < moving.mean() < 0.9
+    assert 100 < moving.sum() < 0.9 * moving.size
     assert (off[moving] != 0).all()
     assert (off[~moving] == 0).all()
 
