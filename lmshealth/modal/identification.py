@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -32,6 +33,7 @@ from lmshealth.modal.ambient.cluster_modes import (
     refuse_close_modes,
 )
 from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search, split_groups
+from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
@@ -147,21 +149,13 @@ def read_ambient(
     stretches, whole = _transform(log, used, targets, band)
     tested: list[tuple[str, float, float]] = []
     sought: tuple[Found, ...] = ()
-    top = _TOP * log.sample_rate
-    fits: list[ClusterFit] = []
     if stage is None:
-        sought, tested = _search(log, used, stretches, whole, band, progress)
-        groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
-        for part in sought:
-            for group in split_groups(part.modes):
-                near = neighbourhood(group, part.modes)
-                groups[near] = part, (*groups.get(near, (part, ()))[1], *group)
-        for k, (near, (part, group)) in enumerate(groups.items()):
-            progress("fitting", k, len(groups))
-            fits += _fit_group(part, group, near, top)
-        progress("fitting", len(groups), len(groups))
+        explore = partial(_explore, log, used, stretches, whole, band, progress)
+        sought, tested, fits = explore()
+        if suspected := _lines_at_modes(fits):
+            sought, tested, fits = explore(suspected)
     else:
-        fits, known, more = _fit_described(whole, targets, top)
+        fits, known, more = _fit_described(whole, targets, _TOP * log.sample_rate)
     refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
     left_out = [
         Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
@@ -260,6 +254,41 @@ def _transform(
     )
 
 
+def _lines_at_modes(fits: Sequence[ClusterFit]) -> list[float]:
+    """Return the lines in Hz that fits masked at a resonance: it may be a harmonic that wanders."""
+    suspected: list[float] = []
+    for fit in fits:
+        if fit.modes is not None and fit.modes.lines:
+            lines, modes = [line.frequency for line in fit.modes.lines], fit.modes.modes
+            if near_lines(modes.frequency, modes.damping_ratio, lines).any():
+                suspected += lines
+    return suspected
+
+
+def _explore(
+    log: Log,
+    used: tuple[Channel, ...],
+    stretches: Sequence[Segment],
+    whole: LogSpectra,
+    band: tuple[float, float] | None,
+    progress: Callable[[str, int, int], None],
+    suspected: Sequence[float] = (),
+) -> tuple[tuple[Found, ...], list[tuple[str, float, float]], list[ClusterFit]]:
+    """Search a band for modes and fit them; return both, and the lines of Thomson's test."""
+    sought, tested = _search(log, used, stretches, whole, band, progress, suspected)
+    groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
+    for part in sought:
+        for group in split_groups(part.modes):
+            near = neighbourhood(group, part.modes)
+            groups[near] = part, (*groups.get(near, (part, ()))[1], *group)
+    fits: list[ClusterFit] = []
+    for k, (near, (part, group)) in enumerate(groups.items()):
+        progress("fitting", k, len(groups))
+        fits += _fit_group(part, group, near, _TOP * log.sample_rate)
+    progress("fitting", len(groups), len(groups))
+    return sought, tested, fits
+
+
 def _search(
     log: Log,
     channels: tuple[Channel, ...],
@@ -267,6 +296,7 @@ def _search(
     spectra: LogSpectra,
     band: tuple[float, float] | None,
     progress: Callable[[str, int, int], None],
+    suspected: Sequence[float],
 ) -> tuple[tuple[Found, ...], list[tuple[str, float, float]]]:
     """Search the parts of the band for modes, and the band for the lines of Thomson's test."""
     duration, usable = spectra.duration, constants.USABLE * log.sample_rate
@@ -298,7 +328,7 @@ def _search(
     for k, (first, last) in enumerate(pairwise(edges)):
         progress("searching", k, len(edges) - 1)
         ends = max(low, first / _BEYOND), min(high, last * _BEYOND)
-        part = search(cut, recording, *ends, frequencies)
+        part = search(cut, recording, *ends, frequencies, suspected)
         number = 1 + sum(len(one.modes) for one in parts)
         modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, number)]
         if parts:

@@ -26,7 +26,7 @@ from lmshealth.modal.ambient.joint_model import (
     floor_ratio,
 )
 from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
-from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
+from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, near_lines
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
@@ -81,15 +81,16 @@ def search(
     low: float,
     high: float,
     lines: Sequence[float] = (),
+    suspected: Sequence[float] = (),
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    ``recording`` is the longest segment, to recognise harmonics. Lines are masked in both. Channels
-    that no common modes explain are left out.
+    ``recording`` is the longest segment, to recognise harmonics. Lines are masked in both. There
+    may be further ones where ``suspected``. Channels that no common modes explain are left out.
     """
     every = spectra.channels
     while True:
-        model, harmonics, after, poles = _explain(spectra, recording, low, high)
+        model, harmonics, after, poles = _explain(spectra, recording, low, high, suspected)
         kept = _consistent(model)
         if len(kept) == len(spectra.channels):
             break
@@ -98,9 +99,7 @@ def search(
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
     wide = (width > LINE_WIDTH) & (width * model.f * spectra.duration > 1)
-    for line in lines:
-        foot = np.abs(model.f / line - 1) < LINE_WIDTH + model.zeta
-        wide &= ~(foot & (width < _FOOT * LINE_WIDTH))
+    wide &= ~(near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH))
     modes = tuple(
         Target(
             f"mode_{number}",
@@ -116,7 +115,11 @@ def search(
 
 
 def _explain(
-    spectra: LogSpectra, recording: SegmentTransforms, low: float, high: float
+    spectra: LogSpectra,
+    recording: SegmentTransforms,
+    low: float,
+    high: float,
+    suspected: Sequence[float],
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -127,7 +130,7 @@ def _explain(
         ]
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
         model = _select(_start(_bin(spectra, candidates, low, high), candidates).refined(6))
-        harmonic = find_harmonic(model, recording, harmonics)
+        harmonic = find_harmonic(model, recording, harmonics, suspected)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
             return model, tuple(harmonics), spectra, poles
         harmonics.append(harmonic)

@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import JointModel
+from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import SegmentTransforms
 
 # Half widths of the filter, and the widest search for its edges, as fractions of the frequency.
@@ -50,20 +51,34 @@ class Harmonic:
 
 
 def find_harmonic(
-    model: JointModel, recording: SegmentTransforms, known: Sequence[Harmonic] = ()
+    model: JointModel,
+    recording: SegmentTransforms,
+    known: Sequence[Harmonic] = (),
+    lines: Sequence[float] = (),
 ) -> Harmonic | None:
     """Return the clearest harmonic that wanders among the modes; None if there is none.
 
-    Lines of the recording are masked. In the bands of known harmonics less evidence is needed:
-    their direction may vary.
+    Lines that Thomson's test found are masked in the recording. Less evidence is needed in the
+    bands of known harmonics, whose direction may vary, and at other lines, in Hz.
     """
-    found = [one for i in range(model.f.size) if (one := _test(model, i, recording)) is not None]
-    for sigmas, harmonic in sorted(found, key=lambda one: one[0]):
-        near = any(harmonic.low < h.high and h.low < harmonic.high for h in known)
+    at_line = near_lines(model.f, model.zeta, lines)
+    found = [
+        (*one, bool(at_line[i]))
+        for i in range(model.f.size)
+        if (one := _test(model, i, recording)) is not None
+    ]
+    for sigmas, harmonic, near in sorted(found, key=lambda one: one[0]):
+        near |= any(harmonic.low < h.high and h.low < harmonic.high for h in known)
         needed = constants.WANDERING_SIGMAS / (2 if near else 1)
         if sigmas < -needed:
             return harmonic
     return None
+
+
+def near_lines(f: FloatArray, zeta: FloatArray, lines: Sequence[float]) -> BoolArray:
+    """Return which modes have one of the lines in Hz at their resonance, shape ``(n_modes,)``."""
+    apart = np.abs(f[:, None] / np.asarray(lines) - 1)
+    return np.asarray((apart < LINE_WIDTH + zeta[:, None]).any(axis=1))
 
 
 def _test(model: JointModel, i: int, recording: SegmentTransforms) -> tuple[float, Harmonic] | None:
