@@ -30,7 +30,7 @@ from lmshealth.stage.description import Stage
     required=True,
     help="Stage description: a .toml file or a shipped name; may be given several times.",
 )
-@options.out_option("Folder for tables and report.", options.FOLDER)
+@options.out_option(type=options.FOLDER, help="Folder for tables and report.")
 @options.store_option(
     help="Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
 )
@@ -72,7 +72,7 @@ def run(
     "report --store postgresql://me@host/fleet --out pages/ --pdf",
 )
 @options.store_option(required=True, help="Store that `run` has filled.")
-@options.out_option("Folder of the pages.", options.FOLDER)
+@options.out_option(type=options.FOLDER, help="Folder of the pages.")
 @options.WORKERS
 @options.PDF
 @click.pass_context

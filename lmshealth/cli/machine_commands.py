@@ -46,7 +46,7 @@ _TABLES = ("track", "track_cov", "effects", "events", "refused")
 )
 @click.argument("table", metavar="MODES.csv", type=options.TABLE)
 @options.stage_option()
-@options.out_option("Table of the track.")
+@options.out_option(help="Table of the track.")
 @options.COV
 @options.MAINTENANCE
 @click.option("--track-cov", type=options.OUT, help="Table of the covariances of the drifts.")
@@ -110,7 +110,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 )
 @click.argument("table", metavar="TRACK.csv", type=options.TABLE)
 @options.stage_option(required=True)
-@options.out_option("Table of the health parameters.")
+@options.out_option(help="Table of the health parameters.")
 @click.option(
     "--cov",
     type=options.TABLE,
@@ -202,7 +202,7 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
 )
 @click.argument("table", metavar="MODES.csv", type=options.TABLE)
 @options.stage_option(required=True)
-@options.out_option("Table of the remaining life.")
+@options.out_option(help="Table of the remaining life.")
 @options.COV
 @options.MAINTENANCE
 @click.option(

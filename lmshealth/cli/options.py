@@ -71,6 +71,11 @@ stage_option = partial(
     metavar="TEXT",
     help="Stage description: a .toml file or a shipped name.",
 )
+out_option = partial(click.option, "--out", required=True, type=OUT)
+# Of the store; addresses in arguments are visible to all users.
+store_option = partial(
+    click.option, "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL"
+)
 _COLUMNS = click.option(
     "--columns", type=click.Path(), callback=_column_map, help="Column map of the export."
 )
@@ -117,18 +122,6 @@ PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stag
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options by which logs are read: --columns and --max-memory (bytes)."""
     return _COLUMNS(_MAX_MEMORY(command))
-
-
-def out_option(text: str, kind: click.Path = OUT) -> Callable[[Any], Any]:
-    """Return the required option of the output."""
-    return click.option("--out", required=True, type=kind, help=text)
-
-
-def store_option(**more: Any) -> Callable[[Any], Any]:
-    """Return the option of the store; addresses in arguments are visible to all users."""
-    return click.option(
-        "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL", **more
-    )
 
 
 def format_option(*styles: str) -> Callable[[Any], Any]:

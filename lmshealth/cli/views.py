@@ -307,7 +307,8 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
         for speed in speeds:
             own = at.get((band, speed), [])
             is_line = key == "magnitude_mm_s2" and any(row["line"] for row in own)
-            level = _mean([row[key] for row in own])
+            mean = sum(row[key] for row in own) / max(len(own), 1)
+            level = number(mean, 3 if mean >= 0.1 else 2) if own else ""
             cell["unknown" if speed < 0 else f"{speed:g}"] = level + ("~" if is_line else " ")
         cell["grows"] = "–"
         if row["grows"] is not None:
@@ -334,11 +335,6 @@ def _print_places(rows: Sequence[Row]) -> None:
 
 def _range(values: Sequence[float]) -> str:
     return " to ".join(dict.fromkeys(f"{end:.0f}" for end in (min(values), max(values))))
-
-
-def _mean(values: Sequence[float]) -> str:
-    mean = sum(values) / len(values) if values else 0.0
-    return number(mean, 3 if mean >= 0.1 else 2) if values else ""
 
 
 # --- Stage descriptions and plans ---

@@ -187,12 +187,32 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
 
 def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
     """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
+    baselines = {spec.name: spec.baseline for spec in stage.parameters}
+    past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
+    travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
+    limits = []
+    for k, name in enumerate(prognosis.parameters):
+        baseline = baselines.get(name, 1.0)
+        wait = quantiles(days[:, k], constants.RUL_LEVELS)
+        limits.append(
+            LimitLife(
+                parameter=name,
+                limit=float(prognosis.limits[k]),
+                travel=quantiles(travel[:, k], constants.RUL_LEVELS),
+                days=wait,
+                dates=tuple(day_after(prognosis, one) for one in wait),
+                already_past=float(past[k]),
+                beyond_horizon=float(beyond[k]),
+                baseline=baseline,
+                health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
+            )
+        )
     return Life(
         stage=prognosis.stage,
         recorded_at=prognosis.recorded_at,
         travel=prognosis.travel,
         horizon=prognosis.horizon,
-        limits=tuple(_limits(prognosis, stage)),
+        limits=tuple(limits),
         laws=prognosis.laws,
         undetermined=prognosis.unidentifiable,
     )
@@ -248,24 +268,4 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             below_limit=below,
             baseline=specs[name].baseline,
             unit=specs[name].unit,
-        )
-
-
-def _limits(prognosis: Prognosis, stage: Stage) -> Iterator[LimitLife]:
-    baselines = {spec.name: spec.baseline for spec in stage.parameters}
-    past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
-    travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
-    for k, name in enumerate(prognosis.parameters):
-        baseline = baselines.get(name, 1.0)
-        wait = quantiles(days[:, k], constants.RUL_LEVELS)
-        yield LimitLife(
-            parameter=name,
-            limit=float(prognosis.limits[k]),
-            travel=quantiles(travel[:, k], constants.RUL_LEVELS),
-            days=wait,
-            dates=tuple(day_after(prognosis, one) for one in wait),
-            already_past=float(past[k]),
-            beyond_horizon=float(beyond[k]),
-            baseline=baseline,
-            health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
         )

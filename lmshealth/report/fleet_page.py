@@ -83,7 +83,6 @@ def write_index(
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
         states=Counter(one.state for one in ranked),
         kinds=Counter(one.service.kind for one in ranked),
-        bar=constants.FLEET_BAR,
         months=_months(ranked, newest) if script else [],
         newest=newest,
         refused=by_reason,

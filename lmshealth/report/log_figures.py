@@ -157,11 +157,7 @@ def spectra_size(
     summary: SpectraSummary, modes: Modes, sought: Sequence[Found] = ()
 ) -> tuple[float, float]:
     """Return the size of `plot_spectra` in inches."""
-    return _size(_n_panels(summary, sought), modes)
-
-
-def _n_panels(summary: SpectraSummary, sought: Sequence[Found]) -> int:
-    return len(summary.channels) + bool(len(summary.singular)) + bool(sought)
+    return _size(len(summary.channels) + bool(len(summary.singular)) + bool(sought), modes)
 
 
 def plot_spectra(
@@ -173,7 +169,7 @@ def plot_spectra(
 ) -> Figure:
     """Plot the spectrum of each channel with its fit, lines, modes and what was refused."""
     middle = (summary.edges[1:] + summary.edges[:-1]) / 2
-    n = _n_panels(summary, sought)
+    n = len(summary.channels) + bool(len(summary.singular)) + bool(sought)
     panels = list(figure.subplots(n, sharex=True, squeeze=False)[:, 0])
     level, fitted, singular = (
         10 ** (np.asarray(part, dtype=float) / 10)
@@ -417,14 +413,11 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     places = ax.transAxes.inverted().transform(points)[:, 0]
     moved = isotonic_regression(places - steps).x.clip(0, None) + steps
     style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 8}
-    style |= {
-        "xycoords": ax.get_xaxis_transform(),
-        "textcoords": ("axes fraction", "offset points"),
-    }
+    across, ends = ax.get_xaxis_transform(), ("axes fraction", "offset points")
     for (f, text, colour), x in zip(labels, moved.tolist(), strict=True):
         text = figures.plain_label(text.replace("\n", "  ") if upright else text)
         arrow = {"arrowstyle": "-", "color": colour, "lw": 0.7, "shrinkA": 0, "shrinkB": 0}
-        ax.annotate(text, (f, 1), (x, 16), color=colour, arrowprops=arrow, **style)
+        ax.annotate(text, (f, 1), (x, 16), across, ends, color=colour, arrowprops=arrow, **style)
 
 
 def _notes(modes: Modes) -> list[str]:

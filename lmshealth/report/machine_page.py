@@ -173,10 +173,6 @@ def _health_content(assessment: Assessment) -> dict[str, Any]:
         "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
         # Laws without parameters to sample, and improbable ones, have no chains.
         "chains": prognosis is not None and bool(np.isfinite(prognosis.ess)),
-        "walk_share": constants.WALK_SHARE,
-        "correlation_shown": constants.CORRELATION_SHOWN,
-        "scale_shown": constants.SCALE_SHOWN,
-        "unfolded": constants.REFUSED_UNFOLDED,
     }
 
 
@@ -261,21 +257,20 @@ def _track_pictures(
 ) -> dict[tuple[str, ...], Any]:
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
     draw: dict[tuple[str, ...], Any] = {}
-    own: dict[str, Any]
+    lives: dict[str, Any] = {"history": history, "track": track}
     for mode in _seen(history):
-        own = {"history": history, "track": track, "mode": mode}
-        draw["frequency", mode] = partial(figures.plot_frequencies, **own)
-        draw["damping", mode] = partial(figures.plot_damping, **own)
+        draw["frequency", mode] = partial(figures.plot_frequencies, **lives, mode=mode)
+        draw["damping", mode] = partial(figures.plot_damping, **lives, mode=mode)
     if waterfall is not None and history.has_odometer:
         moved = None
         if track is not None:
             moved = covariate_effects.covariate_shifts(history, track, assessment.stage)
-        own = {"waterfall": waterfall, "history": history, "track": track, "moved": moved}
-        draw["waterfall", "all"] = partial(figures.plot_waterfall, **own)
+        lives |= {"waterfall": waterfall, "moved": moved}
+        draw["waterfall", "all"] = partial(figures.plot_waterfall, **lives)
     for one in influences:
         if one.values.size:
-            plot = partial(figures.plot_influence, influence=one, history=history)
-            draw["influence", one.covariate, one.mode] = plot
+            key = "influence", one.covariate, one.mode
+            draw[key] = partial(figures.plot_influence, influence=one, history=history)
     if track is not None and _nis(track) is not None:
         draw["nis", "all"] = partial(figures.plot_nis, track=track)
     return draw

@@ -12,7 +12,7 @@ from typing import Any
 
 from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
-from lmshealth.report import text
+from lmshealth.report import constants, text
 
 _FILTERS = (
     *(text.change, text.fixed, text.interval, text.km, text.law, text.moment, text.number),
@@ -46,7 +46,7 @@ def _environment() -> Any:
         lstrip_blocks=True,
     )
     pages.filters |= {function.__name__: function for function in (*_FILTERS, place)}
-    pages.globals["covariate"] = text.covariate
+    pages.globals |= {"covariate": text.covariate, "constants": constants}
     return pages
 
 

@@ -60,7 +60,7 @@ COLUMNS = {
     "warnings": "stage recorded_at code severity where what what_to_do",
 }
 
-# Tables of single logs and of plans.
+# Tables of single logs, of plans and of stage descriptions.
 LOG_COLUMNS = {
     "error": "log channel velocity_mm_s duration_s min_um max_um std_um mean_um n_harmonics "
     "bandwidth_hz lowest_hz highest_hz max_magnitude_um strongest_hz share_explained floor_nm "
@@ -79,6 +79,8 @@ LOG_COLUMNS = {
     "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
     "lines": "frequency_hz amplitude unit kind channel",
     "mac": "log mode_a mode_b mac",
+    "sensitivities": "mode parameter at_baseline at_limits",
+    "correlations": "parameter_a parameter_b correlation",
 }
 
 Row = dict[str, Any]
@@ -109,10 +111,9 @@ def machine_tables(
         life = summarise_life(assessment.prognosis, assessment.stage)
         rows["prognosis"] = prognosis_rows(life, assessment.service())
     found = assessment.judgement
-    verdict = found.stage, _iso(found.recorded_at), found.verdict, found.probability
-    rows["verdict"] = _rows("verdict", [verdict])
+    own = found.stage, _iso(found.recorded_at)
+    rows["verdict"] = _rows("verdict", [(*own, found.verdict, found.probability)])
     rows["refused"] = refused_rows(assessment.refused)
-    own = (found.stage, _iso(found.recorded_at))
     rows["warnings"] = _rows("warnings", [(*own, *astuple(one)) for one in notices(assessment)])
     return rows
 
@@ -274,6 +275,11 @@ def prognosis_rows(
 
     ``before`` is a day with the probabilities that a limit is reached before it: extra columns.
     """
+    every = service.inspect_every / _KM
+    of_service = (
+        *(service.kind, service.by, service.risk, service.inspect_by),
+        *(every if np.isfinite(every) else None, service.earliest_end),
+    )
     rows = []
     for j, one in enumerate(life.limits):
         days = np.array(one.days)
@@ -284,7 +290,7 @@ def prognosis_rows(
             *(None if np.isinf(value) else value for value in quantiles),
             next((level for level, wait in pairs if np.isinf(wait)), None),
             *(one.beyond_horizon, one.already_past),
-            *(_service_cells(service) if one.parameter == "any" else [None] * 6),
+            *(of_service if one.parameter == "any" else [None] * 6),
         )
         (row,) = _rows("prognosis", [values])
         if before is not None:
@@ -293,14 +299,6 @@ def prognosis_rows(
             row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows
-
-
-def _service_cells(service: Service) -> tuple[Any, ...]:
-    every = service.inspect_every / _KM
-    return (
-        *(service.kind, service.by, service.risk, service.inspect_by),
-        *(every if np.isfinite(every) else None, service.earliest_end),
-    )
 
 
 def error_row(log: str, error: FollowingError) -> Row:
@@ -417,25 +415,20 @@ def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, l
         "seconds_per_log": TYPICAL_DURATION,
     }
     sensitivities = [
-        {
-            "mode": mode,
-            "parameter": name,
-            "at_baseline": float(examined.slopes[i, j]),
-            "at_limits": float(examined.limit_slopes[i, j]),
-        }
+        (mode, name, float(examined.slopes[i, j]), float(examined.limit_slopes[i, j]))
         for i, mode in enumerate(examined.informative)
         for j, name in enumerate(names)
     ]
     correlations = [
-        {"parameter_a": a, "parameter_b": b, "correlation": float(examined.correlation[i, j])}
-        for (i, a), (j, b) in combinations(enumerate(names), 2)
+        (names[i], names[j], float(examined.correlation[i, j]))
+        for i, j in combinations(range(len(names)), 2)
     ]
     return {
         "stage": [stage],
         "modes": [_mode_row(check) for check in examined.modes],
         "parameters": [_parameter_row(check) for check in examined.parameters],
-        "sensitivities": sensitivities,
-        "correlations": correlations,
+        "sensitivities": _rows("sensitivities", sensitivities),
+        "correlations": _rows("correlations", correlations),
         "findings": [asdict(finding) for finding in found],
     }
 

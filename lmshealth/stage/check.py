@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Literal
@@ -16,6 +16,7 @@ from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of
+from lmshealth.stage.modal_map import ModalMap
 
 # Values of the column `verdict` of `lmshealth stage`.
 Verdict = Literal["told", "longer-logs", "together", "not-told"]
@@ -111,41 +112,36 @@ class StageCheck(ReadOnly):
 
 def check_stage(stage: Stage) -> StageCheck:
     """Check a stage description, with or without health parameters."""
-    if stage.modal_map is None:
+    modal_map = stage.modal_map
+    if modal_map is None:
         modes = tuple(ModeCheck(mode, informs=False) for mode in stage.modes)
         n_logs, none = stage.description.baseline.logs, np.empty((0, 0))
         return StageCheck(stage.name, modes, (), (), none, none, none, n_logs, np.nan, ())
     information = identifiability_of(stage)
-    rows = [stage.modal_map.modes.index(mode.name) for mode in information.modes]
-    limits = _limits(stage)
+    # The ln parameters at their limits, or baselines; None off the map or without any limit.
+    point = np.log([p.limit.below if p.limit else p.baseline for p in stage.parameters])
+    any_limit = any(parameter.limit for parameter in stage.parameters)
+    limits = point if any_limit and modal_map.inside(point[None]).all() else None
+    limit_slopes = np.full(information.slopes.shape, np.nan)
+    if limits is not None:
+        rows = [modal_map.modes.index(mode.name) for mode in information.modes]
+        limit_slopes = modal_map.gradient(limits[None])[0, rows]
     noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
     cov = np.linalg.inv(information.precision(noise))
     std = np.sqrt(np.diag(cov))
-    limit_slopes = np.full(information.slopes.shape, np.nan)
-    if limits is not None:
-        limit_slopes = stage.modal_map.gradient(limits[None])[0, rows]
-    parameters = enumerate(stage.parameters)
     described = {mode.name for mode in stage.modes}
     return StageCheck(
         name=stage.name,
         modes=tuple(_check_mode(stage, mode, information, limits) for mode in stage.modes),
-        parameters=tuple(_check_parameter(own, j, stage, information) for j, own in parameters),
+        parameters=tuple(_check_parameters(stage.parameters, modal_map, information, noise)),
         informative=tuple(mode.name for mode in information.modes),
         slopes=information.slopes,
         limit_slopes=limit_slopes,
         correlation=cov / np.outer(std, std),
         n_logs=information.n_baseline,
         model_std=information.model_std,
-        unused=tuple(name for name in stage.modal_map.modes if name not in described),
+        unused=tuple(name for name in modal_map.modes if name not in described),
     )
-
-
-def _limits(stage: Stage) -> FloatArray | None:
-    """Return the ln parameters at their limits, or baselines; None off the map or without any."""
-    assert stage.modal_map is not None
-    point = np.log([p.limit.below if p.limit else p.baseline for p in stage.parameters])
-    any_limit = any(parameter.limit for parameter in stage.parameters)
-    return point if any_limit and stage.modal_map.inside(point[None]).all() else None
 
 
 def _check_mode(
@@ -166,44 +162,44 @@ def _check_mode(
     return ModeCheck(mode, mode.tracked, *frequencies, error, float(np.sqrt(reached)))
 
 
-def _check_parameter(
-    spec: ParameterSpec, j: int, stage: Stage, information: Identifiability
-) -> ParameterCheck:
-    assert stage.modal_map is not None
-    noise = information.drift_variance(constants.TYPICAL_DURATION, information.n_baseline)
-    low, high = np.exp([stage.modal_map.low[j], stage.modal_map.high[j]]).tolist()
-    below, upto = spec.prior.probability(np.array([low, high])).tolist()
-    quantiles = spec.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995])).tolist()
-
-    def left(model: Identifiability, variance: FloatArray) -> float:
-        return float(np.sqrt(np.linalg.inv(model.precision(variance))[j, j]))
-
-    unlimited = information.limiting_variance()
-    precision = information.precision(unlimited)
-    found = ParameterCheck(
-        spec,
-        low=low,
-        high=high,
-        quantiles=tuple(quantiles),
-        below=below,
-        above=1 - upto,
-        verdict="not-told",
-        prior_std=float(np.sqrt(information.prior[j])),
-        usual_std=left(information, noise),
-        endless_std=left(information, unlimited),
-        exact_map_std=left(replace(information, model_std=0.0), noise),
-        known_std=float(1 / np.sqrt(precision[j, j])),
-        exponents=precision[j] / precision[j, j],
+def _check_parameters(
+    specs: Sequence[ParameterSpec],
+    modal_map: ModalMap,
+    information: Identifiability,
+    noise: FloatArray,
+) -> Iterator[ParameterCheck]:
+    """Yield the checks of all parameters; ``noise`` is that of typical logs, ``(n_modes,)``."""
+    unlimited = information.precision(information.limiting_variance())
+    exact_map = replace(information, model_std=0.0)
+    usual, endless, exact = (
+        np.sqrt(np.diag(np.linalg.inv(precision)))
+        for precision in (information.precision(noise), unlimited, exact_map.precision(noise))
     )
-    cases: tuple[tuple[Verdict, float], ...] = (
-        ("told", found.usual_std),
-        ("longer-logs", found.endless_std),
-        ("together", found.known_std),
-    )
-    passed = (
-        verdict for verdict, std in cases if found.variance_removed(std) >= constants.INFORMED
-    )
-    return replace(found, verdict=next(passed, "not-told"))
+    for j, spec in enumerate(specs):
+        low, high = np.exp([modal_map.low[j], modal_map.high[j]]).tolist()
+        below, upto = spec.prior.probability(np.array([low, high])).tolist()
+        found = ParameterCheck(
+            spec,
+            low=low,
+            high=high,
+            quantiles=tuple(spec.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995])).tolist()),
+            below=below,
+            above=1 - upto,
+            verdict="not-told",
+            prior_std=float(np.sqrt(information.prior[j])),
+            usual_std=float(usual[j]),
+            endless_std=float(endless[j]),
+            exact_map_std=float(exact[j]),
+            known_std=float(1 / np.sqrt(unlimited[j, j])),
+            exponents=unlimited[j] / unlimited[j, j],
+        )
+        stds: dict[Verdict, float] = {
+            "told": found.usual_std,
+            "longer-logs": found.endless_std,
+            "together": found.known_std,
+        }
+        passed = (v for v, std in stds.items() if found.variance_removed(std) >= constants.INFORMED)
+        yield replace(found, verdict=next(passed, "not-told"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -307,8 +303,8 @@ def _map_range(parameter: ParameterCheck) -> Iterator[Diagnostic]:
     name, ends = parameter.name, f"{parameter.low:.3g} to {parameter.high:.3g}"
     outside = parameter.below + parameter.above
     if outside > constants.PRIOR_OUTSIDE:
-        text = f"{_share(outside)} of its prior lies outside and is cut off"
-        text = f"The map of {name} covers {ends}; {text}. Make a wider map, or a narrower prior."
+        text = f"The map of {name} covers {ends}; {_share(outside)} of its prior lies outside and "
+        text += "is cut off. Make a wider map, or a narrower prior."
         yield Diagnostic("map", False, text)
     if not parameter.has_limit_on_map and parameter.spec.limit is not None:
         text = f"The limit {parameter.spec.limit.below:g} of {name} does not lie inside the map"
@@ -323,10 +319,9 @@ def _searched(check: ModeCheck) -> Iterator[Diagnostic]:
         yield Diagnostic("modes", True, text)
     if not check.informs:
         return
-    for when, frequency in (
-        ("at the baseline", check.map_frequency),
-        ("with every parameter at its limit", check.limit_frequency),
-    ):
+    places = {"at the baseline": check.map_frequency}
+    places["with every parameter at its limit"] = check.limit_frequency
+    for when, frequency in places.items():
         if np.isfinite(frequency) and not low <= frequency <= high:
             text = f"{mode.name} is searched from {low:.4g} to {high:.4g} Hz, but the map has it at"
             text += f" {frequency:.4g} Hz {when}. Widen its search, or correct map or frequency."

@@ -94,7 +94,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
         """Convert y1 = n ln(now / s_w) and y2 = logit of n in its range."""
-        n = self.exponent.low + (self.exponent.high - self.exponent.low) * expit(y[:, 1])
+        n = self.exponent.quantile(expit(y[:, 1]))
         ratio = np.exp(np.clip(-y[:, 0] / n, -_LARGEST_LN, _LARGEST_LN))
         return np.column_stack([now * ratio, n])
 
@@ -108,7 +108,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
         """Draw coordinates from the prior."""
         life = _draw_length(self.life_km, rng, n)
         share = rng.uniform(1e-6, 1 - 1e-6, n)
-        exponent = self.exponent.low + (self.exponent.high - self.exponent.low) * share
+        exponent = self.exponent.quantile(share)
         return np.column_stack([exponent * np.log(now / life), np.log(share / (1 - share))])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import sys
-from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import date
 from fnmatch import fnmatchcase
@@ -373,26 +372,28 @@ def load_stage(reference: str) -> Stage:
             raise BadStage(f"{path}: map.file: there is no file {map_path}")
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())
-        for key, fault in _map_faults(description, modal_map):
-            raise BadStage(f"{path}: {key}: {fault}")
+        _check_map(path, description, modal_map)
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
-def _map_faults(description: Description, modal_map: ModalMap) -> Iterator[tuple[str, str]]:
-    """Find contradictions between a description and its map."""
+def _check_map(path: Path, description: Description, modal_map: ModalMap) -> None:
+    """Refuse a description that contradicts its map."""
     ends = np.array([modal_map.low, modal_map.high])
     for k, parameter in enumerate(description.parameter):
         low, high = ends[:, k]
         if not low <= np.log(parameter.baseline) <= high:
-            fault = (
-                f"the baseline {parameter.baseline:g} of {parameter.name} lies outside the modal"
+            raise BadStage(
+                f"{path}: parameter[{k}].baseline: the baseline {parameter.baseline:g} of "
+                f"{parameter.name} lies outside the modal map, which covers {np.exp(low):.4g} to "
+                f"{np.exp(high):.4g}"
             )
-            covered = f"{np.exp(low):.4g} to {np.exp(high):.4g}"
-            yield f"parameter[{k}].baseline", f"{fault} map, which covers {covered}"
         try:
             JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
         except BadStage as error:
-            yield f"parameter[{k}].prior", str(error)
+            raise BadStage(f"{path}: parameter[{k}].prior: {error}") from error
+    described = [mode.name for mode in description.mode]
     if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
-        fault = f"the map has modes {list(modal_map.modes)}, but none of them is a tracked [[mode]]"
-        yield "map.file", f"{fault} ({[mode.name for mode in description.mode]})"
+        raise BadStage(
+            f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
+            f"tracked [[mode]] ({described})"
+        )
