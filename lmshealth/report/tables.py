@@ -24,7 +24,7 @@ from lmshealth.report.notices import notices
 from lmshealth.signal.acceleration_levels import Growth, Magnitude
 from lmshealth.signal.following_error import FollowingError
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.stage.check import Diagnostic, ModeCheck, ParameterCheck, StageCheck
+from lmshealth.stage.check import Diagnostic, StageCheck
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
@@ -79,6 +79,12 @@ LOG_COLUMNS = {
     "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
     "lines": "frequency_hz amplitude unit kind channel",
     "mac": "log mode_a mode_b mac",
+    "stage": "name model_std n_logs seconds_per_log",
+    "stage_modes": "mode frequency_hz searched_low_hz searched_high_hz tracked informs map_hz "
+    "map_at_limits_hz surrogate_error_ln_f logs_reach_ln_f",
+    "stage_parameters": "parameter baseline limit limit_on_map map_low map_high prior_q005 "
+    "prior_q05 prior_q95 prior_q995 prior_below_map prior_above_map prior_std_ln logs_std_ln "
+    "endless_logs_std_ln exact_map_std_ln others_known_std_ln informed verdict",
     "sensitivities": "mode parameter at_baseline at_limits",
     "correlations": "parameter_a parameter_b correlation",
 }
@@ -408,12 +414,25 @@ def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:
 def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, list[Row]]:
     """Return the results of a check of a stage description, by table."""
     names = [check.name for check in examined.parameters]
-    stage = {
-        "name": examined.name,
-        "model_std": examined.model_std,
-        "n_logs": examined.n_logs,
-        "seconds_per_log": TYPICAL_DURATION,
-    }
+    stage = examined.name, examined.model_std, examined.n_logs, TYPICAL_DURATION
+    modes = [
+        (
+            *(one.mode.name, one.mode.frequency_hz, *one.searched, one.mode.tracked, one.informs),
+            *(one.map_frequency, one.limit_frequency, one.surrogate_error, one.reached),
+        )
+        for one in examined.modes
+    ]
+    parameters = []
+    for one in examined.parameters:
+        limit = one.spec.limit
+        limits = (limit.below, one.has_limit_on_map) if limit else (None, None)
+        values = (
+            *(one.name, one.spec.baseline, *limits, one.low, one.high),
+            *(*one.quantiles, one.below, one.above, one.prior_std, one.usual_std),
+            *(one.endless_std, one.exact_map_std, one.known_std),
+            *(one.variance_removed(one.usual_std), one.verdict),
+        )
+        parameters.append(values)
     sensitivities = [
         (mode, name, float(examined.slopes[i, j]), float(examined.limit_slopes[i, j]))
         for i, mode in enumerate(examined.informative)
@@ -424,49 +443,10 @@ def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, l
         for i, j in combinations(range(len(names)), 2)
     ]
     return {
-        "stage": [stage],
-        "modes": [_mode_row(check) for check in examined.modes],
-        "parameters": [_parameter_row(check) for check in examined.parameters],
+        "stage": _rows("stage", [stage]),
+        "modes": _rows("stage_modes", modes),
+        "parameters": _rows("stage_parameters", parameters),
         "sensitivities": _rows("sensitivities", sensitivities),
         "correlations": _rows("correlations", correlations),
         "findings": [asdict(finding) for finding in found],
-    }
-
-
-def _mode_row(check: ModeCheck) -> Row:
-    low, high = check.searched
-    return {
-        "mode": check.mode.name,
-        "frequency_hz": check.mode.frequency_hz,
-        "searched_low_hz": low,
-        "searched_high_hz": high,
-        "tracked": check.mode.tracked,
-        "informs": check.informs,
-        "map_hz": check.map_frequency,
-        "map_at_limits_hz": check.limit_frequency,
-        "surrogate_error_ln_f": check.surrogate_error,
-        "logs_reach_ln_f": check.reached,
-    }
-
-
-def _parameter_row(check: ParameterCheck) -> Row:
-    spec = check.spec
-    levels = ("q005", "q05", "q95", "q995")
-    return {
-        "parameter": spec.name,
-        "baseline": spec.baseline,
-        "limit": spec.limit.below if spec.limit else None,
-        "limit_on_map": check.has_limit_on_map if spec.limit else None,
-        "map_low": check.low,
-        "map_high": check.high,
-        **{f"prior_{key}": value for key, value in zip(levels, check.quantiles, strict=True)},
-        "prior_below_map": check.below,
-        "prior_above_map": check.above,
-        "prior_std_ln": check.prior_std,
-        "logs_std_ln": check.usual_std,
-        "endless_logs_std_ln": check.endless_std,
-        "exact_map_std_ln": check.exact_map_std,
-        "others_known_std_ln": check.known_std,
-        "informed": check.variance_removed(check.usual_std),
-        "verdict": check.verdict,
     }

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 import pandas as pd
 from numpy.polynomial.chebyshev import chebder, chebvander
+from scipy.linalg import khatri_rao
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage, OutsideMap
@@ -146,11 +148,8 @@ def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
-    basis = np.ones((unit.shape[0], 1))
-    for axis, degree in enumerate(degrees):
-        vander = chebvander(unit[:, axis], degree)
-        basis = (basis[:, :, None] * vander[:, None, :]).reshape(unit.shape[0], -1)
-    return basis
+    rows = (chebvander(x, degree).T for x, degree in zip(unit.T, degrees, strict=True))
+    return np.asarray(reduce(khatri_rao, rows).T)
 
 
 def _choose_degrees(
