@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 
+from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict, degraded_words, undeclared_events
 from lmshealth.io.log import Notice, Refusal
@@ -251,11 +252,12 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     if health is None:
         return
     specs = {spec.name: spec for spec in assessment.stage.parameters}
-    levels = health.latest(np.array(constants.LEVELS)).T.tolist()
+    disagreeing = {name: by_laws for name, _, by_laws in disagreements(assessment)}
     for k, name in enumerate(health.parameters):
-        limit = limit_of(specs[name])
-        below = np.nan if limit is None else float(np.mean(health.samples[-1, :, k] < limit))
-        low, median, high = levels[k]
+        limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
+        draws = max((draws, disagreeing.get(name, draws)), key=_spread)
+        below = np.nan if limit is None else float(np.mean(draws < limit))
+        low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         yield ParameterHealth(
             name=name,
             determined=bool(health.publishable_parameters()[k]),
@@ -269,3 +271,30 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             baseline=specs[name].baseline,
             unit=specs[name].unit,
         )
+
+
+def disagreements(assessment: Assessment) -> Iterator[tuple[str, FloatArray, FloatArray]]:
+    """Yield parameters whose 90 % intervals by the last epoch and by the laws do not overlap.
+
+    After the name draws of health now by either, as fractions of the baseline.
+    """
+    health, prognosis = assessment.latest_health, assessment.prognosis
+    if health is None or prognosis is None:
+        return
+    baselines = {spec.name: spec.baseline for spec in assessment.stage.parameters}
+    for k in np.flatnonzero(health.publishable_parameters()).tolist():
+        name, by_epoch = health.parameters[k], health.samples[-1, :, k]
+        if name not in prognosis.parameters:
+            continue
+        by_laws = prognosis.health[:, prognosis.parameters.index(name)] / baselines[name]
+        (low, high), (least, most) = (
+            np.quantile(draws, (0.05, 0.95)).tolist() for draws in (by_epoch, by_laws)
+        )
+        if low > most or least > high:
+            yield name, by_epoch, by_laws
+
+
+def _spread(draws: FloatArray) -> float:
+    """Return the ratio of the ends of the 90 % interval."""
+    low, high = np.quantile(draws, (0.05, 0.95)).tolist()
+    return float(high / low)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth.io.log import Notice
-from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, summarise_life
-from lmshealth.report.text import spell
+from lmshealth.report import figures
+from lmshealth.report.assessment import Assessment, disagreements
+from lmshealth.report.text import quantiles, spell
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -67,7 +67,7 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about the laws: their fit, and whether they agree with the last epoch."""
-    prognosis, health = assessment.prognosis, assessment.latest_health
+    prognosis = assessment.prognosis
     if prognosis is None:
         return
     for name in prognosis.unidentifiable:
@@ -80,19 +80,9 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             "Do not rely on the remaining life; use the last epoch, and record further logs soon."
         )
         yield Notice("laws-do-not-fit", "serious", "", what, to_do)
-    if health is None:
-        return
-    limits = {one.parameter: one for one in summarise_life(prognosis, assessment.stage).limits}
-    determined = health.publishable_parameters()
-    own = health.latest(np.array(constants.LEVELS))
-    for j, name in enumerate(health.parameters):
-        if name not in limits or not determined[j]:
-            continue
-        (low, _, high), (least, _, most) = limits[name].health, own[:, j]
-        if low <= most and least <= high:
-            continue
+    for name, by_epoch, by_laws in disagreements(assessment):
+        (least, _, most), (low, _, high) = quantiles(by_epoch), quantiles(by_laws)
         what = f"{spell(name).capitalize()} is {100 * least:.0f} to {100 * most:.0f} % by the last "
         what += f"epoch alone, and {100 * low:.0f} to {100 * high:.0f} % by the laws of all logs."
-        yield Notice(
-            "methods-disagree", "serious", name, what, "Trust the lower; record a log soon."
-        )
+        to_do = "The wider interval is shown; allow for the lower, and record a log soon."
+        yield Notice("methods-disagree", "serious", name, what, to_do)

@@ -57,6 +57,22 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     assert row["what"].endswith(".")
 
 
+def test_the_gauge_shows_the_method_that_allows_for_more(make: Maker) -> None:
+    """Where epoch and laws disagree the wider interval is shown, whichever it is."""
+    good = make()
+    assert good.health is not None and good.prognosis is not None
+    by_laws = np.quantile(good.prognosis.health[:, 0], (0.05, 0.95))
+    for power in (0.05, 20.0):  # of the draws about their half
+        chains = 0.5 * (good.health.chains / np.median(good.health.chains[-1, ..., 0])) ** power
+        health = replace(good.health, chains=np.clip(chains, 0.05, 0.6))
+        bad = replace(good, health=health)
+        own = np.quantile(health.samples[-1, :, 0], (0.05, 0.95))
+        wider = max((own, by_laws), key=lambda one: one[1] / one[0])
+        assert own[1] < by_laws[0] and codes(bad) >= {"methods-disagree"}
+        gauge = summarise(bad, bad.service()).health[0]
+        assert [gauge.low, gauge.high] == pytest.approx(wider)
+
+
 def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) -> None:
     """Health in units of its own is the same fraction on pages, and disagrees with no law."""
     good = make()
