@@ -11,7 +11,8 @@ Method
     limit is reached before the travel at which the risk is 5 %; a log announces the end if one of
     the interval advised falls between the loss of half of the margin and the end.
 Answer
-    See the claims.
+    Yes: 173 of 180 intervals hold in courses that no law has (before 41), 177 of 180 services are
+    in time (before 43), and where a law is right scores and widths are those of before.
 Run time
     Half an hour of one processor.
 """

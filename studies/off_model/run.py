@@ -10,9 +10,14 @@ Method
     where 5 % of preload is lost. Control, which must fail: the same lives without wander, outliers,
     running-in, lag and wide scales, as the tracker was before these were added.
 Answer
-    Not recorded yet.
+    Healthy lives alarm as seldom as declared, and nine tenths of the preloads are held, in 19 of 21
+    stable worlds that break the tracker's assumptions; before, up to all of them alarmed. A sensor
+    that drifts looks as a change of the modes does. Logs of two machines mixed at random alarm in
+    a tenth of the lives. Where wear accelerates within a few logs (late, bathtub) the epoch
+    lags: 77 and 47 % of the preloads are held; the page then shows the wider interval of the laws.
+    A sound loss of 5 % is found in as many lives, 1.3 times as late.
 Run time
-    Half an hour on one processor.
+    25 minutes on one processor.
 """
 
 from __future__ import annotations
@@ -40,8 +45,15 @@ LOSERS = tuple(
     name + LOSING for name in ("control", "wander 0.5 sd, 5 logs", "scatter 4", "lag 8 h")
 )
 QUICK = ("control", "wander 3 sd, 5 logs", "outliers 5 %, 10 sd", "control" + LOSING)
-# A drift of the sensor is a change of ln f like any other: documented as not met.
-INDISTINGUISHABLE = ("sensor drifts by 5 K",)
+_DRIFT = "a drift of the sensor is a change of ln f like any other"
+NOT_MET = {
+    "alarms: sensor drifts by 5 K": _DRIFT,
+    "held: sensor drifts by 5 K": _DRIFT,
+    "alarms: two machines mixed": (
+        "two populations 1 % apart that alternate at random look as a step does; a mixture of two "
+        "levels as a regime of its own is the best idea left"
+    ),
+}
 # Lives that alarm and whose preload is held, asked for in stable worlds; detection and width asked
 # for where the model is right, over those of the control.
 MOST_ALARMS, LEAST_HELD, MOST_LATER, MOST_WIDER = 0.02, 0.85, 1.3, 1.25
@@ -67,8 +79,9 @@ def main() -> None:
     before = study.trials.collect(of_world, [(name, n, True) for name in names])
     answer = {"worlds": rows, "control": before}
     answer["passed"] = verdicts(rows, before)
-    not_met = [f"{what}: {n}" for n in INDISTINGUISHABLE for what in ("alarms", "held")]
-    study.conclude(answer, not_met=not_met, quick_may_fail=True)
+    passed = answer["passed"]
+    answer["not_met"] = {name: why for name, why in NOT_MET.items() if not passed.get(name, True)}
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 @cache
