@@ -12,7 +12,8 @@ Method
     the interval advised falls between the loss of half of the margin and the end.
 Answer
     Yes: 173 of 180 intervals hold in courses that no law has (before 41), 177 of 180 services are
-    in time (before 43), and where a law is right scores and widths are those of before.
+    in time (before 43). Where a law is right widths of health are those of before, and scores at
+    70 % of life 0.94 (linear) and 1.18 times (power) those of before, from 20 lives each.
 Run time
     Half an hour of one processor.
 """
