@@ -260,6 +260,12 @@ def at_most(row: Row) -> bool:
 
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim what the estimator does on drawn machines, beside the nominal ones."""
+    for part in (modes_claims, alarm_claims, interval_claims, service_claims):
+        yield from part(answer)
+
+
+def modes_claims(answer: Row) -> Iterator[Claim]:
+    """Claim the modes of raw logs, and doubt about their names."""
     passed, machines, control = answer["passed"], answer["machines"], answer["control"]
     for name, own in answer["modes"].items():
         apart = number(own["frequency_std_of_z"]) if "frequency_std_of_z" in own else "no"
@@ -279,8 +285,11 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"nominal {control['names in doubt']['hits']} of {control['n']}",
         met=passed[NAMES],
     )
-    healthy = answer["healthy"]
-    calm = healthy["unchanged"]
+
+
+def alarm_claims(answer: Row) -> Iterator[Claim]:
+    """Claim the false alarms of machines that do not change, and those of single circumstances."""
+    healthy, calm = answer["healthy"], answer["healthy"]["unchanged"]
     yield counted(
         "drawn machines that alarm though no part has lost 1 %",
         calm["alarm"]["hits"],
@@ -288,7 +297,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"undeclared steps {calm['step']['hits']}; those that run in included "
         f"{healthy['drawn']['alarm']['hits']} of {healthy['drawn']['alarm']['n']}; "
         f"nominal {healthy['nominal']['alarm']['hits']} of {healthy['nominal']['alarm']['n']}",
-        met=passed[CALM],
+        met=answer["passed"][CALM],
     )
     for name, row in answer["circumstances"].items():
         yield counted(
@@ -299,6 +308,11 @@ def claims(answer: Row) -> Iterator[Claim]:
             # Of these two the preload does change.
             met=name in ("running-in", "stick-and-recover") or at_most(row["alarm"]),
         )
+
+
+def interval_claims(answer: Row) -> Iterator[Claim]:
+    """Claim the coverage of 90 % intervals, and the verdicts."""
+    machines, control = answer["machines"], answer["control"]
     for what, name in HOLDS.items():
         for parameter, rows in machines[what].items():
             beside = control[what][parameter][1]
@@ -323,7 +337,11 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"steps {word['step']}, withheld {word['withheld']}, wrong {word['wrong']}; surer than "
         f"95 % and wrong {word['sure_and_wrong']} of {word['sure']}",
     )
-    service = machines["service"]
+
+
+def service_claims(answer: Row) -> Iterator[Claim]:
+    """Claim the services that come after the failure, and those that no limit needs."""
+    service, control = answer["machines"]["service"], answer["control"]["service"]
     late = service["too_late_of_all"]
     low, high = (100 * value for value in clopper_pearson(late["hits"], late["n"]))
     yield Claim(
@@ -331,9 +349,8 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"{late['hits']} of {late['n']}",
         f"{low:.1f} to {high:.1f} % (95 %)",
         f"{service['too_late']['hits']} of {service['failing']} that fail; control "
-        f"{control['service']['too_late_of_all']['hits']} of "
-        f"{control['service']['too_late_of_all']['n']}",
-        passed[IN_TIME],
+        f"{control['too_late_of_all']['hits']} of {control['too_late_of_all']['n']}",
+        answer["passed"][IN_TIME],
     )
     if service["sound_with_service"]:
         yield counted(

@@ -82,14 +82,18 @@ class Study:
         """Print the answer, record it unless this is the quick form, and exit on a failed check.
 
         ``passed`` of the answer has a bool for each check; those in ``not_met`` are documented as
-        not passed. ``details`` are recorded and not printed, in a record of another ``name`` than
-        the script's if it is given. A quick form that is too small to be judged may fail.
+        not passed: of a mapping, the reasons of those that are not are added to the answer.
+        ``details`` are recorded and not printed, in a record of another ``name`` than the script's
+        if it is given. A quick form that is too small to be judged may fail.
         """
+        failed = [check for check, fine in answer.get("passed", {}).items() if not fine]
+        if isinstance(not_met, Mapping):
+            reasons = {check: why for check, why in not_met.items() if check in failed}
+            answer = {**answer, "not_met": reasons}
         print(json.dumps(answer, indent=1))
         if not self.quick:
             name = name or {"run": "result"}.get(self._stem, self._stem)
             self._write(self._folder / f"{name}.json", {**answer, **(details or {})})
-        failed = [check for check, fine in answer.get("passed", {}).items() if not fine]
         if not set(failed) <= set(not_met) and not (self.quick and quick_may_fail):
             raise SystemExit(f"not as asked: {failed}")
 

@@ -80,7 +80,7 @@ def main() -> None:
         "strokes": once(strokes, 1 if quick else 60),
         "modes": once(modes, *((1, QUICK_CROSSINGS, QUICK_PLACES) if quick else (8,))),
     }
-    answer |= {"passed": verdicts(answer), "not_met": NOT_MET}
+    answer["passed"] = verdicts(answer)
     study.conclude(answer, not_met=NOT_MET)
 
 

@@ -74,16 +74,9 @@ def main() -> None:
     tasks = [(name, QUICK_SEEDS if quick else SEEDS, quick) for name in NAMES[: 1 if quick else 3]]
     with spawn_pool(1) as pool:
         cases = study.trials.collect(compare, tasks, pool=pool)
+    versions = {name: version(name) for name in PACKAGES.values()}
     passed = verdicts(cases, quick=quick)
-    study.conclude(
-        {
-            "versions": {name: version(name) for name in PACKAGES.values()},
-            "cases": cases,
-            "passed": passed,
-            "not_met": {name: why for name, why in NOT_MET.items() if not passed[name]},
-        },
-        not_met=NOT_MET,
-    )
+    study.conclude({"versions": versions, "cases": cases, "passed": passed}, not_met=NOT_MET)
 
 
 def compare(name: str, seeds: int, quick: bool) -> Row:
