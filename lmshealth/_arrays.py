@@ -42,6 +42,11 @@ class Rows:
         return some
 
 
+def stack(values: ComplexArray) -> FloatArray:
+    """Stack real above imaginary parts."""
+    return np.concatenate([values.real, values.imag])
+
+
 def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
     """Require the shape of a field; `ValueError` names the field, its shape and the one needed."""
     if array.shape != shape:

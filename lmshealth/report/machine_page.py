@@ -141,7 +141,7 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
         content |= {
             "modes": latest_modes(track),
             "events": _grouped(track.events, attrgetter("kind", "epoch", "source")).values(),
-            "effects": list(_other_effects(track)),
+            "effects": [effect for effect in track.effects if _is_shown(effect)],
             "consistency": track.consistency(),
             "nis": _nis(track),
             "noise_scale": float(track.noise_scale[-1].max()),
@@ -183,12 +183,11 @@ def _grouped(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, lis
     return groups
 
 
-def _other_effects(track: Track) -> Iterator[Effect]:
-    """Yield effects of sources, tunings and sensors, and scales that differ from one."""
-    for effect in track.effects:
-        kind, colon, _ = effect.covariate.partition(":")
-        if colon and (kind != "scale" or abs(effect.coefficient - 1) > constants.SCALE_SHOWN):
-            yield effect
+def _is_shown(effect: Effect) -> bool:
+    """Return whether it is one of source, tuning or sensor, or a scale that differs from one."""
+    kind, colon, _ = effect.covariate.partition(":")
+    scale = abs(effect.coefficient - 1)
+    return bool(colon) and (kind != "scale" or scale > constants.SCALE_SHOWN)
 
 
 def _nis(track: Track) -> dict[str, Any] | None:
@@ -262,9 +261,8 @@ def _track_pictures(
         draw["frequency", mode] = partial(figures.plot_frequencies, **lives, mode=mode)
         draw["damping", mode] = partial(figures.plot_damping, **lives, mode=mode)
     if waterfall is not None and history.has_odometer:
-        moved = None
-        if track is not None:
-            moved = covariate_effects.covariate_shifts(history, track, assessment.stage)
+        shift = covariate_effects.covariate_shifts
+        moved = None if track is None else shift(history, track, assessment.stage)
         lives |= {"waterfall": waterfall, "moved": moved}
         draw["waterfall", "all"] = partial(figures.plot_waterfall, **lives)
     for one in influences:
@@ -280,20 +278,20 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
     prognosis, health = assessment.prognosis, assessment.latest_health
     specs = {spec.name: spec for spec in assessment.stage.parameters}
     draw: dict[tuple[str, ...], Any] = {}
-    own: dict[str, Any]
     if health is not None:
+        drawn: Any = partial(figures.plot_posterior, health=health)
         for names, key, _ in _pairs(health):
-            own = {"health": health, "parameters": names}
-            draw["posterior", key] = partial(figures.plot_posterior, **own)
+            draw["posterior", key] = partial(drawn, parameters=names)
+        drawn = partial(figures.plot_health, health=health)
         for name in health.parameters:
-            own = {"health": health, "parameter": name, "limit": limit_of(specs[name])}
-            draw["health", name] = partial(figures.plot_health, **own)
+            draw["health", name] = partial(drawn, parameter=name, limit=limit_of(specs[name]))
     if prognosis is not None:
+        drawn = partial(figures.plot_life, prognosis=prognosis, health=health)
         for name in prognosis.parameters[:-1]:
-            own = {"parameter": name, "health": health, "baseline": specs[name].baseline}
-            draw["life", name] = partial(figures.plot_life, prognosis=prognosis, **own)
-        own = {"prognosis": prognosis, "service": service}
-        draw["survival", "any"] = partial(figures.plot_survival, **own)
+            draw["life", name] = partial(drawn, parameter=name, baseline=specs[name].baseline)
+        draw["survival", "any"] = partial(
+            figures.plot_survival, prognosis=prognosis, service=service
+        )
     return draw
 
 

@@ -399,8 +399,7 @@ def growth_rows(growth: Iterable[Growth]) -> list[Row]:
 
 def lines_rows(lines: Iterable[Line]) -> list[Row]:
     """Return spectral lines, one row each."""
-    values = [(one.frequency, one.amplitude, one.unit, one.kind, one.channel) for one in lines]
-    return _rows("lines", values)
+    return _rows("lines", map(astuple, lines))
 
 
 def plan_rows(plans: Sequence[Plan]) -> dict[str, list[Row]]:

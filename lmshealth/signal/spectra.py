@@ -314,21 +314,17 @@ def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
     """Group long segments of one length and one set speed."""
     groups: list[list[Segment]] = []
     for segment in segments:
-        long = segment.stop - segment.start >= _LEAST_PART
-        alike = (group for group in groups if _same(group[0], segment))
-        group = next(alike, None) if long else None
-        if group is None:
-            groups.append([segment])
+        size, speed = segment.stop - segment.start, abs(segment.velocity)
+        for group in groups if size >= _LEAST_PART else ():
+            first = group[0]
+            speeds = abs(first.velocity), speed
+            alike = np.isclose(*speeds, rtol=constants.SAME_VELOCITY, atol=0.0, equal_nan=True)
+            if first.stop - first.start == size and alike:
+                group.append(segment)
+                break
         else:
-            group += [segment]
+            groups.append([segment])
     return groups
-
-
-def _same(one: Segment, other: Segment) -> bool:
-    if one.stop - one.start != other.stop - other.start:
-        return False
-    speeds = abs(one.velocity), abs(other.velocity)
-    return bool(np.isclose(*speeds, rtol=constants.SAME_VELOCITY, atol=0.0, equal_nan=True))
 
 
 def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
@@ -381,21 +377,16 @@ def periodogram(
 
 def _transform(x: FloatArray, lag: int, frequency: FloatArray, sample_rate: float) -> ComplexArray:
     """Transform the result of `as_acceleration`; the squared magnitude is the periodogram."""
-    transform: ComplexArray = fft.rfft(_without_trend(x))[1 : frequency.size + 1]
+    ramp = np.arange(x.size, dtype=np.float64)
+    ramp -= (x.size - 1) / 2
+    ramp *= ramp @ x / (ramp @ ramp)
+    rest: FloatArray = x - x.mean()
+    rest -= ramp
+    transform: ComplexArray = fft.rfft(rest)[1 : frequency.size + 1]
     transform *= np.sqrt(2 / (x.size * sample_rate))
     if lag:
         transform *= lag_gain(frequency, lag, sample_rate)
     return transform
-
-
-def _without_trend(x: FloatArray) -> FloatArray:
-    ramp = np.arange(x.size, dtype=np.float64)
-    ramp -= (x.size - 1) / 2
-    slope = ramp @ x / (ramp @ ramp)
-    rest: FloatArray = x - x.mean()
-    ramp *= slope
-    rest -= ramp
-    return rest
 
 
 def as_acceleration(

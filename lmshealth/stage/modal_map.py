@@ -136,15 +136,9 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
 
 def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
     """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
-    shape = coefficients.shape
-    # One matrix product contracts the last parameter axis for all points and modes.
-    basis = chebvander(unit[:, -1], shape[-2] - 1)
-    last = np.moveaxis(coefficients, -2, 0).reshape(shape[-2], -1)
-    value = (basis @ last).reshape(-1, *shape[:-2], shape[-1])
-    for axis in reversed(range(unit.shape[1] - 1)):
-        basis = chebvander(unit[:, axis], shape[axis] - 1)
-        value = np.einsum("n...km,nk->n...m", value, basis)
-    return np.asarray(value)
+    *sizes, n_modes = coefficients.shape
+    degrees = [size - 1 for size in sizes]
+    return np.asarray(_basis(unit, degrees) @ coefficients.reshape(-1, n_modes))
 
 
 def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:

@@ -13,14 +13,13 @@ import numpy as np
 from scipy import linalg, stats
 from scipy.special import softmax
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, stack
 from lmshealth.modal import constants
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     Evaluation,
     IntArray,
     TransientLikelihood,
-    stack,
     transient,
     unit_level,
 )
@@ -322,24 +321,18 @@ def _best_pole(found: DecayFit) -> tuple[float, float]:
 def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
     """Fit one more pole, first without its ambient response, then with the shape of its decays."""
     before, m = found.likelihood, found.likelihood.n_modes
-    p = found.optimum.p
-    start = np.concatenate(
-        [p[:m], [np.log(f)], p[m : 2 * m], [np.log(zeta)], p[2 * m : 3 * m], [0.0], p[3 * m :]]
-    )
+    start = np.insert(found.optimum.p, [m, 2 * m, 3 * m], [np.log(f), np.log(zeta), 0.0])
     size = max(block.duration for block in before.blocks)
     unit = unit_level(f, zeta, size, displacement=before.displacement)
-    likelihood = replace(
-        before,
-        shapes=np.concatenate([before.shapes, np.ones((1, before.n_channels))]),
-        units=np.append(before.units, unit),
-    )
+    shapes, units = np.vstack([before.shapes, np.ones(before.n_channels)]), [*before.units, unit]
+    likelihood = replace(before, shapes=shapes, units=np.array(units))
     without, start = np.delete(np.arange(start.size), 3 * m + 2), likelihood.clip(start)
     first = DecayFit(likelihood, maximise(likelihood, start, without, tolerance=_ROUGH))
     # The real shape that its decays have in common.
     scale, sizes = np.sqrt(first.white_level()), np.concatenate(first.sizes(m), axis=1)
     seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
     shape = np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale
-    likelihood = replace(likelihood, shapes=np.concatenate([before.shapes, shape[None]]))
+    likelihood = replace(likelihood, shapes=np.vstack([before.shapes, shape]))
     start = first.optimum.p + 0.0
     start[3 * m + 2] = _FIRST_LEVEL
     free = np.arange(start.size)

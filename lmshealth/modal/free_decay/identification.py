@@ -143,12 +143,16 @@ class _Pole:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandModes:
-    """Modes of a band of one kind of channels: accepted poles, their estimates, rejected poles."""
+    """Poles of a band of one kind of channels, and the modes of those that are accepted."""
 
     source: str
     poles: tuple[_Pole, ...]
     modes: Modes
-    rejected: tuple[_Pole, ...]
+
+    @property
+    def accepted(self) -> list[_Pole]:
+        """The poles of the modes."""
+        return [pole for pole in self.poles if pole.rejection is None]
 
 
 def _limits(
@@ -251,15 +255,12 @@ def _fit_band(
         stationary = stationary or fit
         if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
             band = _accept(fit, channels, limits)
-            strongest = _strongest((*band.poles, *band.rejected))
-            why = strongest.rejection if strongest is not None else None
+            strongest = _strongest(band.poles)
+            why = strongest.rejection if strongest else None
             if why is None or why.reason not in _TOO_EARLY:
                 return [band]
-    if stationary is not None:
-        return [_accept(stationary, channels, limits)]
-    if nonstationary is not None:
-        return [_accept(nonstationary, channels, limits, linear=False)]
-    return []
+    best = stationary or nonstationary
+    return [_accept(best, channels, limits, linear=best is stationary)] if best else []
 
 
 def _strongest(poles: Iterable[_Pole]) -> _Pole | None:
@@ -311,7 +312,7 @@ def _accept(
 ) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
     source, lines = _SOURCES[channels[0].kind], fit.is_line()
-    rejected: list[_Pole] = []
+    poles: list[_Pole] = []
     modal: list[int] = []
 
     def pole(i: int, rejection: Rejection | None) -> _Pole:
@@ -325,23 +326,21 @@ def _accept(
                 f"the resonance at {f:.5g} Hz is no sum of decays in stationary noise, however "
                 "late the decay is started"
             )
-            rejected.append(pole(i, Rejection("not-linear", detail)))
+            poles.append(pole(i, Rejection("not-linear", detail)))
         elif lines[i]:
-            rejected.append(pole(i, Rejection("line-not-mode", f"{f:.5g} Hz does not decay")))
+            poles.append(pole(i, Rejection("line-not-mode", f"{f:.5g} Hz does not decay")))
         else:
             modal.append(i)
     if not modal:
         nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), source, ())
-        return _BandModes(source, (), nothing, tuple(rejected))
+        return _BandModes(source, tuple(poles), nothing)
     result = estimate(fit, modal)
-    poles = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
-    snr = np.array([one.snr for one in poles])
+    found = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
+    snr = np.array([one.snr for one in found])
     best = [channels[c].name for c in snr.argmax(axis=1)]
     modes = estimates_only(result.mean, result.cov, snr.max(axis=1), source, best)
-    credible = [k for k, one in enumerate(poles) if one.rejection is None]
-    rejected += [one for one in poles if one.rejection is not None]
-    accepted = tuple(poles[k] for k in credible)
-    return _BandModes(source, accepted, modes.select(credible), tuple(rejected))
+    credible = [k for k, one in enumerate(found) if one.rejection is None]
+    return _BandModes(source, (*poles, *found), modes.select(credible))
 
 
 def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
@@ -383,19 +382,19 @@ def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejecti
 
 def _number(log: Log, bands: list[_BandModes]) -> Modes:
     """Merge and number the modes; of Δe only those that accelerometers do not show."""
-    seen = [pole for band in bands if band.source == "acc" for pole in band.poles]
+    seen = [pole for band in bands if band.source == "acc" for pole in band.accepted]
     kept = []
     for band in bands:
         others = () if band.source == "acc" else seen
         new = [
             i
-            for i, pole in enumerate(band.poles)
+            for i, pole in enumerate(band.accepted)
             if all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in others)
         ]
         kept.append(band.modes.select(new))
     modes = numbered(merge(kept, (), log.refused))
     if not modes.names:
-        strongest = _strongest(pole for band in bands for pole in band.rejected)
+        strongest = _strongest(pole for band in bands for pole in band.poles)
         nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
         raise BadLog(log.name, *((strongest and strongest.rejection) or nothing)[:2])
     return modes
@@ -410,7 +409,7 @@ def _name(
     for source in _SOURCES.values():
         taken = {name for modes in named for name in modes.names}
         missing = [target for target in targets if target.name not in taken]
-        poles = [pole for band in bands if band.source == source for pole in band.poles]
+        poles = [pole for band in bands if band.source == source for pole in band.accepted]
         poles.sort(key=lambda pole: pole.frequency)
         assigned, unclear = assign(
             [pole.frequency for pole in poles], missing, damping=[pole.damping for pole in poles]
@@ -418,14 +417,14 @@ def _name(
         ambiguous |= unclear
         names = dict(zip(poles, assigned, strict=True))
         for band in bands:
-            own = {i: names[pole] for i, pole in enumerate(band.poles) if names.get(pole)}
+            own = {i: names[pole] for i, pole in enumerate(band.accepted) if names.get(pole)}
             named.append(replace(band.modes.select([*own]), names=tuple(own.values())))
     return named, ambiguous
 
 
 def _why_missing(target: Target, bands: list[_BandModes]) -> Rejection:
     """Return why a mode was not found, from the strongest resonance within its search."""
-    poles = [pole for band in bands for pole in (*band.poles, *band.rejected)]
+    poles = (pole for band in bands for pole in band.poles)
     strongest = _strongest(pole for pole in poles if is_near(target, pole.frequency))
     if strongest is None:
         return Rejection(

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._arrays import ComplexArray, FloatArray, stack
 
 # Degree of the polynomial over the band that represents leakage from outside.
 _DEGREE = 2
@@ -63,11 +63,6 @@ def transform_decays(
         sample_rate=sample_rate,
         base=base[:, size > _THIN * size[0]],
     )
-
-
-def stack(values: ComplexArray) -> FloatArray:
-    """Stack real above imaginary parts."""
-    return np.concatenate([values.real, values.imag], axis=0)
 
 
 def transient(block: DecaySpectra, f: FloatArray, zeta: FloatArray) -> ComplexArray:
@@ -151,7 +146,6 @@ class BlockFit:
     residual: FloatArray  # white with variance one half, (n_rows, n_segments)
     sizes: FloatArray  # of each column, the base first, (n_channels, n_columns, n_segments)
     removed: FloatArray  # orthonormal basis of the fitted columns, (n_rows, n_removed)
-    tangent: FloatArray  # slopes by ln f and ln ζ less the columns, (2 n_modes, n_rows, n_segments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -280,15 +274,14 @@ class TransientLikelihood:
         own = sizes[:, first:].reshape(n, m, 2, n_segments)
         change = whiten @ np.einsum("dikp,cips->dikcs", turned, own)
         change = change.reshape(2 * m, *residual.shape)
-        tangent = change - q @ (q.T @ change)
-        fit = BlockFit(residual, sizes, q, tangent)
+        tangent = (change - q @ (q.T @ change)).reshape(2 * m, residual.size)
+        fit = BlockFit(residual, sizes, q)
 
         seen = directions @ np.swapaxes(inverse, 1, 2)
         gradient, fisher = _by_noise(fit, np.moveaxis(seen, 1, 0), slopes, m)
         gradient[: 2 * m] += n_segments * _volume_slope(columns, turned, whiten, q, r)
         gradient[: 2 * m] -= 2 * np.sum(residual * change, axis=(1, 2))
-        flat = tangent.reshape(2 * m, residual.size)
-        fisher[: 2 * m, : 2 * m] += 2 * flat @ flat.T
+        fisher[: 2 * m, : 2 * m] += 2 * tangent @ tangent.T
 
         log_det = 2 * float(np.log(np.diagonal(lower, axis1=1, axis2=2)).sum())
         profile = n_segments * log_det + float(np.sum(residual**2))

@@ -187,17 +187,13 @@ def _longest_segment(log: Log, channels: tuple[Channel, Channel]) -> tuple[Float
     """Cut out the longest segment of constant velocity, or of rest in a log that never moves."""
     phases = find_phases(log)
     rests = all(phase.kind == "idle" for phase in phases)
-    usable = [phase for phase in phases if rests or phase.kind in ("constant", "whole")]
-    ranges = [(phase.start, phase.stop) for phase in usable]
+    ranges = [(p.start, p.stop) for p in phases if rests or p.kind in ("constant", "whole")]
     start, stop = max(ranges, key=lambda ends: ends[1] - ends[0], default=(0, 0))
     if stop - start < constants.FRF_SAMPLES:
-        raise BadLog(
-            log.name,
-            "too-short",
-            f"the longest segment of constant velocity without gaps has {stop - start} samples, "
-            f"{(stop - start) / log.sample_rate:.3g} s; needed are at least "
-            f"{constants.FRF_SAMPLES}",
-        )
+        found = f"has {stop - start} samples, {(stop - start) / log.sample_rate:.3g} s"
+        detail = f"the longest segment of constant velocity without gaps {found}"
+        needed = f"needed are at least {constants.FRF_SAMPLES}"
+        raise BadLog(log.name, "too-short", f"{detail}; {needed}")
     first, second = (channel.values[start:stop] for channel in channels)
     for channel, values in zip(channels, (first, second), strict=True):
         if values.max() == values.min():

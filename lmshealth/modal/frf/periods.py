@@ -32,8 +32,14 @@ def find_period(values: FloatArray, stated: float | None = None) -> float | None
     searched for within 1 % of a stated period, at most half the record; where there is none this is
     returned.
     """
-    correlation = _autocorrelation(values)
-    n = values.size
+    x, n = values - values.mean(), values.size
+    size = fft.next_fast_len(2 * n, real=True)
+    transform = fft.rfft(x, size)
+    product = fft.irfft(transform.real**2 + transform.imag**2, size)[:n]
+    energy = np.concatenate([[0.0], np.cumsum(x**2)])
+    both = energy[n:0:-1] + energy[n] - energy[:n]
+    # Of the overlap at every lag.
+    correlation: FloatArray = 2 * product / np.maximum(both, np.finfo(float).tiny)
     if stated is None:
         for share in (_NEAR_BEST, 1.0):
             first = _first_repeat(correlation, n // 2, share)
@@ -51,18 +57,6 @@ def find_period(values: FloatArray, stated: float | None = None) -> float | None
     if first in (low, high) or correlation[first] < _REPEATS:
         return stated
     return _refine(correlation, first)
-
-
-def _autocorrelation(values: FloatArray) -> FloatArray:
-    """Return the autocorrelation over the overlap at every lag, shape ``(n_samples,)``."""
-    x = values - values.mean()
-    n = x.size
-    size = fft.next_fast_len(2 * n, real=True)
-    transform = fft.rfft(x, size)
-    product = fft.irfft(transform.real**2 + transform.imag**2, size)[:n]
-    energy = np.concatenate([[0.0], np.cumsum(x**2)])
-    both = energy[n:0:-1] + energy[n] - energy[:n]
-    return np.asarray(2 * product / np.maximum(both, np.finfo(float).tiny))
 
 
 def _first_repeat(correlation: FloatArray, longest: int, share: float) -> int | None:
@@ -117,17 +111,15 @@ def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexAr
         n_periods = int((n - 2 * _HALF_WIDTH) / period)
         at = (n - _HALF_WIDTH) - n_periods * period + np.arange(n_periods * whole) * period / whole
         cut = [_interpolate(x, at).reshape(n_periods, whole) for x in signals]
-    spectra = [fft.rfft(_without_drift(x), axis=1) * (2 / whole) for x in cut]
+    ramp = (np.arange(whole) - (whole - 1) / 2) / whole
+    spectra = []
+    for x in cut:
+        # A line fitted to a period would remove part of every harmonic; their means hold none.
+        mean = x.mean(axis=1)
+        slope = np.gradient(mean) if n_periods > 1 else np.zeros(1)
+        rest = x - mean[:, None] - slope[:, None] * ramp
+        spectra.append(fft.rfft(rest, axis=1) * (2 / whole))
     return np.array(spectra), period
-
-
-def _without_drift(periods: FloatArray) -> FloatArray:
-    # A line fitted to a period would remove part of every harmonic; their means hold none.
-    n_periods, size = periods.shape
-    mean = periods.mean(axis=1)
-    slope = np.gradient(mean) if n_periods > 1 else np.zeros(1)
-    ramp = (np.arange(size) - (size - 1) / 2) / size
-    return np.asarray(periods - mean[:, None] - slope[:, None] * ramp)
 
 
 def _interpolate(values: FloatArray, at: FloatArray) -> FloatArray:

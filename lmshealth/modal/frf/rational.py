@@ -12,7 +12,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.optimize import least_squares
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, stack
 from lmshealth.modal import constants
 
 # A transient is smooth over a band: powers of s.
@@ -104,11 +104,6 @@ class Solution:
     error: ComplexArray  # measured less fitted answer, (n_lines,)
     response: ComplexArray  # the fitted H, (n_lines,)
     parts: FloatArray  # sum of the powers of the parts of H, (n_lines,)
-
-
-def stack(values: ComplexArray) -> FloatArray:
-    """Stack real over imaginary parts."""
-    return np.concatenate([values.real, values.imag])
 
 
 def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray]:
