@@ -133,6 +133,9 @@ MOST_ASSIGNMENTS, MOST_HYPOTHESES = 12, 24
 MERGING_DISTANCE = 1.0
 # Probability that a declared intervention changes the order of frequencies: modes step together.
 REORDERING_PROBABILITY = 0.05
+# Probability that a mode which strays takes the place of another one. Two modes that are apart do
+# not exchange places from one log to the next: they cross, and are near each other for some logs.
+TAKING_PROBABILITY = 0.01
 # Modes nearer than this in ln f may veer, with this probability per log.
 VEERING_LN_F, VEERING_PROBABILITY = 0.03, 0.02
 
@@ -147,6 +150,10 @@ LEAST_LIFE_LOGS = 50
 # A mode's shape is the mean of its first ones. Later shapes do not move it, so that a mode that
 # takes another's shape is detected.
 N_MEAN_SHAPES = 10
+
+# Errors of a source are scaled anew, and all its logs associated again, once the scatter shows a
+# scale that differs by more than this factor: gates and odds hardly depend on less.
+LEAST_RESCALING = 1.4
 
 # --- Association: track initiation ---------------------------------------------------------------
 # Prior odds that an unassigned estimate is a mode's first, the probability that confirms it, and

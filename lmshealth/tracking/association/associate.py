@@ -26,6 +26,7 @@ from lmshealth.tracking.association.mode_filters import (
     predict,
     update,
 )
+from lmshealth.tracking.association.noise_scale import learn_scales, scaled
 from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
@@ -160,15 +161,30 @@ def associate(
     jumps : collection of int
         Epochs at which frequencies may step, as after declared maintenance.
     """
-    state = State.start(prior_std, epochs[0].shapes.shape[1])
+    start = state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()
     # Length of a life as known at each log.
     count = np.maximum(np.arange(clock.size), 1)
     lives = ((clock - clock[0]) * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)).tolist()
-    labels = []
-    for k, (own, new) in enumerate(zip(epochs, measurements_of(epochs), strict=True)):
-        log = Log(k, places[k], lives[k], offsets[k], k in declared, own.names, own.sources, new)
-        state, found = associate_log(state, log)
+    stated, sources = measurements_of(epochs), [own.sources for own in epochs]
+    scales = learn_scales(stated, sources, offsets, prior_std)
+    labels: list[tuple[Label, ...]] = []
+
+    def log_at(j: int, names: tuple[str, ...], now: int) -> Log:
+        new = scaled(stated[j], sources[j], scales[now])
+        opened = j in declared
+        return Log(j, places[j], lives[j], offsets[j], opened, names, sources[j], new)
+
+    for k, own in enumerate(epochs):
+        if k and scales[k] is not scales[k - 1]:
+            # Filters and hypotheses rest on errors that are wrong: they start again. Labels stay
+            # as they are: they are the names of the estimates that have them.
+            state = start
+            for j, given in enumerate(labels):
+                pairs = zip(given, epochs[j].names, strict=True)
+                names = tuple(label.mode or name for label, name in pairs)
+                state, _ = associate_log(state, log_at(j, names, k))
+        state, found = associate_log(state, log_at(k, own.names, k))
         labels.append(found)
     order = np.argsort(state.first, kind="stable")
     return Association(tuple(state.names[i] for i in order), tuple(labels))

@@ -14,7 +14,7 @@ from itertools import combinations
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.special import hyp1f1, logsumexp, ndtr
+from scipy.special import hyp1f1, ndtr
 
 from lmshealth._arrays import FloatArray
 from lmshealth.tracking import constants
@@ -58,7 +58,7 @@ class Hypotheses:
 
     def probabilities(self, n_modes: int) -> FloatArray:
         """Return the probability of each mode, last of none, per estimate: ``(n, m + 1)``."""
-        weights = np.exp(logsumexp(self.log_weights, axis=1))
+        weights = np.exp(np.logaddexp.reduce(self.log_weights, axis=1))
         hits = self.labels[:, :, None] == np.append(np.arange(n_modes), -1)
         return np.asarray(np.einsum("h,hnm->nm", weights, hits))
 
@@ -196,8 +196,13 @@ def extend(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hyp
         now = _with_veering(now, scan)
     gains = clutter_gains(now.filters, scan)
     gains += shape_gains(scan.measurements.shapes, now.filters.shapes)
-    parents, labels = _assignments(now, gains, scan, order)
     at, var = now.filters.predicted(scan.row)
+    if not opened:
+        off = scan.measurements.ln_f[:, None] - at[:, None]
+        reach = constants.INNER_GATE * np.sqrt(scan.measurements.var_f[:, None] + var[:, None])
+        near = np.abs(off) < reach
+        gains[near.any(axis=2, keepdims=True) & ~near] += np.log(constants.TAKING_PROBABILITY)
+    parents, labels = _assignments(now, gains, scan, order)
     predicted = (at[parents], var[parents])
     rows = np.arange(scan.rows.size)
     # One more column, for no mode.
@@ -210,7 +215,7 @@ def extend(now: Hypotheses, scan: Scan, order: IntArray, *, opened: bool) -> Hyp
         for i, modes in enumerate(labels[:, rising]):
             if (np.diff(predicted[0][i, modes[modes >= 0]]) < 0).any():
                 log_weights[i] += np.log(constants.REORDERING_PROBABILITY)
-    total = logsumexp(log_weights, axis=1)
+    total = np.logaddexp.reduce(log_weights, axis=1)
     kept = np.flatnonzero(total > total.max() + constants.PRUNING_LOG_ODDS)
     chosen, filters = labels[kept], now.filters[parents[kept]]
     each, detected = np.nonzero(chosen >= 0)
@@ -223,7 +228,7 @@ def _assignments(
     now: Hypotheses, gains: FloatArray, scan: Scan, order: IntArray
 ) -> tuple[IntArray, IntArray]:
     """Enumerate assignments: index of the parent hypothesis, and modes of the estimates."""
-    share = now.log_weights - logsumexp(now.log_weights, axis=1, keepdims=True)
+    share = now.log_weights - np.logaddexp.reduce(now.log_weights, axis=1, keepdims=True)
     by_mode = name_gains(scan.names[:, None], np.arange(gains.shape[2]), order)
     # Names by order are as likely under all assignments, unless modes are missing.
     named = np.log(constants.NAME_PROBABILITY * max(order.size, 1))
@@ -261,7 +266,7 @@ def _with_veering(now: Hypotheses, scan: Scan) -> Hypotheses:
 
 def normalised(log_weights: FloatArray) -> FloatArray:
     """Return log weights whose exponentials sum to 1."""
-    return np.asarray(log_weights - logsumexp(log_weights))
+    return np.asarray(log_weights - np.logaddexp.reduce(log_weights, axis=None))
 
 
 def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
@@ -270,7 +275,7 @@ def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
     Merged hypotheses have the mean and covariance of their mixture [Salmond1990]_, and the labels
     of the heaviest: read the probabilities before.
     """
-    total = logsumexp(extended.log_weights, axis=1)
+    total = np.logaddexp.reduce(extended.log_weights, axis=1)
     order = np.argsort(-total)
     order = order[total[order] > total[order[0]] + constants.PRUNING_LOG_ODDS]
     filters, weights = extended.filters[order], extended.log_weights[order]
@@ -283,10 +288,12 @@ def reduce_hypotheses(extended: Hypotheses) -> Hypotheses:
         near = _distance(filters, i, group) < constants.MERGING_DISTANCE
         group = group[(group == i) | near]
         left[group] = False
-        _merge(filters, i, group, np.exp(logsumexp(weights[group], axis=1) - total[order[0]]))
-        weights[i] = logsumexp(weights[group], axis=0)
+        _merge(
+            filters, i, group, np.exp(np.logaddexp.reduce(weights[group], axis=1) - total[order[0]])
+        )
+        weights[i] = np.logaddexp.reduce(weights[group], axis=0)
         leaders.append(i)
-    heaviest = sorted(leaders, key=lambda i: -float(logsumexp(weights[i])))
+    heaviest = sorted(leaders, key=lambda i: -float(np.logaddexp.reduce(weights[i])))
     rows = np.array(heaviest[: constants.MOST_HYPOTHESES])
     return Hypotheses(filters[rows], normalised(weights[rows]), extended.labels[order[rows]])
 
