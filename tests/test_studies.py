@@ -233,6 +233,16 @@ def test_off_model(root: Path) -> None:
     assert checks["without wander healthy lives alarm (control)"]
 
 
+def test_foreign_errors(root: Path) -> None:
+    """Close modes are kept though errors are stated 8 times too wide; as stated they are lost."""
+    answer = json.loads(run_study(root, "off_model", "foreign"))
+    checks = answer["passed"]
+    assert checks["modes kept: 8.0"]
+    assert checks["labels right: 8.0"]
+    assert checks["with errors as stated labels are missing (control)"]
+    assert answer["all"]["alarms"]["hits"] == 0
+
+
 @pytest.mark.parametrize("name", WORLDS)
 def test_worlds_off_the_model_are_drawn_with_their_truth(name: str) -> None:
     """Truth and estimates agree where nothing disturbs them; a life is known log by log."""

@@ -13,11 +13,13 @@ Method
     the trapezoidal rule in steps of its 12 Hz makes them. Control: the coverage of the building's
     windows with all standard deviations halved.
 Answer
-    Mostly. The building is healthy, its dampings are 1.4 to 1.6 %. The intervals of f are too
-    narrow: windows scatter by 1.2 to 1.5 times what is stated (ζ: 0.9 to 1.3 times), and another
-    damping in the description moves frequencies by up to 7 σ, 0.4 %. Every mode of the frame on the
-    table is right on every floor where it is not refused, and identified on one at least; the
-    stiffness ratio is 4.68. The shear frame's frequencies are those of its integration.
+    Mostly. The building is healthy, its dampings are 1.4 to 1.6 %. All 18 intervals of its thirds
+    hold the whole record. Windows scatter about the whole by 1.1 to 1.3 times what is stated in f
+    (ζ: 0.8 to 1.1 times), and another damping in the description moves frequencies by up to
+    6 σ, 0.4 %.
+    Every mode of the frame on the table is right on every floor where it is not refused, and
+    identified on one at least; the stiffness ratio is 4.68. The shear frame's frequencies are those
+    of its integration.
 Run time
     About a minute on one processor.
 Data
@@ -30,7 +32,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from itertools import combinations, product
 
-from studies.harness.claims import Claim, Older, number, percents
+from studies.harness.claims import Claim, Older, counted, number, percents, span
 from studies.harness.study import Row, Study, real_data
 from studies.modes_real.building import study_building
 from studies.modes_real.sets import Z95, study_koma, study_mpstd, study_shake, study_weimar
@@ -38,17 +40,12 @@ from studies.modes_real.sets import Z95, study_koma, study_mpstd, study_shake, s
 STEP = "identify"
 
 OLDER = {
-    "result": Older("42b2f869c506", "standard deviations allowed for an unsteady excitation"),
     "blind": Older("ced8b61ec0d6", "standard deviations allowed for an unsteady excitation"),
 }
 
 NOT_MET = {
     "building: no end of life visible": "no log excludes that an end begins within a time as short "
     "as that of all logs, here less than a day: see the onsets in lmshealth/prognosis/README.md",
-    "building: intervals of each third hold the whole": (
-        "some frequencies of a third are little more than two standard deviations off: windows "
-        "scatter by more than stated as well"
-    ),
     "building: frequencies do not depend on the described damping": (
         "the band of the fit follows from it, the noise of a real building is not as simple as the "
         "likelihood assumes, and the likelihood of close modes has several maxima"
@@ -62,6 +59,8 @@ NOT_MET = {
         "so many intervals one may miss by chance"
     ),
 }
+
+_OFF = ("f_off_in_std", "zeta_off_in_std")
 
 
 def main() -> None:
@@ -84,7 +83,7 @@ def judge_building(building: Row) -> dict[str, bool]:
     modes, n = building["modes"].values(), building["n_windows"]
     low, _, high = building["stiffness"].values()
     seen = [part for part in building["parts"] if "f_hz" in part]
-    inside = [abs(p[key]) < Z95 for p in seen for key in ("f_off_in_std", "zeta_off_in_std")]
+    inside = [abs(p[key]) < Z95 for p in seen for key in _OFF]
     found = [row for row in building["described"] if "f_hz" in row]
     apart = [
         abs(a["f_hz"] - b["f_hz"]) / max(a["f_std_hz"], b["f_std_hz"])
@@ -163,6 +162,20 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"95 % required; half the standard deviations {percents(half)}",
         all(end >= 0.95 for _, end in bounds)
         and answer["passed"]["building: intervals of each third hold the whole"],
+    )
+    yield Claim(
+        "scatter of its windows over what is stated, frequencies",
+        span(row["frequency_hz_scatter_over_std"] for row in modes),
+        f"{n} windows each",
+        "damping ratios " + span(row["damping_ratio_scatter_over_std"] for row in modes),
+    )
+    parts = [abs(p[key]) < Z95 for p in building["parts"] for key in _OFF if key in p]
+    yield counted(
+        "95 % intervals of f and ζ of its thirds hold those of the whole record",
+        sum(parts),
+        len(parts),
+        "90 % required",
+        met=sum(parts) >= 0.9 * len(parts),
     )
     light = answer["light_frame"]
     off = [abs(row["f_hz"] / row["known_f_hz"] - 1) for row in light]

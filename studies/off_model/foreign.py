@@ -2,7 +2,7 @@
 
 Method
     Masts with two pairs of close modes (1.5 to 2.5 and 4 to 8 Hz, 6 to 12 standard deviations of
-    the scatter apart) whose frequencies follow the temperature by -4e-4 per K (10 %): 130 hourly
+    the scatter apart) whose frequencies follow the temperature by -4e-4 per K (10 %): 100 hourly
     logs with a swing of 14 K of the weather and days of 6 K. Estimates scatter by 0.05 to 0.15 %; a
     tenth of them is missing, 5 % of the logs have a spurious one. Stated standard deviations are
     those of the scatter times 0.25, 1, 4, 8 or 15, and 30 % up or down from log to log. Modes have
@@ -41,7 +41,7 @@ from studies.off_model.worlds import Array
 
 STEP = "track"
 
-SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 130, 60
+SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50
 FACTORS = (0.25, 1.0, 4.0, 8.0, 15.0)
 NAMES = ("unnamed", "named", "named and described", "described")
 QUICK = (("named and described", 8.0, 0, 24), ("unnamed", 8.0, 0, 24))
@@ -68,7 +68,7 @@ def main() -> None:
     study = Study(__file__, __doc__)
     tasks = [(n, f, k, N_LOGS) for k in range(N_LIVES) for n in NAMES for f in FACTORS]
     controls = [(names, f, 0, CONTROL_LOGS) for names in NAMES for f in (4.0, 15.0)]
-    with study.pool() as pool:
+    with study.pool(4) as pool:
         rows = study.trials.collect(one, list(QUICK) if study.quick else tasks, pool=pool)
         before = study.trials.collect(one_before, QUICK[1:] if study.quick else controls, pool=pool)
     answer: Row = {
