@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from itertools import product
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -16,7 +17,9 @@ from lmshealth.tracking.association.hypotheses import (
     Scan,
     best_assignments,
     clutter_gains,
+    extend,
     name_gains,
+    normalised,
     order_gains,
     reduce_hypotheses,
     shape_gains,
@@ -121,6 +124,20 @@ def test_an_unknown_damping_is_averaged_over() -> None:
     without = clutter_gains(filters, many)[0, 0, 0]
     mean = trapezoid(constants.CLUTTER_LN_ZETA_DENSITY * np.exp(with_damping), damping)
     assert mean == pytest.approx(np.exp(without), rel=1e-6)
+
+
+@pytest.mark.parametrize(("opened", "chance"), [(False, 0.01), (True, 1.0)])
+def test_a_mode_seldom_takes_the_place_of_another(opened: bool, chance: float) -> None:
+    """An estimate at one mode is of another that strays with 1 % of the odds, unless logs open."""
+    filters = ModeFilters.empty(0, 0).start(measured([4.6, 4.608]), ROW, np.zeros(0), 50.0)
+    now = Hypotheses(filters, normalised(np.zeros((1, 2))), np.empty((1, 0), dtype=int))
+    scan = Scan(0, np.arange(1), np.array([-1]), measured([4.6]), ROW)
+    odds = []
+    for value in (constants.TAKING_PROBABILITY, 1.0):
+        with patch.object(constants, "TAKING_PROBABILITY", value):
+            found = extend(now, scan, np.empty(0, dtype=int), opened=opened).probabilities(2)[0]
+        odds.append(found[1] / found[2])
+    assert odds[0] / odds[1] == pytest.approx(chance)
 
 
 def test_far_dampings_are_not_merged() -> None:
