@@ -3,16 +3,20 @@
 Method
     Masts with two pairs of close modes (1.5 to 2.5 and 4 to 8 Hz, 6 to 12 standard deviations of
     the scatter apart) whose frequencies follow the temperature by -4e-4 per K (10 %): 100 hourly
-    logs with a swing of 14 K of the weather and days of 6 K. Estimates scatter by 0.05 to 0.15 %; a
+    logs with a swing of up to 14 K of the weather and days of 6 K. Estimates scatter by 0.05 to 0.15 %; a
     tenth of them is missing, 5 % of the logs have a spurious one. Stated standard deviations are
     those of the scatter times 0.25, 1, 4, 8 or 15, and 30 % up or down from log to log. Modes have
     no name, the right name (without and with a description of modes and temperature), or only a
     description. Judged are labels, modes, alarms and 90 % intervals of the temperature's slopes.
     Control, which must fail: association that takes stated errors as they are, as before.
 Answer
-    PENDING
+    Yes, in all 100 lives. 94 to 98 % of the estimates have a label, whatever is stated, and 99.9 %
+    of these the right one (control: 9 % have one); 392 of 400 slopes lie inside their intervals.
+    Most of the rest is ambiguous, most often where the table has no names. One life alarms: its
+    modes have only a description, by whose nearest frequency estimates are named, though the
+    temperature moves them by as much as they are apart.
 Run time
-    PENDING
+    About five minutes of one processor.
 """
 
 from __future__ import annotations
@@ -68,7 +72,7 @@ def main() -> None:
     study = Study(__file__, __doc__)
     tasks = [(n, f, k, N_LOGS) for k in range(N_LIVES) for n in NAMES for f in FACTORS]
     controls = [(names, f, 0, CONTROL_LOGS) for names in NAMES for f in (4.0, 15.0)]
-    with study.pool(4) as pool:
+    with study.pool() as pool:
         rows = study.trials.collect(one, list(QUICK) if study.quick else tasks, pool=pool)
         before = study.trials.collect(one_before, QUICK[1:] if study.quick else controls, pool=pool)
     answer: Row = {
