@@ -3,7 +3,7 @@
 Method
     Masts with two pairs of close modes (1.5 to 2.5 and 4 to 8 Hz, 6 to 12 standard deviations of
     the scatter apart) whose frequencies follow the temperature by -4e-4 per K (10 %): 100 hourly
-    logs with a swing of up to 14 K of the weather and days of 6 K. Estimates scatter by 0.05 to 0.15 %; a
+    logs, with up to 14 K by the weather and 6 K by the day. Estimates scatter by 0.05 to 0.15 %; a
     tenth of them is missing, 5 % of the logs have a spurious one. Stated standard deviations are
     those of the scatter times 0.25, 1, 4, 8 or 15, and 30 % up or down from log to log. Modes have
     no name, the right name (without and with a description of modes and temperature), or only a
