@@ -90,9 +90,7 @@ class Assessment:
             return health
         chains = np.array(health.chains)
         pooled = chains[-1].reshape(-1, len(health.parameters))[::2]
-        by_laws = prognosis.health[
-            np.linspace(0, len(prognosis.health) - 1, len(pooled), dtype=int)
-        ]
+        rows = np.linspace(0, len(prognosis.health) - 1, len(pooled), dtype=int)
         for j, name in enumerate(health.parameters):
             if name in prognosis.parameters:
                 pooled[:, j] = prognosis.health[rows, prognosis.parameters.index(name)]
