@@ -11,7 +11,7 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Verdict, degraded_words, undeclared_events
+from lmshealth.health.verdict import Verdict, degraded_below, degraded_words, undeclared_events
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
@@ -83,10 +83,17 @@ class Assessment:
     def present(self) -> Health | None:
         """The health that gauges and the verdict show.
 
-        Its last epoch is pooled in equal parts with health now by the laws where both disagree.
+        Its last epoch is pooled in equal parts with health now by the laws where both disagree:
+        about an interval, or whether most draws are degraded.
         """
         health, prognosis = self.health, self.prognosis
-        if health is None or prognosis is None or not any(disagreements(self)):
+        both = list(_by_both_methods(self))
+        degraded = [
+            {np.median(draws) < degraded_below(spec) / spec.baseline for draws in own}
+            for spec, *own in both
+        ]
+        apart = any(disagreements(self)) or any(len(one) > 1 for one in degraded)
+        if health is None or prognosis is None or not apart:
             return health
         chains = np.array(health.chains)
         pooled = chains[-1].reshape(-1, len(health.parameters))[::2]
@@ -312,17 +319,23 @@ def disagreements(assessment: Assessment) -> Iterator[tuple[str, FloatArray, Flo
 
     After the name draws of health now by either, as fractions of the baseline.
     """
-    health, prognosis = assessment.latest_health, assessment.prognosis
-    if health is None or prognosis is None:
-        return
-    baselines = {spec.name: spec.baseline for spec in assessment.stage.parameters}
-    for k in np.flatnonzero(health.publishable_parameters()).tolist():
-        name, by_epoch = health.parameters[k], health.samples[-1, :, k]
-        if name not in prognosis.parameters:
-            continue
-        by_laws = prognosis.health[:, prognosis.parameters.index(name)] / baselines[name]
+    for spec, by_epoch, by_laws in _by_both_methods(assessment):
         (low, high), (least, most) = (
             np.quantile(draws, (0.05, 0.95)).tolist() for draws in (by_epoch, by_laws)
         )
         if low > most or least > high:
-            yield name, by_epoch, by_laws
+            yield spec.name, by_epoch, by_laws
+
+
+def _by_both_methods(
+    assessment: Assessment,
+) -> Iterator[tuple[ParameterSpec, FloatArray, FloatArray]]:
+    """Yield the published parameters that have a limit, with draws as `disagreements` does."""
+    health, prognosis = assessment.latest_health, assessment.prognosis
+    if health is None or prognosis is None:
+        return
+    specs = {spec.name: spec for spec in assessment.stage.parameters}
+    for k in np.flatnonzero(health.publishable_parameters()).tolist():
+        if (name := health.parameters[k]) in prognosis.parameters:
+            by_laws = prognosis.health[:, prognosis.parameters.index(name)] / specs[name].baseline
+            yield specs[name], health.samples[-1, :, k], by_laws

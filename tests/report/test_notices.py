@@ -12,6 +12,7 @@ from lmshealth.health.verdict import judge
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import COLUMNS, machine_tables
+from tests.assessments import PARAMETERS as PARTS
 from tests.assessments import Assessment, Maker, make, nothing
 
 __all__ = ["make"]
@@ -89,6 +90,22 @@ def test_a_healthy_epoch_does_not_hide_an_end_by_the_laws(make: Maker) -> None:
     found = judge(both.stage, both.history, both.present)
     assert both.service().kind == "now"
     assert found.verdict == "both" and found.probability == pytest.approx(0.5, abs=1e-3)
+
+
+def test_methods_that_overlap_but_differ_about_the_verdict_are_pooled(make: Maker) -> None:
+    """A preload that is healthy by the epoch and degraded by the laws is neither for sure."""
+    good = make()
+    assert good.health is not None and good.prognosis is not None
+    rng = np.random.default_rng(1)
+    chains = [0.91, 0.99] * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
+    draws = good.prognosis.health * 0 + 0.885 * np.exp(0.01 * rng.standard_normal((4000, 1)))
+    draws[:, 1] = 0.99
+    edge = replace(good, health=replace(good.health, chains=chains),
+                   prognosis=replace(good.prognosis, health=draws))  # fmt: skip
+    assert "methods-disagree" not in {one.code for one in notices(edge) if one.where != PARTS[1]}
+    alone, pooled = (judge(edge.stage, edge.history, h) for h in (edge.health, edge.present))
+    assert (alone.verdict, pooled.verdict) == ("healthy", "preload")
+    assert alone.probability > 0.7 and pooled.probability < 0.7
 
 
 def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) -> None:
