@@ -422,6 +422,7 @@ def test_calibration_needs_as_many_lives_as_support_it() -> None:
     assert far is not None and np.isinf(far.travel)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("n", [9, 25])
 def test_calibrated_travel_is_outlived_as_often_as_stated(n: int) -> None:
     """Whatever the law of places; a quantile of the prognosis itself is outlived far less often."""
@@ -438,6 +439,7 @@ def test_calibrated_travel_is_outlived_as_often_as_stated(n: int) -> None:
     assert np.mean(by_model) < 0.8
 
 
+@pytest.mark.slow
 def test_the_end_of_a_life_is_placed_in_what_was_predicted_of_it(
     small_grid: None, stage: Stage
 ) -> None:
