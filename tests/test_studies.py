@@ -506,7 +506,7 @@ def test_errors_of_the_map(root: Path) -> None:
     """A mode that drifts by 30 % more is named with its size, and none with the exact map."""
     worlds = json.loads(run_study(root, "off_model", "map_errors"))["worlds"]
     assert (worlds["exact"]["n"], worlds["exact"]["warned"]) == (1, 0)
-    assert (worlds["roll"]["n"], worlds["roll"]["named"]) == (1, 1)
+    assert (worlds["pitch"]["n"], worlds["pitch"]["named"]) == (1, 1)
 
 
 def test_calibration_by_ended_lives(root: Path) -> None:

@@ -1,7 +1,7 @@
 """Is a mode that disagrees with the map named, and none where the map is right?
 
 Method
-    Preloads of stage Y that lose 20 to 32 % over 20 logs by a power of 0.9 to 1.2, with estimates
+    Preloads of stage Y that lose 28 to 38 % over 20 logs by a power of 0.9 to 1.2, with estimates
     as identified, and a mount that keeps its stiffness. The drifts of the modes follow the shipped
     map exactly, or those of one mode are 30 % larger. A life is warned of if `modes_off_map`
     returns a mode; it names the right one if that is the first. Control: the exact map, where at
@@ -30,7 +30,7 @@ from studies.off_model.worlds import LN_F, LN_ZETA, MODES, STD_F, STD_ZETA
 
 STEP = "prognose"
 SEED, N_LOGS, LENGTH_M = 20261126, 20, 2e6
-N_EXACT, N_WRONG, SIZE = 80, 16, 0.3
+N_EXACT, N_WRONG, SIZE = 60, 12, 0.3
 MOST_FALSE, LEAST_NAMED = 0.02, 0.8
 EXACT = "exact"
 
@@ -40,7 +40,7 @@ def main() -> None:
     study = Study(__file__, __doc__)
     n_exact, n_wrong = (1, 1) if study.quick else (N_EXACT, N_WRONG)
     tasks = [(EXACT, k) for k in range(n_exact)]
-    tasks += [(mode, k) for k in range(n_wrong) for mode in MODES[: 1 if study.quick else None]]
+    tasks += [(mode, k) for k in range(n_wrong) for mode in (MODES[1:2] if study.quick else MODES)]
     rows = study.trials.collect(one, tasks)
     answer: Row = {"seed": SEED, "size": SIZE, "worlds": {}}
     for world in dict.fromkeys(world for world, _ in tasks):
@@ -54,7 +54,7 @@ def main() -> None:
             "std": float(np.median([row["std"] for row in named])) if named else None,
         }
     answer["passed"] = verdicts(answer["worlds"])
-    study.conclude(answer)
+    study.conclude(answer, quick_may_fail=True)
 
 
 @cache
@@ -68,7 +68,7 @@ def one(world: str, number_: int) -> Row:
     rng = np.random.default_rng([SEED, number_, [EXACT, *MODES].index(world)])
     u = np.r_[0.0, np.sort(rng.uniform(size=N_LOGS - 2)), 1.0]
     x = np.tile(stage().baseline_point, (N_LOGS, 1))
-    x[:, 0] += np.log1p(-rng.uniform(0.2, 0.32) * u ** rng.uniform(0.9, 1.2))
+    x[:, 0] += np.log1p(-rng.uniform(0.28, 0.38) * u ** rng.uniform(0.9, 1.2))
     drift = stage().drift(x, MODES)
     if world != EXACT:
         drift[:, MODES.index(world)] *= 1 + SIZE
