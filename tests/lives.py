@@ -290,21 +290,7 @@ def seen_by(
 
 def cut(history: History, n: int) -> History:
     """Give the first logs of a history."""
-    return replace(
-        history,
-        logs=history.logs[:n],
-        recorded_at=history.recorded_at[:n],
-        travel=history.travel[:n],
-        covariates={name: values[:n] for name, values in history.covariates.items()},
-        ln_frequency=history.ln_frequency[:n],
-        ln_damping=history.ln_damping[:n],
-        cov=history.cov[:n],
-        loop_error=history.loop_error[:n],
-        baselines=tuple(first for first in history.baselines if first < n),
-        steps=tuple(
-            replace(step, there=step.there[:n]) for step in history.steps if step.first < n
-        ),
-    )
+    return history.first_logs(n)
 
 
 def make_track(drift: FloatArray, cov: FloatArray) -> Track:

@@ -476,7 +476,8 @@ def test_blind_lives(root: Path) -> None:
     answer = json.loads(run_study(root, "blind_lives"))
     assert all(answer["passed"].values())
     told = answer["verdicts"]["all"]
-    assert told["right"]["n"] == 2
+    # The third is of a drawn machine, from estimates.
+    assert (told["right"]["n"], answer["drawn"], answer["front_page"]["n"]) == (3, 1, 2)
     found = told["told_of_true"]
     assert [found[word][word] for word in ("healthy", "not-enough-data")] == [1, 1]
 
@@ -509,6 +510,19 @@ def test_rul_metrics(root: Path) -> None:
         # Knowing that the map is right can only help.
         bounds = cut["bound"]
         assert bounds["map right"]["accurate"] > bounds["map to 5 %"]["accurate"]
+
+
+def test_errors_of_the_map(root: Path) -> None:
+    """A mode that drifts by 30 % more is named with its size, and none with the exact map."""
+    worlds = json.loads(run_study(root, "off_model", "map_errors"))["worlds"]
+    assert (worlds["exact"]["n"], worlds["exact"]["warned"]) == (1, 0)
+    assert (worlds["pitch"]["n"], worlds["pitch"]["named"]) == (1, 1)
+
+
+def test_calibration_by_ended_lives(root: Path) -> None:
+    """A fleet with one ended life and one machine is predicted, and too small to be judged."""
+    answer = json.loads(run_study(root, "fleet_prior", "conformal"))
+    assert (answer["ended"], answer["running"], "ways" in answer) == (1, 1, False)
 
 
 def test_fleet_prior(root: Path) -> None:

@@ -20,8 +20,12 @@ from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.io.log import Notice
 from lmshealth.prognosis.fleet_prior import (
+    EndedLife,
+    FleetContribution,
     FleetPrior,
     MachineEvidence,
+    calibrate,
+    ended_lives,
     fleet_priors,
     machine_evidence,
 )
@@ -111,7 +115,7 @@ def assess(
         latest=used[-1] if used else None,
     )
     made = _with_results(made, used, epochs, executor)
-    judgement = judge(stage, history, made.health, made.track, doubt=made.doubt)
+    judgement = judge(stage, history, made.present, made.track, doubt=made.doubt)
     return replace(made, judgement=judgement)
 
 
@@ -133,6 +137,8 @@ def _with_results(
         has_limit = any(parameter.limit for parameter in stage.parameters)
         mapper = map if executor is None else partial(map_in_order, executor)
         life = mapper(_prognose, [history], [stage], [seed]) if has_limit else None
+        if has_limit:
+            made = replace(made, ended=ended_lives(history, stage, seed))
         chosen = epochs_to_infer(tracked, stage, epochs)
         made = replace(made, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
         if life is None:
@@ -240,7 +246,7 @@ def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
 
 def pack_assessment(assessment: Assessment) -> PackedAssessment:
     """Encode an assessment for the store."""
-    evidence = pack(assessment.evidence)
+    evidence = pack(FleetContribution(assessment.evidence, assessment.ended))
     summary = pack(summarise(assessment, assessment.service()))
     return PackedAssessment(pack(assessment), evidence, summary)
 
@@ -265,7 +271,7 @@ def _assess_packed(
 def apply_fleet_priors(
     machines: Sequence[Machine], resources: Resources, *, force: Container[str] = ()
 ) -> tuple[dict[str, str], dict[str, str]]:
-    """Recompute the prognosis of young machines with the prior of their fleet.
+    """Recompute prognoses of young machines with the prior of their fleet; calibrate the others.
 
     A fleet is all machines of one description. The result of machines named by ``force`` is
     computed although it is in the store. Return the key of the assessment of each machine to
@@ -274,17 +280,20 @@ def apply_fleet_priors(
     store, failed = resources.store, dict[str, str]()
     keys = {machine.name: machine.key for machine in machines}
     left = []
-    for machine, prior in _machines_to_update(machines, store):
-        key = fingerprint(machine.key, prior)
+    for machine, prior, ended in _machines_to_update(machines, store):
+        key = fingerprint(machine.key, prior, ended)
         if machine.name not in force and store.has_assessment(machine.name, key):
             keys[machine.name] = key
         else:
-            left.append((machine, prior, key))
+            left.append((machine, key, prior, ended))
     if left:
         resources.progress("fleet priors", 0, len(left))
-    updates = ((m.name, key, store.assessment(m.name, m.key), prior) for m, prior, key in left)
+    updates = (
+        (m.name, key, store.assessment(m.name, m.key), prior, ended)
+        for m, key, prior, ended in left
+    )
     done = resources.pool.map_unordered(_update, updates, lambda _, why: why)
-    for k, ((name, key, _, _), made) in enumerate(done, start=1):
+    for k, ((name, key, _, _, _), made) in enumerate(done, start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(name, key, made)
             keys[name] = key
@@ -296,31 +305,40 @@ def apply_fleet_priors(
 
 def _machines_to_update(
     machines: Sequence[Machine], store: Store
-) -> Iterator[tuple[Machine, FleetPrior]]:
-    """Find the machines of each description that need a fleet prior, and their priors."""
+) -> Iterator[tuple[Machine, FleetPrior | None, tuple[EndedLife, ...]]]:
+    """Find the machines that need a fleet prior, and their priors; the others with ended lives.
+
+    Predictions of ended lives are by the description, as are those that they calibrate.
+    """
     fleets: dict[str, dict[str, Machine]] = {}
     for machine in machines:
         fleets.setdefault(machine.stage.digest, {})[machine.name] = machine
     for fleet in fleets.values():
-        evidence = {}
-        for name, machine in fleet.items():
+        evidence, ended = {}, list[EndedLife]()
+        for name, machine in sorted(fleet.items()):
             content = store.evidence(name, machine.key)
-            if (own := unpack_or_none(content, MachineEvidence | None)) is not None:
-                evidence[name] = own
-        if evidence:
-            stage = next(iter(fleet.values())).stage
-            priors = fleet_priors(stage, evidence)
-            yield from ((fleet[name], prior) for name, prior in priors.items())
+            if (own := unpack_or_none(content, FleetContribution)) is not None:
+                ended += own.ended
+                if own.evidence is not None:
+                    evidence[name] = own.evidence
+        priors = fleet_priors(next(iter(fleet.values())).stage, evidence) if evidence else {}
+        yield from ((fleet[name], prior, ()) for name, prior in priors.items())
+        if ended:
+            yield from ((fleet[m], None, tuple(ended)) for m in evidence if m not in priors)
 
 
-def _update(job: tuple[str, str, bytes | None, FleetPrior]) -> PackedAssessment | str | None:
-    """Recompute a prognosis; None where it cannot be decoded, else why that fails."""
-    machine, _, content, prior = job
+def _update(
+    job: tuple[str, str, bytes | None, FleetPrior | None, tuple[EndedLife, ...]],
+) -> PackedAssessment | str | None:
+    """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
+    machine, _, content, prior, ended = job
 
     def work() -> PackedAssessment | None:
         found: Assessment | None = unpack_or_none(content, Assessment)
-        if found is None or found.track is None:
+        if found is None or found.track is None or found.prognosis is None:
             return None
+        if prior is None:
+            return pack_assessment(replace(found, calibration=calibrate(found.prognosis, ended)))
         history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
         prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
         return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))

@@ -229,8 +229,8 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
         below = health.samples[-1, :, j] < degraded_below(parameter)
         lost[parameter.word] = lost.get(parameter.word, False) | below
     draws = Counter(map(tuple, np.column_stack(list(lost.values())).tolist()))
-    # Of equally probable verdicts the one with fewer degraded parameters.
-    degraded, count = max(draws.items(), key=lambda one: (one[1], -sum(one[0]), one[0]))
+    # Of equally probable verdicts the one with more degraded parameters: it allows for more.
+    degraded, count = max(draws.items(), key=lambda one: (one[1], sum(one[0]), one[0]))
     verdict, probability = verdict_of(tuple(compress(lost, degraded))), count / draws.total()
     why = _parameter_sentences(stage, health)
     return Verdict(history.stage, history.recorded_at[-1], verdict, probability, why)

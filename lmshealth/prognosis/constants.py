@@ -32,6 +32,13 @@ DEVIATION_STDS = (0.0, 0.0125, 0.05)
 grow to a tenth and to a third of the loss at a limit of 0.6 over ten times the travel seen."""
 DEVIATION_PRIOR = (0.6, 0.3, 0.1)
 
+# Modes that disagree with the map, see README.md.
+MAP_DOUBT = 0.95
+"""Probability that the map is worse than declared at which modes are named: an error of a single
+drift by 3.4 of its declared standard deviations, which chance makes in one life of 1500."""
+MODE_ERROR_STD = 0.5
+"""Relative error of a mode that disagrees: from none to a drift twice that of the map, or none."""
+
 # Posterior over scenarios, see README.md.
 MIN_PROBABILITY = 0.01
 """Scenarios with a lower probability are not published."""
@@ -69,6 +76,17 @@ FLEET_VARIANCE = (np.arange(12) + 0.5) / 12
 fifth of the prior's standard deviation: machines that are more alike change no date."""
 FLEET_DIGITS = 2
 """Significant digits of a fleet prior: with more, one new log would recompute a whole fleet."""
+
+# Calibration by ended lives, see README.md.
+CALIBRATED_RISK = 0.1
+"""Share of machines that may end before the calibrated travel: nine ended lives are the least that
+support it; 5 % would need nineteen, more than most fleets have."""
+LIFE_SHARES = (0.3, 0.6, 0.9)
+"""Shares of an ended life after which its end is predicted: young, middle-aged and old."""
+MIN_PAST = 0.5
+"""Probability of being past a limit at its last log from which an ended life has reached it."""
+SURPRISE = 0.01
+"""Probability of as many early ends, were the predictions right, below which they are noticed."""
 
 INSPECTION_RISK = 0.2
 """Share of the accepted risk that may come from ends between two logs that no log announced: small,

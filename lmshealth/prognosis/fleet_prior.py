@@ -1,27 +1,32 @@
-"""Prior of a degradation law from the other machines of the description (empirical Bayes).
+"""What a fleet contributes: a prior of its laws (empirical Bayes), and calibration by ended lives.
 
-README.md has the model.
+README.md has both models.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from itertools import pairwise
 
 import msgspec
 import numpy as np
 from scipy.special import betainc, logsumexp, softmax
+from scipy.stats import binom
 
 from lmshealth._arrays import FloatArray
 from lmshealth._serialize import fingerprint
+from lmshealth.errors import LmshealthError
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior
-from lmshealth.prognosis.remaining_life import identifiable_limits
+from lmshealth.prognosis.remaining_life import identifiable_limits, prognose
+from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.degradation_laws import AnyLaw, Law
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal
+from lmshealth.tracking.history import History
 
 _MEAN, _VARIANCE = constants.FLEET_MEAN, constants.FLEET_VARIANCE
 # Log prior of mean and variance at their grid: N(0, 1 - v) and U(0, 1).
@@ -305,3 +310,92 @@ def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawE
         pairs = zip((before / before.sum()).tolist(), after.tolist(), strict=True)
         found[field] = tuple(LawEvidence(b, min(a, 1.0), _NO_PACE) for b, a in pairs)
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class EndedLife:
+    """A life that maintenance ended, and the place of its end in what was predicted of it.
+
+    `place` is the probability that was predicted for an end as early as the true one, the least
+    over `constants.LIFE_SHARES` of the life. One that was serviced before any limit (not `reached`)
+    counts as if it had ended at its last log: its true place is later.
+    """
+
+    place: float
+    reached: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FleetContribution:
+    """What a machine contributes to its fleet: evidence for the prior, and its ended lives."""
+
+    evidence: MachineEvidence | None
+    ended: tuple[EndedLife, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Calibration:
+    """Remaining travel that a share of machines outlives at least, by the ended lives of a fleet.
+
+    `coverage` is that share, 1 - k / (n + 1) for the k-th smallest place of n lives; `travel` in m
+    is infinite beyond the horizon. `early` lives ended before the travel predicted for a tenth;
+    with right predictions as many have the probability `p_value`.
+    """
+
+    n_lives: int
+    n_reached: int
+    coverage: float
+    travel: float
+    early: int
+    p_value: float
+
+
+def ended_lives(history: History, stage: Stage, seed: int | Sequence[int]) -> tuple[EndedLife, ...]:
+    """Predict the ends of the lives before the present baseline, and compare with their ends.
+
+    Lives that are too short for a prognosis are left out.
+    """
+    found = []
+    for _, end in pairwise(history.baselines):
+        try:
+            found.append(_ended_life(history.first_logs(end), stage, seed))
+        except LmshealthError:
+            continue
+    return tuple(one for one in found if one is not None)
+
+
+def _ended_life(history: History, stage: Stage, seed: int | Sequence[int]) -> EndedLife | None:
+    clock, needed = history.clock(), stage.description.baseline.logs
+    left = prognose(history, stage, seed, chains=False).remaining[:, -1]
+    reached = bool(np.mean(left <= 0) >= constants.MIN_PAST)
+    end = float(clock[-1] + (np.median(left) if reached else 0.0))
+    places = []
+    for share in constants.LIFE_SHARES:
+        n = int(np.searchsorted(clock, share * end, side="right"))
+        if n - history.baseline >= needed and clock[n - 1] < end:
+            young = prognose(history.first_logs(n), stage, seed, chains=False)
+            places.append(float(np.mean(young.remaining[:, -1] <= end - clock[n - 1])))
+    return EndedLife(min(places), reached) if places else None
+
+
+def calibrate(prognosis: Prognosis, lives: Sequence[EndedLife]) -> Calibration | None:
+    """Return the calibrated remaining travel to any limit (split conformal, one-sided).
+
+    None with fewer ended lives than `constants.CALIBRATED_RISK` needs.
+    """
+    n, places = len(lives), sorted(one.place for one in lives)
+    k = int(constants.CALIBRATED_RISK * (n + 1))
+    if k < 1:
+        return None
+    level, left = places[k - 1], 0.0
+    if level > 0:  # else an end came before every draw, and no travel is supported
+        left = float(np.quantile(prognosis.remaining[:, -1], level, method="inverted_cdf"))
+    early = sum(place < constants.CALIBRATED_RISK for place in places)
+    return Calibration(
+        n_lives=n,
+        n_reached=sum(one.reached for one in lives),
+        coverage=1 - k / (n + 1),
+        travel=np.inf if left > prognosis.horizon else max(left, 0.0),
+        early=early,
+        p_value=float(binom.sf(early - 1, n, constants.CALIBRATED_RISK)),
+    )

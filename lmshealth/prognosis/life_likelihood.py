@@ -110,7 +110,7 @@ class NodeBasis(ReadOnly):
             y = scenario.draw(rng, _N_EXAMPLES if scenario.n_dim else 1)
             x, inside = ln_health(data.stage, scenario, y, data.clock)
             if inside.any():
-                examples.append(_drifts(data, x[inside]).reshape(-1, n_logs))
+                examples.append(drifts(data, x[inside]).reshape(-1, n_logs))
         if not examples:
             raise NotEnoughData(f"{data.stage.name}: no life of the prior stays inside the map")
         # The R of each part has the columns' geometry of the part.
@@ -132,7 +132,7 @@ class Grid(Rows):
 
     `design` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``; `target` is
     Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest` the χ² that no life explains, and `log_weight` the log
-    prior minus ln |L|, both ``(n_points,)``.
+    prior minus ln |L|, both ``(n_points,)``. `map_std` may have a column per mode.
     """
 
     walk: FloatArray
@@ -205,6 +205,16 @@ class LifeLikelihood:
         chi_square = grid.rest[:, None] + np.sum(r * r, axis=2) - np.sum(w * solved, axis=2)
         return chi_square, np.linalg.slogdet(m)[1]
 
+    def map_errors(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the errors of the map in standard deviations.
+
+        Given a life and all data: ``(n_points, n, n_errors)`` and ``(…, n_errors, n_errors)``,
+        those of all parameters at the first mode first.
+        """
+        r, v, m = self._residuals(grid, x)
+        cov = np.asarray(np.linalg.inv(m), dtype=float)
+        return (cov @ (v @ r[..., None]))[..., 0], cov
+
     def deviation(
         self, grid: Grid, k: int, x: FloatArray, moments: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
@@ -241,12 +251,12 @@ class LifeLikelihood:
         Shapes ``(n_points, n, n_rows)``, ``(n_points, n, n_errors, n_rows)`` and
         ``(n_points, n, n_errors, n_errors)``, with an error per parameter and mode.
         """
-        drift = _drifts(self.data, x)
+        drift = drifts(self.data, x)
         n_modes, n_paths, n, n_nodes = drift.shape
         white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
         white = white.reshape(-1, n_modes, n_paths, n, grid.target.shape[1])
         r = grid.target[:, None] - white[:, :, 0].sum(axis=1)
-        white = grid.map_std[:, None, None, None, None] * white[:, :, 1:]
+        white = grid.map_std.reshape(len(r), -1, 1, 1, 1) * white[:, :, 1:]
         v = np.moveaxis(white, 3, 1).reshape(*r.shape[:2], -1, r.shape[2])
         return r, v, np.eye(v.shape[2]) + v @ np.swapaxes(v, 2, 3)
 
@@ -266,7 +276,7 @@ def ln_health(
     return x, np.asarray(stage.modal_map.inside(x).all(axis=1))
 
 
-def _drifts(data: LifeData, x: FloatArray) -> FloatArray:
+def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     """Return the drifts along lives, then of each parameter alone, at ln parameters of `ln_health`.
 
     Shape ``(n_modes, 1 + n_parameters, n, n_moments)``.

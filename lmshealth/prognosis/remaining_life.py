@@ -11,6 +11,7 @@ from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.map_error import modes_off_map
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.prognosis.scenarios import DegradationPath
 from lmshealth.stage.degradation_laws import Accelerating, Law
@@ -80,7 +81,7 @@ def prognose_with_posterior(
     """Return the prognosis and the posterior of the life; see `prognose`."""
     if not parameters_with_limit(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
-    seeds = stream(seed, _STEP).spawn(3)
+    seeds = stream(seed, _STEP).spawn(4)
     life = fit_life(history, stage, seed, chains=chains)
     limited = identifiable_limits(stage, life.modes)
     if not limited:
@@ -90,7 +91,7 @@ def prognose_with_posterior(
         )
     horizon = stage.description.usage.horizon_km * _KM
     since = float(history.travel[-1] - history.travel[history.baseline])
-    of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds)
+    of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds[:3])
     remaining, half = _passages(life, limited, of_passage, now=since, horizon=horizon)
     usage = _usage(history, stage, of_usage, remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
@@ -123,6 +124,7 @@ def prognose_with_posterior(
         deviation=life.deviation,
         ess=life.ess,
         r_hat=life.worst_r_hat,
+        modes_off=modes_off_map(life, seeds[3]),
     )
     return found, life
 

@@ -23,6 +23,20 @@ class LawWeight:
     probability: float
 
 
+@dataclass(frozen=True, slots=True)
+class ModeError:
+    """Relative error of the map's drift of a mode now, if the map is right about the others.
+
+    `size` is positive where the mode drifts by more than the map predicts; `probability` is that it
+    is this mode about which the map is wrong.
+    """
+
+    mode: str
+    size: float
+    std: float
+    probability: float
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Prognosis:
     """Remaining useful life of one machine, of which `n` health parameters have a limit."""
@@ -57,6 +71,8 @@ class Prognosis:
     deviation: float
     ess: float  # ess, r_hat: worst of all law parameters
     r_hat: float
+    # Modes that disagree with the map, the most probable first; empty if none has to.
+    modes_off: tuple[ModeError, ...] = ()
 
     def __post_init__(self) -> None:
         n = len(self.parameters)

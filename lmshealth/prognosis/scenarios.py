@@ -13,6 +13,7 @@ from itertools import product
 import numpy as np
 
 from lmshealth._arrays import FloatArray
+from lmshealth.health.constants import STEP_PROBABILITY
 from lmshealth.prognosis import constants
 from lmshealth.stage.degradation_laws import Law
 from lmshealth.stage.description import ParameterSpec
@@ -134,20 +135,30 @@ def list_scenarios(
 ) -> tuple[Scenario, ...]:
     """List the scenarios of a life with their prior probabilities.
 
-    Steps, ascending, and the last log by their travel in m since the baseline.
+    Steps, ascending, and the last log by their travel in m since the baseline. The tracker found
+    the steps in the same logs: that there are none competes with them.
     """
-    choices = []
-    for parameter in parameters:
-        total = sum(law.weight for law in parameter.laws)
-        own: list[tuple[DegradationPath, float]] = []
-        for law in parameter.laws:
-            # A law with parameters may restart at the last step if travel follows it.
-            restarts = law.names and steps and 0 < steps[-1] < now
-            begins = (0.0, steps[-1]) if restarts else (0.0,)
-            share = law.weight / total / len(begins)
-            own += [(DegradationPath(law, begin, tuple(steps)), share) for begin in begins]
-        choices.append(own)
-    return tuple(
-        Scenario(tuple(path for path, _ in one), now, float(np.prod([share for _, share in one])))
-        for one in product(*choices)
-    )
+    found = []
+    certain = STEP_PROBABILITY if steps else 1.0
+    for taken, probability in ((tuple(steps), certain), ((), 1 - certain)):
+        if probability:
+            choices = [_paths(parameter, taken, now) for parameter in parameters]
+            for one in product(*choices):
+                weight = probability * float(np.prod([share for _, share in one]))
+                found.append(Scenario(tuple(path for path, _ in one), now, weight))
+    return tuple(found)
+
+
+def _paths(
+    parameter: ParameterSpec, steps: tuple[float, ...], now: float
+) -> list[tuple[DegradationPath, float]]:
+    """List the paths of a health parameter with their prior probabilities."""
+    total = sum(law.weight for law in parameter.laws)
+    found: list[tuple[DegradationPath, float]] = []
+    for law in parameter.laws:
+        # A law with parameters may restart at the last step if travel follows it.
+        restarts = law.names and steps and 0 < steps[-1] < now
+        begins = (0.0, steps[-1]) if restarts else (0.0,)
+        share = law.weight / total / len(begins)
+        found += [(DegradationPath(law, begin, steps), share) for begin in begins]
+    return found

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime
 from typing import Literal
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Verdict, degraded_words, undeclared_events
+from lmshealth.health.verdict import Verdict, degraded_below, degraded_words, undeclared_events
 from lmshealth.io.log import Notice, Refusal
-from lmshealth.prognosis.fleet_prior import FleetPrior, MachineEvidence
+from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report import constants
@@ -47,11 +47,24 @@ class Assessment:
     evidence: MachineEvidence | None = None
     # Fleet prior of the prognosis; None when it rests on the prior of the description.
     fleet: FleetPrior | None = None
+    # Lives before the present baseline, and what those of the fleet support; None with too few.
+    ended: tuple[EndedLife, ...] = ()
+    calibration: Calibration | None = None
     doubt: str = ""  # why the names of the modes are in doubt; then there is no health
 
     def service(self) -> Service:
-        """Choose the day of the service by the rule of the description."""
-        return decide(self.prognosis, self.stage.description.decision)
+        """Choose the day of the service by the rule of the description.
+
+        It is now where the health that is shown is below a limit with more than the accepted risk.
+        """
+        decision = self.stage.description.decision
+        found = decide(self.prognosis, decision)
+        below = max((own.below_limit for own in _parameters(self) if own.determined), default=0.0)
+        if found.kind in ("by", "later") and below > (decision.accepted or np.inf):
+            day = self.judgement.recorded_at.date()
+            now = replace(found, kind="now", by=day, wait=0.0, risk=max(found.risk, below))
+            return replace(now, inspect_by=day, earliest_end=day)
+        return found
 
     @property
     def alarmed(self) -> tuple[str, ...]:
@@ -64,7 +77,33 @@ class Assessment:
     @property
     def latest_health(self) -> Health | None:
         """The health as fractions of the baseline, if it has an epoch and a parameter."""
-        health = self.health
+        return self._relative(self.health)
+
+    @property
+    def present(self) -> Health | None:
+        """The health that gauges and the verdict show.
+
+        Its last epoch is pooled in equal parts with health now by the laws where both disagree:
+        about an interval, or whether most draws are degraded.
+        """
+        health, prognosis = self.health, self.prognosis
+        both = list(_by_both_methods(self))
+        degraded = [
+            {np.median(draws) < degraded_below(spec) / spec.baseline for draws in own}
+            for spec, *own in both
+        ]
+        apart = any(disagreements(self)) or any(len(one) > 1 for one in degraded)
+        if health is None or prognosis is None or not apart:
+            return health
+        chains = np.array(health.chains)
+        pooled = chains[-1].reshape(-1, len(health.parameters))[::2]
+        rows = np.linspace(0, len(prognosis.health) - 1, len(pooled), dtype=int)
+        for j, name in enumerate(health.parameters):
+            if name in prognosis.parameters:
+                pooled[:, j] = prognosis.health[rows, prognosis.parameters.index(name)]
+        return replace(health, chains=chains)
+
+    def _relative(self, health: Health | None) -> Health | None:
         if health is None or not (health.recorded_at and health.parameters):
             return None
         specs = {spec.name: spec.baseline for spec in self.stage.parameters}
@@ -131,6 +170,7 @@ class Life:
     laws: tuple[LawWeight, ...]
     # Parameters with a limit that the modes do not determine: excluded.
     undetermined: tuple[str, ...]
+    calibration: Calibration | None = None  # by the ended lives of the fleet
 
     @property
     def any(self) -> LimitLife:
@@ -163,7 +203,7 @@ class Summary:
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
-    history = assessment.history
+    history, of_fleet = assessment.history, assessment.calibration
     states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
@@ -181,12 +221,14 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         probability=judgement.probability,
         why=judgement.why,
         health=tuple(_parameters(assessment)),
-        life=None if prognosis is None else summarise_life(prognosis, assessment.stage),
+        life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
     )
 
 
-def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
+def summarise_life(
+    prognosis: Prognosis, stage: Stage, calibration: Calibration | None = None
+) -> Life:
     """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
     baselines = {spec.name: spec.baseline for spec in stage.parameters}
     past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
@@ -216,6 +258,7 @@ def summarise_life(prognosis: Prognosis, stage: Stage) -> Life:
         limits=tuple(limits),
         laws=prognosis.laws,
         undetermined=prognosis.unidentifiable,
+        calibration=calibration,
     )
 
 
@@ -248,14 +291,12 @@ def _headline(assessment: Assessment) -> str:
 
 
 def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
-    health = assessment.latest_health
+    health = assessment._relative(assessment.present)
     if health is None:
         return
     specs = {spec.name: spec for spec in assessment.stage.parameters}
-    disagreeing = {name: by_laws for name, _, by_laws in disagreements(assessment)}
     for k, name in enumerate(health.parameters):
         limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
-        draws = max((draws, disagreeing.get(name, draws)), key=_spread)
         below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         yield ParameterHealth(
@@ -278,23 +319,23 @@ def disagreements(assessment: Assessment) -> Iterator[tuple[str, FloatArray, Flo
 
     After the name draws of health now by either, as fractions of the baseline.
     """
-    health, prognosis = assessment.latest_health, assessment.prognosis
-    if health is None or prognosis is None:
-        return
-    baselines = {spec.name: spec.baseline for spec in assessment.stage.parameters}
-    for k in np.flatnonzero(health.publishable_parameters()).tolist():
-        name, by_epoch = health.parameters[k], health.samples[-1, :, k]
-        if name not in prognosis.parameters:
-            continue
-        by_laws = prognosis.health[:, prognosis.parameters.index(name)] / baselines[name]
+    for spec, by_epoch, by_laws in _by_both_methods(assessment):
         (low, high), (least, most) = (
             np.quantile(draws, (0.05, 0.95)).tolist() for draws in (by_epoch, by_laws)
         )
         if low > most or least > high:
-            yield name, by_epoch, by_laws
+            yield spec.name, by_epoch, by_laws
 
 
-def _spread(draws: FloatArray) -> float:
-    """Return the ratio of the ends of the 90 % interval."""
-    low, high = np.quantile(draws, (0.05, 0.95)).tolist()
-    return float(high / low)
+def _by_both_methods(
+    assessment: Assessment,
+) -> Iterator[tuple[ParameterSpec, FloatArray, FloatArray]]:
+    """Yield the published parameters that have a limit, with draws as `disagreements` does."""
+    health, prognosis = assessment.latest_health, assessment.prognosis
+    if health is None or prognosis is None:
+        return
+    specs = {spec.name: spec for spec in assessment.stage.parameters}
+    for k in np.flatnonzero(health.publishable_parameters()).tolist():
+        if (name := health.parameters[k]) in prognosis.parameters:
+            by_laws = prognosis.health[:, prognosis.parameters.index(name)] / specs[name].baseline
+            yield specs[name], health.samples[-1, :, k], by_laws

@@ -44,3 +44,6 @@ TERMINAL_MACHINES, TERMINAL_ROWS = 3, 20
 # On a terminal: lines of a frequency response; harmonics per channel where several channels are
 # listed; velocities in one table.
 TERMINAL_LINES, TERMINAL_HARMONICS, TERMINAL_VELOCITIES = 12, 12, 7
+
+NAMED = 0.9
+"""Modes that disagree with the map are named until one of them is wrong with this probability."""

@@ -7,7 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth.io.log import Notice
-from lmshealth.report import figures
+from lmshealth.prognosis.constants import CALIBRATED_RISK, SURPRISE
+from lmshealth.prognosis.results import ModeError
+from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, disagreements
 from lmshealth.report.text import quantiles, spell
 
@@ -73,6 +75,8 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     for name in prognosis.unidentifiable:
         what = f"The limit of {spell(name)} is left out of the life: the modes do not show it."
         yield Notice("limit-not-included", "caution", name, what)
+    if prognosis.modes_off:
+        yield _of_map(prognosis.modes_off)
     dof = prognosis.degrees_of_freedom
     if dof > 0 and prognosis.chi_square > figures.chi_square_band(np.array(float(dof)))[1]:
         what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof})."
@@ -80,9 +84,33 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             "Do not rely on the remaining life; use the last epoch, and record further logs soon."
         )
         yield Notice("laws-do-not-fit", "serious", "", what, to_do)
+    fleet = assessment.calibration
+    if fleet is not None and fleet.p_value < SURPRISE:
+        what = f"{fleet.early} of the {fleet.n_lives} ended lives of this fleet ended before the "
+        what += f"travel predicted for {CALIBRATED_RISK:.0%} of them (p = {fleet.p_value:.1g})."
+        to_do = "Plan by the calibrated travel instead of the service date; add a law that fits."
+        yield Notice("fleet-ends-early", "serious", "", what, to_do)
     for name, by_epoch, by_laws in disagreements(assessment):
         (least, _, most), (low, _, high) = quantiles(by_epoch), quantiles(by_laws)
         what = f"{spell(name).capitalize()} is {100 * least:.0f} to {100 * most:.0f} % by the last "
         what += f"epoch alone, and {100 * low:.0f} to {100 * high:.0f} % by the laws of all logs."
-        to_do = "The wider interval is shown; allow for the lower, and record a log soon."
+        to_do = "Gauges and verdict pool both; allow for the lower, and record a log soon."
         yield Notice("methods-disagree", "serious", name, what, to_do)
+
+
+def _of_map(errors: tuple[ModeError, ...]) -> Notice:
+    """Return the notice about the modes of which one disagrees with the map."""
+    upto = np.cumsum([one.probability for one in errors])
+    likely = errors[: int(np.searchsorted(upto, constants.NAMED)) + 1]
+    texts = [
+        f"{spell(one.mode)} drifts by {100 * one.size:+.0f} ± {100 * one.std:.0f} % of what the "
+        f"map predicts from the other modes (probability {one.probability:.0%})"
+        for one in likely
+    ]
+    what = " or ".join(texts).replace("-", "−")
+    to_do = (
+        "Check the name and the sensitivities of the mode; correct the map, or declare its error "
+        "(model_std). The intervals allow for three times the declared one."
+    )
+    where = " or ".join(one.mode for one in likely)
+    return Notice("mode-off-map", "caution", where, f"{what[0].upper()}{what[1:]}.", to_do)

@@ -54,7 +54,8 @@ COLUMNS = {
         for level in RUL_LEVELS
     )
     + " censored_from probability_beyond_horizon probability_already_past service service_by "
-    "service_risk inspect_by inspect_every_km earliest_end",
+    "service_risk inspect_by inspect_every_km earliest_end rul_km_calibrated calibrated_coverage "
+    "calibrated_lives",
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
     "warnings": "stage recorded_at code severity where what what_to_do",
@@ -114,7 +115,7 @@ def machine_tables(
     if assessment.health is not None:
         rows["health"] = health_rows(assessment.health)
     if assessment.prognosis is not None:
-        life = summarise_life(assessment.prognosis, assessment.stage)
+        life = summarise_life(assessment.prognosis, assessment.stage, assessment.calibration)
         rows["prognosis"] = prognosis_rows(life, assessment.service())
     found = assessment.judgement
     own = found.stage, _iso(found.recorded_at)
@@ -281,10 +282,11 @@ def prognosis_rows(
 
     ``before`` is a day with the probabilities that a limit is reached before it: extra columns.
     """
-    every = service.inspect_every / _KM
-    of_service = (
+    fleet = life.calibration
+    of_any = (
         *(service.kind, service.by, service.risk, service.inspect_by),
-        *(every if np.isfinite(every) else None, service.earliest_end),
+        *(_or_none(service.inspect_every / _KM), service.earliest_end),
+        *((_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives) if fleet else [None] * 3),
     )
     rows = []
     for j, one in enumerate(life.limits):
@@ -296,7 +298,7 @@ def prognosis_rows(
             *(None if np.isinf(value) else value for value in quantiles),
             next((level for level, wait in pairs if np.isinf(wait)), None),
             *(one.beyond_horizon, one.already_past),
-            *(of_service if one.parameter == "any" else [None] * 6),
+            *(of_any if one.parameter == "any" else [None] * len(of_any)),
         )
         (row,) = _rows("prognosis", [values])
         if before is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
 from typing import Literal
@@ -143,6 +143,23 @@ class History:
         else:
             ticks = np.array([moment.timestamp() for moment in self.recorded_at])
         return np.asarray(ticks - ticks[self.baseline])
+
+    def first_logs(self, n: int) -> History:
+        """Return the history as it was after its first n logs."""
+        steps = (replace(one, there=one.there[:n]) for one in self.steps if one.first < n)
+        return replace(
+            self,
+            logs=self.logs[:n],
+            recorded_at=self.recorded_at[:n],
+            travel=self.travel[:n],
+            covariates={name: values[:n] for name, values in self.covariates.items()},
+            ln_frequency=self.ln_frequency[:n],
+            ln_damping=self.ln_damping[:n],
+            cov=self.cov[:n],
+            loop_error=self.loop_error[:n],
+            baselines=tuple(first for first in self.baselines if first < n),
+            steps=tuple(steps),
+        )
 
     def mode_of(self) -> np.ndarray:
         """Return the index of the mode of each series, shape ``(n_series,)``."""

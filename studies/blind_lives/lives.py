@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from numpy.typing import NDArray
 from scipy.stats import bernoulli
 
 from lmshealth.health.verdict import degraded_below
@@ -140,10 +141,20 @@ def sureness(rows: Iterable[Row]) -> Row:
         "bins": [
             {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(reported[own].mean()), 4)}
             | share(map(bool, right[own]))
+            | {"holds": _as_often(reported[own], int(right[own].sum()))}
             for k in range(len(_BINS) - 1)
             if (own := places == k).any()
         ],
     }
+
+
+def _as_often(reported: NDArray[np.float64], right: int) -> bool:
+    """Return whether so many right verdicts are compatible with their probabilities, two-sided."""
+    counts = np.ones(1)  # distribution of the number of right ones
+    for p in reported:
+        counts = np.convolve(counts, [1 - p, p])
+    tail = min(counts[: right + 1].sum(), counts[right:].sum())
+    return bool(tail >= (1 - LEVEL) / 2)
 
 
 def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str, dict[str, Row]]:

@@ -80,21 +80,9 @@ class Life:
 
     def first_logs(self, n: int) -> Life:
         """Return the life as it is known after its first n logs."""
-        own = self.history
-        history = replace(
-            own,
-            logs=own.logs[:n],
-            recorded_at=own.recorded_at[:n],
-            travel=own.travel[:n],
-            covariates={name: values[:n] for name, values in own.covariates.items()},
-            ln_frequency=own.ln_frequency[:n],
-            ln_damping=own.ln_damping[:n],
-            cov=own.cov[:n],
-            loop_error=own.loop_error[:n],
-        )
         return replace(
             self,
-            history=history,
+            history=self.history.first_logs(n),
             travel_km=self.travel_km[:n],
             preload=self.preload[:n],
             drift=self.drift[:n],

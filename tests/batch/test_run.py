@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lmshealth._serialize import pack, unpack
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
@@ -27,14 +28,17 @@ from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Log
 from lmshealth.modal.identification import AmbientReading
-from lmshealth.prognosis.fleet_prior import FleetPrior
+from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior
 from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.report.assessment import Assessment
-from lmshealth.report.tables import COLUMNS
+from lmshealth.report.tables import COLUMNS, machine_tables
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import LogEstimates
 from studies.harness import servers
+from tests.assessments import Maker, make
 from tests.signals import sine, write_archive, write_archive_stage, write_log
+
+__all__ = ["make"]
 
 N_LOGS = 6
 
@@ -632,3 +636,23 @@ def test_assess_without_parameters_tracks_and_claims_nothing(
     assert assessment.health is None
     assert assessment.prognosis is None
     assert assessment.judgement.verdict == "not-enough-data"
+
+
+def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) -> None:
+    """With enough ended lives page and table state the calibrated travel, and early ends."""
+    own = make()
+    assert own.prognosis is not None
+    lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
+    made = assessing._update(("M7-Y", "key", pack(own), None, lives))
+    assert isinstance(made, assessing.PackedAssessment)
+    found: Assessment = unpack(made.content, Assessment)
+    tables = machine_tables([], found)
+    row = tables["prognosis"][-1]
+    travel = np.quantile(own.prognosis.remaining[:, -1], 0.01, method="inverted_cdf")
+    assert row["rul_km_calibrated"] == pytest.approx(travel / 1000)
+    assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
+    assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
+    assert machine_tables([], own)["prognosis"][-1]["calibrated_lives"] is None
+    few = assessing._update(("M7-Y", "key", pack(own), None, lives[:8]))
+    assert isinstance(few, assessing.PackedAssessment)
+    assert unpack(few.content, Assessment).calibration is None

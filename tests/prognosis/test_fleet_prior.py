@@ -16,9 +16,12 @@ from lmshealth._serialize import pack, unpack
 from lmshealth.prognosis import constants
 from lmshealth.prognosis import fleet_prior as fleet
 from lmshealth.prognosis.fleet_prior import (
+    EndedLife,
     FleetPrior,
     LawEvidence,
     MachineEvidence,
+    calibrate,
+    ended_lives,
     fleet_priors,
     machine_evidence,
     needs_fleet_prior,
@@ -26,12 +29,14 @@ from lmshealth.prognosis.fleet_prior import (
 )
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.results import Prognosis
 from lmshealth.prognosis.scenarios import list_scenarios
 from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
 from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from lmshealth.tracking.history import History
 from tests.lives import FOOT, FREQUENCY, MOUNT, PRELOAD, make_history, make_stage, true_drift
+from tests.lives import make_prognosis as prognosis_with
 
 NONE = '{ kind = "none" }'
 WEAR_OR_NOT = PRELOAD.replace("law = {", "law = [{").replace("} }\n", "} }, " + NONE + "]\n")
@@ -388,3 +393,63 @@ def test_an_unidentifiable_limit_needs_no_fleet_prior(
     assert not needs_fleet_prior(evidence)
     # Nor has such a machine evidence on it.
     assert np.abs(evidence.laws["foot"]["hertz-wear"].pace[15:26, 4:]).max() < 0.5
+
+
+# Calibration by ended lives
+
+
+def lives_at(places: FloatArray) -> list[EndedLife]:
+    """Make ended lives with ends at some places of what was predicted."""
+    return [EndedLife(place, reached=True) for place in places.tolist()]
+
+
+def predicted(remaining: FloatArray) -> Prognosis:
+    """Make a prognosis with draws of the remaining travel in m."""
+    return prognosis_with(remaining, np.full(remaining.size, 1e4))
+
+
+def test_calibration_needs_as_many_lives_as_support_it() -> None:
+    """Nine lives support nine in ten, eight do not; one that ended before all draws, no travel."""
+    own = predicted(np.linspace(1e5, 1e6, 1001))
+    assert calibrate(own, lives_at(np.full(8, 0.3))) is None
+    found = calibrate(own, lives_at(np.r_[0.02, np.full(8, 0.3)]))
+    assert found is not None
+    assert (found.n_lives, found.coverage, found.early) == (9, pytest.approx(0.9), 1)
+    assert found.travel == pytest.approx(1.18e5, rel=0.01)
+    none = calibrate(own, lives_at(np.r_[0.0, np.full(8, 0.3)]))
+    assert none is not None and none.travel == 0.0
+    far = calibrate(predicted(np.full(100, 2e7)), lives_at(np.full(9, 0.3)))
+    assert far is not None and np.isinf(far.travel)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [9, 25])
+def test_calibrated_travel_is_outlived_as_often_as_stated(n: int) -> None:
+    """Whatever the law of places; a quantile of the prognosis itself is outlived far less often."""
+    rng, own = np.random.default_rng(n), predicted(np.linspace(0.0, 1e6, 5001))
+    stated, kept, by_model = 0.0, [], []
+    for _ in range(800):
+        *places, new = rng.beta(0.7, 2.0, n + 1)  # ends come far sooner than predicted
+        found = calibrate(own, lives_at(np.array(places)))
+        assert found is not None
+        stated = found.coverage
+        kept.append(1e6 * new >= found.travel)
+        by_model.append(1e6 * new >= 1e5)
+    assert abs(np.mean(kept) - stated) < 4 * np.sqrt(stated * (1 - stated) / 800)
+    assert np.mean(by_model) < 0.8
+
+
+@pytest.mark.slow
+def test_the_end_of_a_life_is_placed_in_what_was_predicted_of_it(
+    small_grid: None, stage: Stage
+) -> None:
+    """A life whose limit was passed before the repair is reached; one serviced early is not."""
+    travel = np.linspace(0.0, 1.3e6, 14)
+    for life_km, reached in ((4000.0, True), (9000.0, False)):
+        worn = lived(travel, life_km)
+        history = replace(worn, baselines=(0, 13))
+        (found,) = ended_lives(history, stage, 1)
+        assert found.reached is reached
+        assert 0.0 <= found.place < 0.9
+    assert ended_lives(worn, stage, 1) == ()
+    assert ended_lives(replace(worn, baselines=(0, 2)), stage, 1) == ()

@@ -145,7 +145,7 @@ def test_every_scenario_after_a_step_is_the_dense_normal(tmp_path: Path) -> None
     history = replace(history, steps=(since("step", 5, 10),))
     likelihood = LifeLikelihood.of(history, stage)
     assert likelihood.data.steps == (np.mean(history.clock()[4:6]),)
-    assert len(likelihood.data.scenarios) == 3 * 2
+    assert len(likelihood.data.scenarios) == 3 * 2 + 2 * 1
     found, known = [], []
     for scenario in likelihood.data.scenarios:
         density = LifeDensity(likelihood, scenario, likelihood.grid)

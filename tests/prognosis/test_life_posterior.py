@@ -370,6 +370,21 @@ def test_probabilities_are_those_of_the_evidence(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize(("kept", "real"), [(1.0, False), (0.875, True)])
+def test_a_step_that_the_tracker_found_may_not_be_one(
+    tmp_path: Path, kept: float, real: bool
+) -> None:
+    """Whether it happened is decided by the logs: without a jump the life has no step."""
+    stage = make_stage(tmp_path, (FADING,))
+    travel = np.linspace(0.0, 2.4e6, 13)
+    preload = (1 - 0.04e-6 * travel) * np.where(travel > 1.3e6, kept, 1.0)
+    history = replace(lived(travel, preload, np.ones(13)), steps=(Step.found("step", 7, 13),))
+    fit = fit_life(history, stage, 3, chains=False, n_draws=400)
+    stepped = sum(one.probability for one in fit.scenarios if one.scenario.paths[0].steps)
+    assert stepped > 0.99 if real else stepped < 0.1
+
+
+@pytest.mark.slow
 def test_a_step_is_followed_by_a_jump(tmp_path: Path) -> None:
     """A loss of an eighth between two logs is followed if the history has the step."""
     stage = make_stage(tmp_path, (FADING,))

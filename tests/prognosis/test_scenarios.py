@@ -8,6 +8,7 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from lmshealth._arrays import FloatArray
+from lmshealth.health.constants import STEP_PROBABILITY
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.scenarios import DegradationPath, Scenario, list_scenarios
 from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging
@@ -39,16 +40,22 @@ MOUNT = parameter("mount", LOOSE, NONE)
 
 
 @pytest.mark.parametrize(
-    ("steps", "n"), [((), 3 * 2), (STEPS, 5 * 3), ((0.0, NOW), 3 * 2)], ids=["none", "two", "ends"]
+    ("steps", "n"),
+    [((), 3 * 2), (STEPS, 5 * 3 + 3 * 2), ((0.0, NOW), 2 * 3 * 2)],
+    ids=["none", "two", "ends"],
 )
 def test_scenarios_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
-    """Every choice of laws and begins occurs once, and weights add up to one."""
+    """Every choice of laws, begins and steps, or none, occurs once; weights add up to one."""
     scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW)
     assert len(scenarios) == n
     assert sum(scenario.weight for scenario in scenarios) == pytest.approx(1, abs=1e-14)
-    keys = {tuple((b.law.kind, b.begin) for b in scenario.paths) for scenario in scenarios}
+    keys = {tuple((b.law.kind, b.begin, b.steps) for b in one.paths) for one in scenarios}
     assert len(keys) == n
-    assert all(path.steps == steps for scenario in scenarios for path in scenario.paths)
+    weight = {taken: 0.0 for taken in (steps, ())}
+    for scenario in scenarios:
+        (taken,) = {path.steps for path in scenario.paths}
+        weight[taken] += scenario.weight
+    assert weight[()] == pytest.approx(0.9 if steps else 1.0)
 
 
 def test_a_law_has_its_weight_whether_it_restarts_or_not() -> None:
@@ -57,8 +64,9 @@ def test_a_law_has_its_weight_whether_it_restarts_or_not() -> None:
     weights: dict[tuple[str, float], float] = {}
     for scenario in scenarios:
         for path in scenario.paths:
-            key = (path.law.kind, path.begin)
-            weights[key] = weights.get(key, 0.0) + scenario.weight
+            if path.steps:
+                key = (path.law.kind, path.begin)
+                weights[key] = weights.get(key, 0.0) + scenario.weight / STEP_PROBABILITY
     known = {
         ("hertz-wear", 0.0): 1 / 12,
         ("hertz-wear", 1.2e6): 1 / 12,

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from lmshealth.health.verdict import judge
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import COLUMNS, machine_tables
+from tests.assessments import PARAMETERS as PARTS
 from tests.assessments import Assessment, Maker, make, nothing
 
 __all__ = ["make"]
@@ -57,20 +59,53 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     assert row["what"].endswith(".")
 
 
-def test_the_gauge_shows_the_method_that_allows_for_more(make: Maker) -> None:
-    """Where epoch and laws disagree the wider interval is shown, whichever it is."""
+@pytest.mark.parametrize("power", [0.05, 20.0])
+def test_gauges_verdict_and_service_agree_where_methods_disagree(make: Maker, power: float) -> None:
+    """Half of the draws are those of the laws: no answer contradicts another."""
     good = make()
     assert good.health is not None and good.prognosis is not None
     by_laws = np.quantile(good.prognosis.health[:, 0], (0.05, 0.95))
-    for power in (0.05, 20.0):  # of the draws about their half
-        chains = 0.5 * (good.health.chains / np.median(good.health.chains[-1, ..., 0])) ** power
-        health = replace(good.health, chains=np.clip(chains, 0.05, 0.6))
-        bad = replace(good, health=health)
-        own = np.quantile(health.samples[-1, :, 0], (0.05, 0.95))
-        wider = max((own, by_laws), key=lambda one: one[1] / one[0])
-        assert own[1] < by_laws[0] and codes(bad) >= {"methods-disagree"}
-        gauge = summarise(bad, bad.service()).health[0]
-        assert [gauge.low, gauge.high] == pytest.approx(wider)
+    chains = 0.5 * (good.health.chains / np.median(good.health.chains[-1, ..., 0])) ** power
+    low = replace(good, health=replace(good.health, chains=np.clip(chains, 0.05, 0.6)))
+    own = np.quantile(low.health.samples[-1, :, 0], (0.05, 0.95))
+    assert own[1] < by_laws[0] and codes(low) >= {"methods-disagree"}
+    assert good.service().kind != "now"  # by the laws alone
+    gauge, service = summarise(low, low.service()).health[0], low.service()
+    assert gauge.low <= own[1] and gauge.high >= by_laws[0]
+    assert gauge.below_limit > 0.05 and service.kind == "now" and service.risk >= gauge.below_limit
+    found = judge(low.stage, low.history, low.present)
+    assert found.verdict != "healthy" and found.probability <= 1
+
+
+def test_a_healthy_epoch_does_not_hide_an_end_by_the_laws(make: Maker) -> None:
+    """Where the laws are past a limit, no verdict is healthy with more than half of the draws."""
+    good = make()
+    assert good.health is not None and good.prognosis is not None
+    draws = np.tile(good.prognosis.limits[:2] * 0.95, (len(good.prognosis.health), 1))
+    past = np.full_like(good.prognosis.remaining, -1e3)
+    ended = replace(good.prognosis, health=draws, remaining=past)
+    sound = replace(good.health, chains=np.full_like(good.health.chains, 0.99))
+    both = replace(good, health=sound, prognosis=ended)
+    assert judge(both.stage, both.history, sound).verdict == "healthy"
+    found = judge(both.stage, both.history, both.present)
+    assert both.service().kind == "now"
+    assert found.verdict == "both" and found.probability == pytest.approx(0.5, abs=1e-3)
+
+
+def test_methods_that_overlap_but_differ_about_the_verdict_are_pooled(make: Maker) -> None:
+    """A preload that is healthy by the epoch and degraded by the laws is neither for sure."""
+    good = make()
+    assert good.health is not None and good.prognosis is not None
+    rng = np.random.default_rng(1)
+    chains = [0.91, 0.99] * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
+    draws = good.prognosis.health * 0 + 0.885 * np.exp(0.01 * rng.standard_normal((4000, 1)))
+    draws[:, 1] = 0.99
+    edge = replace(good, health=replace(good.health, chains=chains),
+                   prognosis=replace(good.prognosis, health=draws))  # fmt: skip
+    assert "methods-disagree" not in {one.code for one in notices(edge) if one.where != PARTS[1]}
+    alone, pooled = (judge(edge.stage, edge.history, h) for h in (edge.health, edge.present))
+    assert (alone.verdict, pooled.verdict) == ("healthy", "preload")
+    assert alone.probability > 0.7 and pooled.probability < 0.7
 
 
 def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) -> None:
