@@ -72,7 +72,7 @@ def test_mixed_rates(tmp_path):
     path = write(
         tmp_path / "log.tdms",
         ("a", NOISE, fast),
-        ("b", NOISE, fast),
+        ("b", NOISE[::-1], fast),
         ("c", NOISE[:200], slow),
         ("temperature", NOISE[:2], {"unit_string": "C", "wf_increment": 1.0}),
     )
