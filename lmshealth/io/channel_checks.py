@@ -77,7 +77,8 @@ def independent(
     while len(order) < min(most, len(columns)):
         left = np.diagonal(rest).copy()
         left[order] = -np.inf
-        best = int(left.argmax())
+        # The first of equals, whatever their rounding.
+        best = int(np.argmax(left >= left.max() - 1e-9))
         if left[best] < constants.DEPENDENT:
             break
         order.append(best)

@@ -137,7 +137,8 @@ def _clock(parts: Sequence[tuple[int, Any, Any]]) -> list[tuple[float, float, in
     Empty where an increment is missing.
     """
     clock: list[tuple[float, float, int]] = []
-    end, last, before = 0.0, 0, parts[0][2] if parts else None
+    end, last = 0.0, 0
+    before: Any = parts[0][2] if parts else None
     first = before
     for n_total, stated, moment in parts:
         rate, n = rate_of(stated), n_total - last
