@@ -143,13 +143,11 @@ def main() -> None:
     n = N_EACH_QUICK if study.quick else N_EACH
     kinds = (*KINDS, *PLAIN)[:: QUICK_KINDS if study.quick else 1]
     sets = tuple(SETS)[:: QUICK_KINDS if study.quick else 1]
-    with tempfile.TemporaryDirectory(prefix="axes-") as folder:
-        rows = [try_axis(Path(folder), kind, k) for kind in kinds for k in range(n)]
-        controls = [
-            try_axis(Path(folder), kind, 0, checked=False) for kind in ("one step", "drift")
-        ]
-        degenerate = [try_set(Path(folder), name, k) for name in sets for k in range(n)]
-        unnamed = try_set(Path(folder), "copy", 0, checked=False)
+    collect = study.trials.collect
+    rows = collect(try_axis, [(kind, k) for k in range(n) for kind in kinds])
+    controls = collect(try_axis, [(kind, 0, False) for kind in UNCHECKED])
+    degenerate = collect(try_set, [(name, k) for k in range(n) for name in sets])
+    unnamed = collect(try_set, [("copy", 0, False)])[0]
     study.conclude(judge(rows, controls, degenerate, unnamed))
 
 
@@ -165,7 +163,7 @@ def vibration(rng: Rng, moments: Floats) -> tuple[Floats, Floats]:
     return truth, own / own.std() + 0.3 * rng.standard_normal(moments.size)
 
 
-def try_axis(folder: Path, kind: str, number: int, *, checked: bool = True) -> Row:
+def try_axis(kind: str, number: int, checked: bool = True) -> Row:
     """Write one log of an odd clock, and return what is read and found."""
     rng = np.random.default_rng([_SEED, sum(kind.encode()), number])
     moments, stamps = KINDS.get(kind, KINDS["uniform"])(rng)
@@ -178,15 +176,15 @@ def try_axis(folder: Path, kind: str, number: int, *, checked: bool = True) -> R
     suffix = ".csv" if kind in PLAIN else _FORMATS[number % len(_FORMATS)]
     if kind == "another rate in the header":
         metadata, columns = {"sample_rate_hz": repr(1.01 * RATE)}, {"time_s": stamps, **columns}
-    path = folder / f"log{suffix}"
-    path.unlink(missing_ok=True)
-    if kind in PLAIN[:2]:
-        step = 10 if kind == PLAIN[0] else N // 2
-        lines = ["" if k % step == step - 1 else repr(float(v)) for k, v in enumerate(values)]
-        path.write_text("\n".join([f"# sample_rate_hz: {RATE}", _SAMPLES, *lines]) + "\n")
-    else:
-        write(Archive(folder), path, LogFile(columns, metadata))
-    return {"kind": kind, "format": suffix, **_found(path, truth)}
+    with tempfile.TemporaryDirectory(prefix="axes-") as folder:
+        path = Path(folder) / f"log{suffix}"
+        if kind in PLAIN[:2]:
+            step = 10 if kind == PLAIN[0] else N // 2
+            lines = ["" if k % step == step - 1 else repr(float(v)) for k, v in enumerate(values)]
+            path.write_text("\n".join([f"# sample_rate_hz: {RATE}", _SAMPLES, *lines]) + "\n")
+        else:
+            write(Archive(path.parent), path, LogFile(columns, metadata))
+        return {"kind": kind, "format": suffix, **_found(path, truth)}
 
 
 def _found(path: Path, truth: Floats) -> Row:
@@ -225,19 +223,19 @@ SETS: dict[str, tuple[Other, str]] = {
 }
 
 
-def try_set(folder: Path, name: str, number: int, *, checked: bool = True) -> Row:
+def try_set(name: str, number: int, checked: bool = True) -> Row:
     """Write one log of degenerate channels, and return what is read and found."""
     rng = np.random.default_rng([_SEED, 1, sum(name.encode()), number])
     truth, values = vibration(rng, _INDEX / RATE)
     make, reasons = SETS[name]
     columns = {_SAMPLES: values}
     columns |= {f"acc_{k}_m_s2": other for k, other in enumerate(make(values, rng))}
-    path = folder / "set.h5"
-    path.unlink(missing_ok=True)
-    write(Archive(folder), path, LogFile(columns, {"sample_rate_hz": repr(RATE)}))
     before, constants.DEPENDENT = constants.DEPENDENT, constants.DEPENDENT if checked else -1.0
     try:
-        found = _found(path, truth)
+        with tempfile.TemporaryDirectory(prefix="axes-") as folder:
+            path = Path(folder) / "set.h5"
+            write(Archive(path.parent), path, LogFile(columns, {"sample_rate_hz": repr(RATE)}))
+            found = _found(path, truth)
     finally:
         constants.DEPENDENT = before
     told = {one.split(": ")[1] for one in found["named"]}

@@ -138,8 +138,8 @@ def _clock(parts: Sequence[tuple[int, Any, Any]]) -> list[tuple[float, float, in
     """
     clock: list[tuple[float, float, int]] = []
     end, last = 0.0, 0
-    before: Any = parts[0][2] if parts else None
-    first = before
+    first: Any = parts[0][2] if parts else None
+    before = first
     for n_total, stated, moment in parts:
         rate, n = rate_of(stated), n_total - last
         if rate is None:
