@@ -67,7 +67,8 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
         return TimeAxis(rate, np.empty(0, dtype=np.int64), "")
     n_repeated = _check_order(time)
     step = _resolution(time)
-    coarse = (time.size - 1) * step > 0.2 * float(time[time.size - 1 :][0] - time[:1][0])
+    span = float(time[time.size - 1 :][0] - time[:1][0])
+    coarse = 0 < 0.2 * span < (time.size - 1) * step
     try:
         if n_repeated:
             found = f"time_s repeats {n_repeated} times in {time.size} samples"
@@ -147,6 +148,8 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, f
                 middles.append(middle)
                 spreads.append(np.sqrt(np.mean((groups - middle[:, None]) ** 2, axis=1)))
     median, spread = np.concatenate(middles), np.concatenate(spreads)
+    if median.min() <= 0:
+        raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
     local = np.pad(median, 1, mode="edge")
     total, n_regular, n_gaps, missing = 0.0, 0, 0, 0.0
     breaks = [np.empty(0, dtype=np.int64)]

@@ -4,13 +4,13 @@ Method
     Recordings of 24 s with two modes of drawn frequency and damping (1 to 2 %), sampled at the
     moments of an odd clock at 500 Hz on average: rates that step, clocks that drift or oscillate,
     jitter, stamps that are rounded, gaps, stamps that repeat, run backwards or jump by an hour,
-    empty rows, another rate in the header. Eight of each kind, in five formats in turn. What
-    is read and not refused is identified; the frequencies are compared with the truth. Degenerate sets:
-    a channel beside its copy, opposite, multiple, or combination, beside values of 1e-300 and
-    1e300, zeros, and counts. Assumptions: stamps are those of the samples but for rounding; the
-    errors are normal, so that of true standard deviations 0.27 % of the frequencies are beyond 3.
-    Controls: the same samples with the mean rate in the place of the stamps must give wrong
-    frequencies, and a copy that is not compared with the others must not be named.
+    empty rows, another rate in the header. Eight of each kind, in five formats in turn. What is
+    read and not refused is identified; the frequencies are compared with the truth. Degenerate
+    sets: a channel beside its copy, opposite, multiple, or combination, beside values of 1e-300
+    and 1e300, zeros, and counts. Assumptions: stamps are those of the samples but for rounding;
+    the errors are normal, so that with true standard deviations 0.27 % of the frequencies are
+    beyond 3. Controls: the same samples with the mean rate in the place of the stamps must give
+    wrong frequencies, and a copy that is not compared with the others must not be named.
 Answer
     See the record.
 Run time

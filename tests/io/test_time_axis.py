@@ -115,6 +115,13 @@ def test_jitter_of_one_frequency_is_refused():
     assert not time_axis(time + noise, None).clocks
 
 
+@pytest.mark.parametrize("digits", [0, -1, -5])
+def test_stamps_that_stand_still_are_refused(digits):
+    """Stamps that are too coarse for their clock, or all equal, are refused."""
+    with pytest.raises(Unusable, match="repeats"):
+        time_axis(np.round(INDEX / 1000 + 1.7e9, digits), None)
+
+
 def test_a_rate_that_more_than_doubles_is_refused():
     """Resampling to the lowest rate would lose more than half of the band."""
     with pytest.raises(Unusable, match="cut the record where the rate changes"):
