@@ -111,7 +111,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
     notes = [note] if note else []
     if n_lost:
         notes.append(f"{n_lost} samples have no certain time, left out")
-    lowest, highest = 1 / max(slopes), 1 / min(slopes)
+    lowest, highest = 1 / max(slopes), 1 / max(min(slopes), 1e-9 * interval)
     own = rate or float(f"{1 / interval:.10g}")  # 20000.000000000004 Hz is one of the division
     if varies:
         notes.append(f"the sample rate varies from {lowest:.6g} to {highest:.6g} Hz")
