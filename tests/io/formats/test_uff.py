@@ -306,7 +306,9 @@ def test_records_that_start_later_are_refused(tmp_path):
     for start, n_refused in ((0.0, 0), (0.25, 1)):
         records = {"a": VALUES[:100], "b": VALUES[::-1][:100], "c": VALUES[1:101]}
         write_uff(path, {"a": records["a"], "b": records["b"]})
-        late = write_uff(tmp_path / "late.uff", {"c": records["c"]}, abscissa_min=start)
+        late = write_uff(
+            tmp_path / "late.uff", {"c": records["c"]}, x=start + np.arange(100) / 2000
+        )
         path.write_bytes(path.read_bytes() + late.read_bytes())
         content = load(path, ColumnMap(), 1e9)
         assert len(content.refused) == n_refused and len(content.columns) == 3 - n_refused
