@@ -12,7 +12,7 @@ Method
     beyond 3. Controls: the same samples with the mean rate in the place of the stamps must give
     wrong frequencies, and a copy that is not compared with the others must not be named.
 Answer
-    See the record.
+    Not recorded yet.
 Run time
     Ten minutes on one processor.
 """
@@ -40,6 +40,8 @@ from studies.harness.study import Row, Study
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
+
+STEP = "batch"
 
 RATE, N, BASE = 500.0, 12_000, 4000.0
 N_EACH, N_SETS, N_QUICK, QUICK_KINDS = 8, 10, 1, 5
