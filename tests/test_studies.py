@@ -571,6 +571,13 @@ def test_bad_inputs_damaged(root: Path) -> None:
     assert answer["damaged_told_right"] == answer["damaged"] > 12
 
 
+def test_bad_inputs_time_axes(root: Path) -> None:
+    """Of some odd time axes and degenerate sets none is wrong unnamed, and unchecked ones are."""
+    answer = json.loads(run_study(root, "bad_inputs", "time_axes"))
+    assert all(answer["passed"].values())
+    assert answer["sets_told_right"] == answer["sets"] >= 2
+
+
 def test_bad_inputs_injection(root: Path) -> None:
     """Some hostile names, files and addresses are text, reach nothing, and show no password."""
     answer = json.loads(run_study(root, "bad_inputs", "injection"))

@@ -1,14 +1,14 @@
-"""Checks of a channel: missing samples, constant value, clipping."""
+"""Checks of channels: missing samples, constant value, clipping, linear dependence."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, blocks
+from lmshealth.io.buffers import BLOCK, Samples, blocks
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray, too_many
 
@@ -46,12 +46,44 @@ def check_signal(values: Samples) -> None:
     high = max(float(block.max()) for block in _measured(values))
     if low == high:
         raise Unusable("flat", f"all {values.size} samples are {low:.6g} (SI); check the sensor")
+    if high - low < constants.SMALLEST_RANGE:
+        found = f"all {values.size} samples are within {high - low:.3g} (SI)"
+        raise Unusable("flat", f"{found}; check the sensor and its unit")
     at_high = _stuck(values, low, high, 1.0)
     at_low = _stuck(values, -high, -low, -1.0)
     if at_high + at_low >= constants.CLIPPED_SHARE * values.size:
         found = f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum"
         needed = "widen the range of the sensor"
         raise Unusable("clipped", f"{found} {high:.6g} (SI) of {values.size}; {needed}")
+
+
+def independent(
+    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]], most: int
+) -> list[int]:
+    """Order channels by what each adds to those before, by a pivoted Cholesky decomposition.
+
+    Columns of ``(n_samples,)`` without missing samples in the half-open ranges. Return the indices
+    of at most so many; a channel that the others determine is not among them.
+    """
+    gram = np.zeros((len(columns), len(columns)))
+    for start, stop in ranges:
+        for at in range(start, stop, BLOCK):
+            part = np.stack([c[at : min(at + constants.COMPARED, stop)] for c in columns])
+            part -= part.mean(axis=1, keepdims=True)
+            gram += part @ part.T
+    scale = np.sqrt(np.diagonal(gram).clip(np.finfo(float).tiny))
+    rest = gram / scale[:, None] / scale
+    order: list[int] = []
+    while len(order) < min(most, len(columns)):
+        left = np.diagonal(rest).copy()
+        left[order] = -np.inf
+        # The first of equals, whatever their rounding.
+        best = int(np.argmax(left >= left.max() - 1e-9))
+        if left[best] < constants.DEPENDENT:
+            break
+        order.append(best)
+        rest = rest - np.outer(rest[:, best], rest[best]) / left[best]
+    return order
 
 
 def _measured(values: Samples) -> Iterator[FloatArray]:

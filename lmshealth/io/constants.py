@@ -23,6 +23,12 @@ LARGEST_MISSING = 0.10
 LARGEST_MAGNITUDE = 1e12
 """Magnitude in SI units from which a sample counts as missing: no acceleration, position or current
 reaches it, and its square is still finite."""
+SMALLEST_RANGE = 1e-30
+"""Range in SI units below which a channel is constant: powers of its spectrum would be no normal
+floating-point numbers."""
+DEPENDENT, COMPARED = 1e-9, 4096
+"""Share of its variance that a channel must have beyond the others, else it is one of them again
+(rounding of float32 leaves 1e-14); samples of each block of 2¹⁸ that are compared."""
 CLIPPED_SHARE = 1e-3
 """Share of samples at both ends of the range from which a channel is clipped."""
 CLIPPING_RATIO = 2.0
@@ -46,6 +52,11 @@ GAP = 1.5
 JITTER = 0.25
 """Largest relative deviation of an interval. Time stamps are rounded (to 1e-6 s in many exports, to
 2e-6 s by float32 after 20 s); no sampling clock deviates so far."""
+PERIODIC = 0.02
+"""Largest amplitude of periodic jitter, in intervals: sidebands of a mode at a tenth of the sample
+rate are (π 0.1 0.02)² = 4e-5 of its power, below the floor of all but the clearest modes."""
+LARGEST_SPREAD = 2.0
+"""Largest ratio of the sample rates in one record: it is resampled to the lowest."""
 INTERRUPTED_SHARE = 0.01
 """Interruptions per sample above which a record is refused instead of cut, beyond
 `ALWAYS_ALLOWED`."""

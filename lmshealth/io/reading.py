@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import stat
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple, cast
@@ -14,18 +14,26 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.channel_checks import check_signal, missing_ranges
+from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
-from lmshealth.io.time_axis import IntArray, pieces, set_velocity, time_axis
+from lmshealth.io.time_axis import (
+    IntArray,
+    TimeAxis,
+    pieces,
+    resampled,
+    set_velocity,
+    time_axis,
+)
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
+Ranges = tuple[tuple[int, int], ...]
 _REFERENCES = ("reference_velocity", "reference_position")
 
 
@@ -129,18 +137,18 @@ class _Series(NamedTuple):
 
 
 def _to_log(
-    content: Content, columns: ColumnMap, overrides: Mapping[str, str], *, name: str, digest: str
+    content: Content, layout: ColumnMap, overrides: Mapping[str, str], *, name: str, digest: str
 ) -> Log:
     """Apply the log contract to the content of a file."""
     filled = {key: value for key, value in overrides.items() if value.strip()}
-    metadata, rate = parse_metadata(content.metadata | columns.constants() | filled)
-    series = _series(content, columns)
+    metadata, rate = parse_metadata(content.metadata | layout.constants() | filled)
+    series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)
     refused = [replace(refusal, log=name) for refusal in content.refused]
     if axis.note:
         refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
-    missing: list[IntArray] = []
+    missing: list[IntArray] = [axis.lost]
     channels = []
     for item in series:
         if item.signal.role in _MEASURED:
@@ -158,7 +166,10 @@ def _to_log(
     ranges = pieces(series[0].values.size, missing, axis.breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
+    channels = _without_copies(channels, ranges, name, refused)
     velocity = None if gone is None else references[0].values
+    if axis.clocks:
+        channels, velocity, ranges = _at_one_rate(channels, velocity, ranges, axis)
     if velocity is not None and references[0].signal.role == "reference_position":
         velocity = set_velocity(velocity, ranges, axis.sample_rate)
     return Log(
@@ -217,6 +228,33 @@ def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | Non
     if note:
         refused.append(Refusal(name, "gaps", note, channel=item.signal.name))
     return gone
+
+
+def _at_one_rate(
+    channels: list[Channel], reference: Samples | None, ranges: Ranges, axis: TimeAxis
+) -> tuple[list[Channel], Samples | None, Ranges]:
+    """Resample channels and set point of a varying rate; return them with their pieces."""
+    columns = [(channel.values, True) for channel in channels]
+    columns += [] if reference is None else [(reference, False)]
+    read, ranges = resampled(columns, ranges, axis)
+    if not ranges:
+        raise Unusable("time", f"{axis.note}; the pieces are too short for that")
+    pairs = zip(channels, read, strict=False)
+    channels = [replace(channel, values=values) for channel, values in pairs]
+    return channels, None if reference is None else read[-1], ranges
+
+
+def _without_copies(
+    channels: list[Channel], ranges: Sequence[tuple[int, int]], name: str, refused: list[Refusal]
+) -> list[Channel]:
+    """Leave out channels of vibration that are combinations of the others, which are refused."""
+    dynamic = [channel for channel in channels if channel.kind in _DYNAMIC]
+    order = independent([c.values for c in dynamic], ranges, len(dynamic))
+    copies = [channel for k, channel in enumerate(dynamic) if k not in order]
+    others = listed(dynamic[k].name for k in sorted(order))
+    detail = f"is a multiple or combination of {others}; check whether a sensor is recorded twice"
+    refused += [Refusal(name, "dependent", detail, channel=copy.name) for copy in copies]
+    return [channel for channel in channels if channel not in copies]
 
 
 def _why(refused: list[Refusal]) -> str:

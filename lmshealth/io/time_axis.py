@@ -1,11 +1,12 @@
-"""The time axis: sample rate, interruptions, and the set velocity of a set position.
+"""The time axis: sample rate, interruptions, resampling, and the set velocity of a set position.
 
-Samples are never sorted and never interpolated.
+Samples are never sorted, and never interpolated across a gap (README.md, "Time").
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -13,24 +14,38 @@ from numpy.typing import NDArray
 
 from lmshealth._arrays import FloatArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool, blocks
+from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
 from lmshealth.io.refusal import Unusable
 
 IntArray = NDArray[np.int64]
+# Time in s of samples, by their index, and its derivatives.
+Clock = Callable[..., FloatArray]
 
 # Quantile of the second differences of a position that is at most a step and an acceleration.
 _QUANTILE = 0.9
+# Intervals of which the median is the local interval; most decimals of rounded stamps, and knots
+# of a clock.
+_GROUP, _MOST_DIGITS, _MOST_KNOTS = 128, 10, 1 << 14
+# Steps of rounding that the residuals of stamps may span (the clock is estimated), and probability
+# exp(-x) with which the highest line of white jitter exceeds its expectation.
+_ROUNDING, _CHANCE = 1.2, 7.0
+# Resampled at once, and the kernel: zeros to either side, and its window, which damps by 100 dB.
+_OUTPUT, _ZEROS, _WINDOW = 1 << 12, 32, 10.0
 
 
 class TimeAxis(NamedTuple):
     """Sample rate in Hz, samples before which a record is interrupted, ``(n_breaks,)``.
 
-    ``note`` counts the interruptions; it is empty if there are none.
+    ``note`` counts the interruptions; it is empty if there are none. Samples whose stamps do not
+    keep to the clock are ``lost``, half-open ranges, ``(n_ranges, 2)``. Where the rate varies there
+    is a clock for each stretch between breaks, and `resampled` makes ``sample_rate`` of it.
     """
 
     sample_rate: float
     breaks: IntArray
     note: str
+    lost: IntArray = np.empty((0, 2), dtype=np.int64)
+    clocks: tuple[Clock, ...] = ()
 
 
 def too_many(n_interruptions: int, n_samples: int) -> bool:
@@ -39,28 +54,113 @@ def too_many(n_interruptions: int, n_samples: int) -> bool:
 
 
 def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
-    """Find the sample rate and the interruptions of a record.
+    """Find the sample rate, its variation and the interruptions of a record.
 
     From time stamps in s as recorded, ``(n_samples,)``, and the sample rate in Hz of the metadata.
     `Unusable` (``time``) where both are absent or disagree, where time stamps are missing, repeated
-    or descending, and where the intervals are not uniform.
+    or descending, and where the intervals are not uniform enough to resample the record.
     """
     if time is None:
         if rate is None:
             detail = "neither a column time_s nor the metadata sample_rate_hz; needed one"
             raise Unusable("time", detail)
         return TimeAxis(rate, np.empty(0, dtype=np.int64), "")
-    _check_order(time)
-    interval, total, n_regular, n_gaps, missing = 0.0, 0.0, 0, 0, 0.0
+    n_repeated = _check_order(time)
+    step = _resolution(time)
+    span = float(time[time.size - 1 :][0] - time[:1][0])
+    coarse = 0 < 0.2 * span < (time.size - 1) * step
+    try:
+        if n_repeated:
+            found = f"time_s repeats {n_repeated} times in {time.size} samples"
+            raise Unusable("time", f"{found}; needed increasing time stamps")
+        return _axis(time, rate, step, 0.0)
+    except Unusable:
+        if not coarse:
+            raise
+        # Rounding to a step near the interval makes them unlike: the clock decides.
+        try:
+            return _axis(time, rate, step, step)
+        except Unusable:
+            pass
+        raise
+
+
+def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
+    """Find the axis of increasing time stamps, rounded to a step in s.
+
+    ``slack`` in s is the rounding that an interval may have beyond its tolerance.
+    """
+    breaks, note, interval, scatter = _interruptions(time, slack)
+    if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
+        found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
+        raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
+    least = max(_GROUP, int(scatter / (interval * constants.AGREEMENT)))
+    least = min(max(least, time.size // _MOST_KNOTS), max(1, time.size // 8))
+    clocks, lost, slopes, varies = [], [], [interval], False
+    for start, stop in pairwise([0, *breaks.tolist(), time.size]):
+        clock, slope = _clock(time, start, stop, least)
+        allowed = constants.AGREEMENT + scatter / (interval * min(least, (stop - start) / 2))
+        # In a stretch this short a rate cannot be measured.
+        if stop - start >= _GROUP:
+            varies |= bool((np.abs(slope / interval - 1) > allowed).any())
+            slopes += slope.tolist()
+            lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
+        clocks.append(clock)
+    gone = np.concatenate([*lost, np.empty((0, 2), dtype=np.int64)])
+    n_lost = int(np.sum(gone[:, 1] - gone[:, 0]))
+    notes = [note] if note else []
+    if n_lost:
+        notes.append(f"{n_lost} samples have no certain time, left out")
+    lowest, highest = 1 / max(slopes), 1 / max(min(slopes), 1e-9 * interval)
+    own = rate or float(f"{1 / interval:.10g}")  # 20000.000000000004 Hz is one of the division
+    if varies:
+        notes.append(f"the sample rate varies from {lowest:.6g} to {highest:.6g} Hz")
+        own = float(f"{lowest:.10g}")
+    note = " and ".join(notes)
+    spread = highest > constants.LARGEST_SPREAD * lowest
+    if n_lost > constants.LARGEST_MISSING * time.size or (varies and spread):
+        needed = "export samples of one clock, or cut the record where the rate changes"
+        raise Unusable("time", f"{note}; {needed}")
+    if not varies:
+        return TimeAxis(own, breaks, note, gone)
+    return TimeAxis(own, breaks, f"{note}: resampled to the lowest", gone, tuple(clocks))
+
+
+def _steps(time: Samples) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the intervals in s block by block, in whole groups but the last."""
+    for at in range(0, time.size - 1, BLOCK):
+        yield at, np.diff(time[at : at + BLOCK + 1])
+
+
+def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, float]:
+    """Find gaps and odd intervals by the median interval of a group and of its neighbours.
+
+    Return breaks, their counts as a text, the mean regular interval and four times the usual
+    deviation from it in s.
+    """
+    middles, spreads = [], []
+    for _, steps in _steps(time):
+        whole = steps.size - steps.size % _GROUP
+        for groups in (steps[:whole].reshape(-1, _GROUP), steps[None, whole:]):
+            if groups.size:
+                # Stamps that are coarser than the interval have no useful median.
+                middle = (np.mean if slack else np.median)(groups, axis=1)
+                middles.append(middle)
+                spreads.append(np.sqrt(np.mean((groups - middle[:, None]) ** 2, axis=1)))
+    median, spread = np.concatenate(middles), np.concatenate(spreads)
+    if median.min() <= 0:
+        raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
+    local = np.pad(median, 1, mode="edge")
+    total, n_regular, n_gaps, missing = 0.0, 0, 0, 0.0
     breaks = [np.empty(0, dtype=np.int64)]
-    for at, stamps in blocks(time, overlap=1):
-        steps = np.diff(stamps)
-        # The first block determines the nominal interval.
-        interval = interval or float(np.median(steps))
-        gap = steps > constants.GAP * interval
-        irregular = gap | (np.abs(steps / interval - 1) > constants.JITTER)
+    for at, steps in _steps(time):
+        own = 1 + (at + np.arange(steps.size)) // _GROUP
+        near = np.stack([local[own - 1], local[own], local[own + 1]])
+        odd = np.abs(steps - near) > constants.JITTER * near + slack
+        irregular = odd.all(axis=0)
+        gap = irregular & (steps > constants.GAP * near[1])
         n_gaps += int(gap.sum())
-        missing += float(np.round(steps[gap] / interval - 1).sum())
+        missing += float(np.round(steps[gap] / near[1, gap] - 1).sum())
         total += float(steps[~irregular].sum())
         n_regular += int(np.count_nonzero(~irregular))
         breaks.append(np.flatnonzero(irregular) + at + 1)
@@ -69,18 +169,98 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     if n_odd := where.size - n_gaps:
         notes.append(
             f"{n_odd} of {time.size - 1} intervals differ by more than {constants.JITTER:.0%} "
-            f"from the median {interval:.6g} s"
+            f"from the median {np.median(median):.6g} s"
         )
     note = " and ".join(notes)
     if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
     # The mean over all regular intervals averages the rounding of time stamps out.
-    interval = total / n_regular if n_regular else interval
-    if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
-        found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
-        raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
-    # 20000.000000000004 Hz is an artefact of the division.
-    return TimeAxis(rate or float(f"{1 / interval:.10g}"), where, note)
+    interval = total / n_regular if n_regular else float(np.median(median))
+    return where, note, interval, 4 * float(np.median(spread))
+
+
+def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, FloatArray]:
+    """Fit the clock of a stretch: a spline through means of at least so many stamps.
+
+    Return time over the index of a sample, and the mean intervals in s between the knots.
+    """
+    from scipy.interpolate import make_interp_spline
+
+    n = stop - start
+    edges = np.linspace(start, stop, min(n, max(2, n // least)) + 1).astype(int)
+    mean = np.array([float(np.mean(time[a:b])) for a, b in pairwise(edges)])
+    if mean.size == 1:  # of a single sample, which is left out
+        return np.polynomial.Polynomial([mean[0], 1.0]), np.empty(0)
+    centre = (edges[:-1] + edges[1:] - 1) / 2
+    spline = make_interp_spline(centre, mean, k=min(3, mean.size - 1))
+    return spline, np.diff(mean) / np.diff(centre)
+
+
+def _residual(
+    time: Samples, stretch: tuple[int, int], clock: Clock, interval: float, step: float
+) -> IntArray:
+    """Find the ranges of samples whose stamps are off the clock; refuse periodic jitter."""
+    found = [np.empty((0, 2), dtype=np.int64)]
+    for at, stamps in blocks(time, *stretch):
+        error = stamps - clock(np.arange(at, at + stamps.size))
+        if np.ptp(error) <= _ROUNDING * step:
+            continue
+        off = np.abs(error) > constants.JITTER * interval + step / 2
+        found.append(np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2) + at)
+        error[off] = 0
+        line = 2 * np.abs(np.fft.rfft(error - error.mean())).max() / error.size
+        by_chance = 2 * error.std() * np.sqrt((np.log(error.size) + _CHANCE) / error.size)
+        if line > max(constants.PERIODIC * interval, by_chance):
+            detail = f"time stamps jitter periodically by {line / interval:.1%} of the interval"
+            raise Unusable("time", f"{detail}; needed uniform samples, or stamps of their clock")
+    return np.concatenate(found)
+
+
+def resampled(
+    columns: Sequence[tuple[Samples, bool]], ranges: Sequence[tuple[int, int]], axis: TimeAxis
+) -> tuple[list[Samples], tuple[tuple[int, int], ...]]:
+    """Resample the pieces of columns of a varying rate to the rate of the axis.
+
+    Signals by a windowed sinc that passes up to 0.45 of the rate; the others (second entry false)
+    linearly. Return columns of the pieces one after another, and these.
+    """
+    spools = [Spool() for _ in columns]
+    pieces = []
+    first, rate = np.concatenate([[0], axis.breaks]), axis.sample_rate
+    for start, stop in ranges:
+        clock = axis.clocks[int(np.searchsorted(first, start, side="right")) - 1]
+        knots = np.linspace(start, stop - 1, 2 + (stop - start) // _GROUP)
+        at = clock(knots)
+        half = int(np.ceil(_ZEROS * max(1.0, float((np.diff(knots) / np.diff(at)).max() / rate))))
+        begin, end = clock(np.array([start + half, stop - 1 - half]))
+        n = int((end - begin) * rate) + 1 if stop - start > 2 * half else 0
+        if n < constants.SHORTEST_PIECE:
+            continue
+        pieces.append((spools[0].size, spools[0].size + n))
+        for k in range(0, n, _OUTPUT):
+            wanted = begin + np.arange(k, min(k + _OUTPUT, n)) / rate
+            place = np.interp(wanted, at, knots)
+            for _ in range(3):
+                place -= (clock(place) - wanted) / clock(place, 1)
+            weights, index = _kernel(place, clock(place, 1) * rate, half)
+            low = int(index.min())
+            for (samples, is_signal), spool in zip(columns, spools, strict=True):
+                part = samples[low : int(index.max()) + 1]
+                if is_signal:
+                    spool.append(np.einsum("ij,ij->i", weights, part[index - low]))
+                else:
+                    spool.append(np.interp(place - low, np.arange(part.size), part))
+    return [spool.samples() for spool in spools], tuple(pieces)
+
+
+def _kernel(place: FloatArray, density: FloatArray, half: int) -> tuple[FloatArray, IntArray]:
+    """Return weights and indices of the samples around fractional places, ``(n, 2 half)``."""
+    index = np.floor(place).astype(np.int64)[:, None] + np.arange(1 - half, half + 1)
+    x = (index - place[:, None]) * density[:, None]
+    inside = np.sqrt(np.clip(1 - (x / _ZEROS) ** 2, 0, None))
+    grid = np.linspace(0, 1, 1 << 14)
+    weights = np.sinc(x) * np.interp(inside, grid, np.i0(_WINDOW * grid)) * (inside > 0)
+    return weights / weights.sum(axis=1, keepdims=True), index
 
 
 def pieces(
@@ -104,23 +284,37 @@ def pieces(
     return tuple(zip(start[keep].tolist(), stop[keep].tolist(), strict=True))
 
 
-def _check_order(time: Samples) -> None:
-    """Require that time stamps are numbers and increase."""
+def _check_order(time: Samples) -> int:
+    """Require that time stamps are numbers and do not decrease; return how many repeat."""
     unknown = backwards = repeated = 0
     first = None
     for at, stamps in blocks(time, overlap=1):
         steps = np.diff(stamps)
-        if first is None and not (steps > 0).all():
-            first = at + int(np.argmin(steps > 0)) + 1
+        if first is None and not (steps >= 0).all():
+            first = at + int(np.argmin(steps >= 0)) + 1
         unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.LARGEST_MAGNITUDE)))
         backwards += int(np.count_nonzero(steps < 0))
         repeated += int(np.count_nonzero(steps == 0))
     if unknown:
         raise Unusable("time", f"{unknown} of {time.size} time stamps are no numbers")
-    if backwards or repeated:
+    if backwards:
         found = f"time_s runs backwards {backwards} times and repeats {repeated} times"
         where = f"in {time.size} samples, first at sample {first}"
         raise Unusable("time", f"{found} {where}; needed increasing time stamps")
+    return repeated
+
+
+def _resolution(time: Samples) -> float:
+    """Return the step in s to which time stamps are rounded, of decimals or of floats."""
+    stamps = time[:BLOCK]
+    largest = float(np.abs(stamps).max())
+    float32 = np.array_equal(stamps.astype(np.float32), stamps)
+    floating = float(np.spacing(np.float32(largest) if float32 else largest))
+    for digits in range(_MOST_DIGITS):
+        scaled = stamps * 10.0**digits
+        if (np.abs(scaled - np.rint(scaled)) < max(1e-6, 4 * floating * 10.0**digits)).all():
+            return max(10.0**-digits, floating)
+    return floating
 
 
 def set_velocity(

@@ -13,6 +13,9 @@ USABLE = 0.45
 # Standard deviations of ln f and ln ζ beyond which an estimate is refused: a frequency known to
 # 3 % cannot show the drifts that are tracked, a damping known to a factor of two cannot be used.
 WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
+# Most channels that are fitted together, those that add most to each other: cross spectra of 64
+# channels over a minute at 1 kHz take 2 GB each.
+MOST_CHANNELS = 16
 # Most modes that are fitted together.
 MOST_TOGETHER = 4
 

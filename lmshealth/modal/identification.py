@@ -36,7 +36,13 @@ from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search,
 from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import assign, likeness, name_together
-from lmshealth.modal.targets import Target, choose_channels, choose_targets, clusters
+from lmshealth.modal.targets import (
+    Target,
+    choose_channels,
+    choose_targets,
+    clusters,
+    limit_channels,
+)
 from lmshealth.signal.segments import Segment, find_phases, stationary
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
@@ -144,7 +150,8 @@ def read_ambient(
     progress: Callable[[str, int, int], None] = lambda step, done, total: None,
 ) -> AmbientReading:
     """Identify modes as `identify` does; return them with the spectra and their fit."""
-    used = choose_channels(log, channels)
+    log = limit_channels(log, channels)
+    used = choose_channels(log)
     targets = () if stage is None else choose_targets(stage, band)
     stretches, whole = _transform(log, used, targets, band)
     tested: list[tuple[str, float, float]] = []
@@ -184,7 +191,7 @@ def read_ambient(
     widths = [2 * target.damping_ratio * target.frequency for target in targets]
     if stage is None or not more or whole.duration * min(widths) < constants.SEARCHABLE:
         return reading
-    return _with_undescribed(log, reading, known, targets, channels)
+    return _with_undescribed(log, reading, known, targets)
 
 
 def _with_undescribed(
@@ -192,14 +199,13 @@ def _with_undescribed(
     described: AmbientReading,
     known: Sequence[Target],
     targets: tuple[Target, ...],
-    channels: Sequence[str] | None,
 ) -> AmbientReading:
     """Search for all resonances near described modes, and name them together."""
     bands = [(*target.band(BAND_HALF_WIDTH), target.search) for target in targets]
     low = min(low * (1 - search) for low, _, search in bands)
     high = max(high * (1 + search) for _, high, search in bands)
     try:
-        found = read_ambient(log, channels=channels, band=(low, min(high, _TOP * log.sample_rate)))
+        found = read_ambient(log, band=(low, min(high, _TOP * log.sample_rate)))
     except BadLog:  # too short for a search
         return described
     named = name_together(found.modes, described.modes, known, targets, log.name)

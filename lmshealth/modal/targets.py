@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from lmshealth._arrays import ComplexArray
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.io.log import Channel, Log
+from lmshealth.io.channel_checks import independent
+from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
 from lmshealth.stage.constants import BAND_HALF_WIDTH
 from lmshealth.stage.description import Stage
@@ -55,6 +56,23 @@ def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Chann
     if not usable:
         raise BadLog(log.name, "no-signal", "no delta_e or acc channel is left to analyse")
     return tuple(sorted(usable, key=lambda channel: channel.name))
+
+
+def limit_channels(log: Log, names: Sequence[str] | None = None) -> Log:
+    """Refuse (``surplus``) the channels beyond those that can be fitted together.
+
+    Names are those of `choose_channels`; the channels that add most to each other are kept.
+    """
+    used = choose_channels(log, names)
+    if len(used) <= constants.MOST_CHANNELS:
+        return replace(log, channels=used)
+    order = independent([c.values for c in used], log.pieces, constants.MOST_CHANNELS)
+    kept = tuple(used[k] for k in sorted(order))
+    detail = f"{len(used)} channels, of which {len(kept)} are used; choose others with --channels"
+    surplus = tuple(
+        Refusal(log.name, "surplus", detail, channel=c.name) for c in used if c not in kept
+    )
+    return replace(log, channels=kept, refused=(*log.refused, *surplus))
 
 
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:

@@ -1,10 +1,10 @@
-"""Flat and clipped channels are refused, coarse ones are not."""
+"""Flat, clipped and dependent channels are refused, coarse ones are not."""
 
 import numpy as np
 import pytest
 
 from lmshealth.io.buffers import BLOCK
-from lmshealth.io.channel_checks import check_signal, missing_ranges
+from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.refusal import Unusable
 
 N = 40_000
@@ -54,6 +54,22 @@ def test_flat():
     """A constant channel is refused."""
     with pytest.raises(Unusable, match="all 100 samples are 3"):
         check_signal(np.full(100, 3.0))
+
+
+def test_vanishing_samples_are_flat():
+    """Samples whose squares are no numbers are refused."""
+    with pytest.raises(Unusable, match="within"):
+        check_signal(1e-300 * noise(1.0))
+
+
+def test_independent_channels():
+    """Copies, opposites, multiples and combinations are found; noisy copies are not."""
+    x, y = noise(1.0), noise(1.0, seed=1)
+    whole = [(0, N)]
+    assert independent([x, -x, 1e-6 * x + 9.81], whole, 3) == [0]
+    assert sorted(independent([x, y, x + 2 * y], whole, 3)) in ([0, 1], [0, 2])
+    assert independent([x, x + noise(1e-3, seed=2)], whole, 2) == [0, 1]
+    assert independent([x, x + noise(0.1, seed=2), y], whole, 2) == [0, 2]
 
 
 def test_missing_ranges():

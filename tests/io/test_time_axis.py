@@ -1,11 +1,11 @@
-"""The time axis: rates agree, gaps split, disorder is refused; set velocities of positions."""
+"""The time axis: rates agree, gaps split, disorder is refused; varying rates; set velocities."""
 
 import numpy as np
 import pytest
 
 from lmshealth.io.buffers import BLOCK, Stored
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import pieces, set_velocity, time_axis
+from lmshealth.io.time_axis import pieces, resampled, set_velocity, time_axis
 from lmshealth.signal.segments import find_phases
 from tests.signals import make_log
 
@@ -67,6 +67,65 @@ def test_disorder_is_refused():
     time[3] = np.nan
     with pytest.raises(Unusable, match="1 of 100 time stamps"):
         time_axis(time, None)
+
+
+INDEX = np.arange(12_000)
+CLOCKS = {
+    "a step": np.cumsum(np.repeat([1e-3, 1.2e-3], 6000)),
+    "drift": np.cumsum(1e-3 * (1 + 0.2 * INDEX / INDEX.size)),
+    "oscillation": 1e-3 * (INDEX + 3 * np.sin(INDEX / 500)),
+}
+
+
+@pytest.mark.parametrize("name", CLOCKS)
+def test_a_varying_rate_is_resampled(name):
+    """A sine keeps frequency, phase and amplitude within 1 % when resampled to the lowest rate."""
+    time = CLOCKS[name]
+    axis = time_axis(time, None)
+    assert axis.clocks and "resampled" in axis.note
+    assert axis.sample_rate == pytest.approx(1 / np.diff(time).max(), rel=2e-3)
+    ranges = pieces(time.size, [axis.lost], axis.breaks)
+    columns, cut = resampled([(np.sin(2 * np.pi * 100 * time), True), (time, False)], ranges, axis)
+    for start, stop in cut:
+        at, steps = columns[1][start:stop], np.arange(stop - start) / axis.sample_rate
+        even = np.median(at - steps) + steps
+        error = np.abs(columns[0][start:stop] - np.sin(2 * np.pi * 100 * even))
+        # Near a step samples may be off by a quarter of an interval: 0.16 of the amplitude.
+        assert np.quantile(error, 0.95) < 0.01 and error.max() < 0.2
+    # The negative control: in samples of one rate it is another sine.
+    uniform = time[0] + INDEX * np.mean(np.diff(time))
+    assert np.abs(np.sin(2 * np.pi * 100 * time) - np.sin(2 * np.pi * 100 * uniform)).max() > 0.5
+
+
+@pytest.mark.parametrize("digits", [3, 4, 5, 6])
+@pytest.mark.parametrize("rate", [1010.0, 2999.7, 3000.0, 16384.0])
+def test_rounded_stamps_are_no_jitter(rate, digits):
+    """Stamps rounded to coarser than the interval give the rate, without a break."""
+    axis = time_axis(np.round(np.arange(30_000) / rate, digits), None)
+    assert axis.sample_rate == pytest.approx(rate, rel=1e-4)
+    assert not axis.breaks.size and not axis.clocks and not axis.note
+
+
+def test_jitter_of_one_frequency_is_refused():
+    """Periodic jitter makes sidebands and is refused; the same power as noise is accepted."""
+    time = INDEX / 1000
+    with pytest.raises(Unusable, match="periodically"):
+        time_axis(time + 5e-5 * np.sin(2 * np.pi * INDEX / 7), None)
+    noise = np.random.default_rng(0).uniform(-6e-5, 6e-5, INDEX.size)
+    assert not time_axis(time + noise, None).clocks
+
+
+@pytest.mark.parametrize("digits", [0, -1, -5])
+def test_stamps_that_stand_still_are_refused(digits):
+    """Stamps that are too coarse for their clock, or all equal, are refused."""
+    with pytest.raises(Unusable, match="repeats"):
+        time_axis(np.round(INDEX / 1000 + 1.7e9, digits), None)
+
+
+def test_a_rate_that_more_than_doubles_is_refused():
+    """Resampling to the lowest rate would lose more than half of the band."""
+    with pytest.raises(Unusable, match="cut the record where the rate changes"):
+        time_axis(np.cumsum(np.repeat([1e-3, 3e-3], 6000)), None)
 
 
 def test_pieces_around_missing_samples():

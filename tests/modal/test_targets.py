@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.modal.targets import choose_channels, choose_targets
+from lmshealth.modal import constants
+from lmshealth.modal.targets import choose_channels, choose_targets, limit_channels
 from tests.signals import make_log, make_stage
 
 NAMES = ("acc_b", "current", "delta_e", "acc_a")
@@ -66,3 +67,17 @@ def test_a_band_without_modes_is_an_error() -> None:
     """A band without described modes is an error, not an empty table."""
     with pytest.raises(BadStage, match="300 and 400 Hz"):
         choose_targets(STAGE, (300.0, 400.0))
+
+
+def test_surplus_channels_are_named() -> None:
+    """Of too many channels those that add most are kept, a copy with little noise is not."""
+    most = constants.MOST_CHANNELS
+    rng = np.random.default_rng(0)
+    values = {f"acc_{k:02d}": rng.standard_normal(500) for k in range(most)}
+    values["acc_00b"] = values["acc_00"] + 0.01 * rng.standard_normal(500)
+    log = limit_channels(make_log(values, 100.0))
+    assert len(log.channels) == most
+    (refused,) = log.refused
+    assert refused.reason == "surplus" and refused.channel in ("acc_00", "acc_00b")
+    few = limit_channels(make_log(values, 100.0), ["acc_00", "acc_00b"])
+    assert len(few.channels) == 2 and not few.refused

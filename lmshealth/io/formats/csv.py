@@ -126,7 +126,9 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     if not places:
         return Content({}, metadata, tuple(names), hint=_hint(text, columns))
     text.n_fields = len(names)
-    return Content(_numbers(text, places, layout), metadata, tuple(names))
+    # Time stamps place the other rows; without them an empty row is a missing sample.
+    placed = any(columns.target(name) == "time_s" for name in places)
+    return Content(_numbers(text, places, layout, placed), metadata, tuple(names))
 
 
 def _line(text: Text) -> str:
@@ -222,8 +224,13 @@ def _is_row(line: str, delimiter: str) -> bool:
         return False
 
 
-def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str, Samples]:
-    """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty."""
+def _numbers(
+    text: Text, places: dict[str, int], layout: CsvLayout, placed: bool
+) -> dict[str, Samples]:
+    """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
+
+    Empty lines are left out where time stamps place the rows, and at the end.
+    """
     import pandas as pd
 
     start = text.position
@@ -241,6 +248,7 @@ def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str,
         index_col=False,
         # A block is small enough as a whole.
         low_memory=False,
+        skip_blank_lines=placed,
         chunksize=max(1, min(_ROWS, _FIELDS // text.n_fields)),
     )
     with _WARNINGS, warnings.catch_warnings():
@@ -264,7 +272,7 @@ def _numbers(text: Text, places: dict[str, int], layout: CsvLayout) -> dict[str,
 
 def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
     """Read the rows block by block."""
-    n_rows = 0
+    n_rows = n_blank = 0
     taken = {name: Spool() for name in places}
     with read() as blocks:
         for table in blocks:
@@ -274,12 +282,18 @@ def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dic
                 if filled.any():
                     n_found = f"{text.n_fields + 1} or more"
                     raise _too_long(n_rows + int(filled.argmax()) + 1, n_found, text.n_fields)
+            n_used = len(table)
+            if n_used and table.iloc[-1].isna().all():
+                n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
                 if table[place].dtype.kind not in "fiu":
                     raise not_numeric(name, _first_text(table[place].tolist(), n_rows))
-                taken[name].append(table[place].to_numpy())
+                if n_used:
+                    taken[name].append(np.full(n_blank, np.nan))
+                    taken[name].append(table[place].to_numpy()[:n_used])
             n_rows += len(table)
-    if not n_rows:
+            n_blank = len(table) - n_used + (0 if n_used else n_blank)
+    if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
 

@@ -60,6 +60,11 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         chosen = choose(described, columns)
         wanted = {name: channels[k] for name, k in chosen.columns.items()}
         read = _read(file, wanted, path.stat().st_size)
+        stamps = None if "time_s" in read else _stamps(path, [c.path for c in wanted.values()])
+        if stamps is not None:
+            # The increment of a channel is that of its last segment.
+            read["time_s"] = stamps
+            chosen.metadata.clear()
         starts = [channel.properties.get("wf_start_time") for channel in wanted.values()]
         own = {key: as_text(file.properties[key]) for key in KEYS if key in file.properties}
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
@@ -92,6 +97,65 @@ def _segments(path: Path) -> list[int]:
             at += _LEAD_IN + rest
             found.append(rest - samples)
     return found
+
+
+def _stamps(path: Path, channels: Sequence[str]) -> Samples | None:
+    """Make time stamps in s where segments state another ``wf_increment``, or a gap by their start.
+
+    None where one clock runs through all segments; `Unusable` (``time``) where channels differ.
+    """
+    from nptdms.reader import TdmsReader
+
+    found: dict[str, list[tuple[int, Any, Any]]] = {name: [] for name in channels}
+
+    class Reader(TdmsReader):  # type: ignore[misc]
+        """Collect the properties at the end of each segment, of which npTDMS keeps the last."""
+
+        def _update_object_properties(self, properties: object) -> None:
+            super()._update_object_properties(properties)
+            for name, own in self.object_metadata.items():
+                values = (own.properties.get(key) for key in ("wf_increment", "wf_start_time"))
+                if name in found:
+                    found[name].append((own.num_values, *values))
+
+    with path.open("rb") as stream:
+        Reader(stream).read_metadata()
+    clocks = [_clock(parts) for parts in found.values()]
+    if all(len(clock) < 2 for clock in clocks):
+        return None
+    if any(clock != clocks[0] for clock in clocks):
+        raise Unusable("time", "segments of the channels differ in start or increment; split them")
+    spool = Spool()
+    for start, interval, n in clocks[0]:
+        spool.append(start + interval * np.arange(n))
+    return spool.samples()
+
+
+def _clock(parts: Sequence[tuple[int, Any, Any]]) -> list[tuple[float, float, int]]:
+    """Join segments of one clock; return start in s, interval in s and number of samples of each.
+
+    Empty where an increment is missing.
+    """
+    clock: list[tuple[float, float, int]] = []
+    end, last = 0.0, 0
+    first: Any = parts[0][2] if parts else None
+    before = first
+    for n_total, stated, moment in parts:
+        rate, n = rate_of(stated), n_total - last
+        if rate is None:
+            return []
+        start = end
+        if moment != before and hasattr(first, "as_datetime64"):
+            since = moment.as_datetime64("us") - first.as_datetime64("us")
+            at = float(since / np.timedelta64(1, "us")) / 1e6
+            # Start times are rounded to 1 µs.
+            start = at if abs(at - end) * rate > constants.JITTER else end
+        if clock and start == end and clock[-1][1] == 1 / rate:
+            clock[-1] = *clock[-1][:2], clock[-1][2] + n
+        elif n:
+            clock.append((start, 1 / rate, n))
+        end, last, before = start + n / rate, n_total, moment
+    return clock
 
 
 def _check_sizes(channels: Sequence[Any], n_bytes: int) -> None:

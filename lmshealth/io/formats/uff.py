@@ -214,7 +214,8 @@ def _describe(header: Header, name: str) -> Described:
         unit = unit.replace("\ufffd", "2")
     uneven = header["abscissa_spacing"] == _UNEVEN
     rate = None if uneven else rate_of(header["abscissa_inc"])
-    return Described(name, unit, rate, acceleration)
+    start = 0.0 if uneven else float(header["abscissa_min"])
+    return Described(name, unit, rate, acceleration, start)
 
 
 def _is_time_record(header: Header) -> bool:

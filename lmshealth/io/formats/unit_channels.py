@@ -17,21 +17,23 @@ from lmshealth.io.refusal import Unusable, listed
 class Described:
     """Name and unit of a channel as in the file, empty where there is none.
 
-    ``rate`` is its sample rate in Hz; ``acceleration`` whether the file calls it one, whatever its
-    unit.
+    ``rate`` is its sample rate in Hz, ``start`` the time in s of its first sample; ``acceleration``
+    whether the file calls it one, whatever its unit.
     """
 
     name: str
     unit: str
     rate: float | None = None
     acceleration: bool = False
+    start: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class Chosen:
     """Channels that make the log: name as a column of the log to the index in the file.
 
-    ``metadata`` holds their sample rate, where there is one; channels of another one are refused.
+    ``metadata`` holds their sample rate, where there is one; channels of another one, or of another
+    start, are refused.
     """
 
     columns: dict[str, int]
@@ -60,14 +62,23 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
         return Chosen(found, {}, ())
     # The rate of most channels, of several the highest.
     rate = max(counts, key=lambda rate: (counts[rate], rate))
+    alike = {
+        name: k
+        for name, k in found.items()
+        if abs((channels[k].rate or rate) / rate - 1) <= constants.AGREEMENT
+    }
+    starts = [channels[k].start for k in alike.values()]
+    start = max(starts, key=starts.count)
     kept, refused = {}, []
     for name, k in found.items():
-        own = channels[k].rate
-        if own is None or abs(own / rate - 1) <= constants.AGREEMENT:
+        late = channels[k].start - start
+        if name in alike and abs(late) * rate <= 0.5:
             kept[name] = k
             continue
-        detail = f"sampled at {own:.6g} Hz, the log at {rate:.6g} Hz; "
-        detail += "keep channels of one rate in one log"
+        detail = f"sampled at {channels[k].rate or rate:.6g} Hz, the log at {rate:.6g} Hz; "
+        if name in alike:
+            detail = f"starts {late:.6g} s after the other channels; "
+        detail += "keep channels of one rate and start in one log"
         refused.append(Refusal("", "time", detail, channel=name))
     # 999.9999999999999 Hz is an artefact of the division.
     return Chosen(kept, {"sample_rate_hz": f"{rate:.10g}"}, tuple(refused))

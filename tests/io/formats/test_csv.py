@@ -250,3 +250,11 @@ def test_the_beginning_of_a_contract_file_after_a_preamble_is_named(tmp_path):
     with pytest.raises(BadLog, match="no signal") as refused:
         read_log(tmp_path / "log.csv")
     assert "[csv]" not in refused.value.detail
+
+
+def test_empty_lines_are_missing_samples():
+    """An empty line has a place in time: a missing sample, but at the end or beside stamps."""
+    body = "1\n\n2\n\n\n"
+    assert str(parse("delta_e_um\n" + body).columns["delta_e_um"].tolist()) == "[1.0, nan, 2.0]"
+    stamped = parse("time_s,delta_e_um\n0,1\n\n1,2\n")
+    assert stamped.columns["delta_e_um"].tolist() == [1.0, 2.0]

@@ -72,7 +72,7 @@ def test_mixed_rates(tmp_path):
     path = write(
         tmp_path / "log.tdms",
         ("a", NOISE, fast),
-        ("b", NOISE, fast),
+        ("b", NOISE[::-1], fast),
         ("c", NOISE[:200], slow),
         ("temperature", NOISE[:2], {"unit_string": "C", "wf_increment": 1.0}),
     )
@@ -288,3 +288,28 @@ def test_limit_of_memory(tmp_path):
     with pytest.raises(Unusable, match="convert the file to HDF5 or Parquet, or raise") as caught:
         load(tmp_path / "log.tdms", ColumnMap(), 2 * n_bytes - 1)
     assert caught.value.reason == "too-large"
+
+
+def write_segments(path, *segments):
+    """Write one channel in g, each segment with its samples and properties."""
+    with TdmsWriter(str(path)) as writer:
+        for values, properties in segments:
+            own = {"unit_string": "g", **properties}
+            writer.write_segment([ChannelObject("log", "x", values, own)])
+    return path
+
+
+def test_segments_of_other_clocks(tmp_path):
+    """A segment of another increment or a late start is placed in time; a continued one is not."""
+    moment = np.datetime64("2026-03-01T08:30:00", "us")
+    values = np.random.default_rng(0).standard_normal(6000)
+    first = (values[:3000], {"wf_start_time": moment, **RATE})
+    log = read_log(
+        write_segments(tmp_path / "a.tdms", first, (values[3000:], {"wf_increment": 1.2e-3}))
+    )
+    assert log.sample_rate == pytest.approx(1000 / 1.2, rel=1e-4) and len(log.pieces) == 2
+    for late, n_pieces in ((0, 1), (500, 2)):
+        start = moment + np.timedelta64(3000 + late, "ms").astype("timedelta64[us]")
+        second = (values[3000:], {"wf_start_time": start, **RATE})
+        log = read_log(write_segments(tmp_path / f"{late}.tdms", first, second))
+        assert log.sample_rate == 1000.0 and len(log.pieces) == n_pieces

@@ -13,6 +13,7 @@ from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
+from tests.io.conftest import write_uff
 from tests.io.handmade import uff_set
 
 _SPEC = importlib.util.spec_from_file_location(
@@ -297,3 +298,18 @@ def test_limit_of_memory(tmp_path):
         with pytest.raises(Unusable, match=rf"{what} needs .* raise --max-memory") as caught:
             load(path, ColumnMap(), limit)
         assert caught.value.reason == "too-large"
+
+
+def test_records_that_start_later_are_refused(tmp_path):
+    """A record of another start than the others is refused by name."""
+    path = tmp_path / "log.uff"
+    for start, n_refused in ((0.0, 0), (0.25, 1)):
+        records = {"a": VALUES[:100], "b": VALUES[::-1][:100], "c": VALUES[1:101]}
+        write_uff(path, {"a": records["a"], "b": records["b"]})
+        late = write_uff(
+            tmp_path / "late.uff", {"c": records["c"]}, x=start + np.arange(100) / 2000
+        )
+        path.write_bytes(path.read_bytes() + late.read_bytes())
+        content = load(path, ColumnMap(), 1e9)
+        assert len(content.refused) == n_refused and len(content.columns) == 3 - n_refused
+        assert all("starts 0.25 s after" in one.detail for one in content.refused)
