@@ -12,6 +12,9 @@ from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, listed
 
+# Names that exporters give to the column of times.
+_TIME = re.compile(r"(time|zeit|temps|tiempo|tempo|t|x_value|timestamp)\b", re.IGNORECASE)
+
 
 @dataclass(frozen=True, slots=True)
 class Described:
@@ -89,9 +92,14 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
     """Name a channel as a column of the log; None if it is not to be read."""
     if channel.name in columns.columns.values():
         return channel.name
+    if role_of(channel.name) is None and columns.target(channel.name) is not None:
+        return channel.name
     if role_of(channel.name) is not None:
         column = _with_unit(channel, columns)
     else:
+        time = unit_key(channel.unit, "time")
+        if time and channel.rate is None and _TIME.match(channel.name):
+            return f"time_{time}" if columns.target(f"time_{time}") is not None else None
         unit = unit_key(channel.unit, "acceleration")
         if columns.columns or (unit is None and not channel.acceleration):
             return None
