@@ -99,7 +99,10 @@ def test_absent_map(tmp_path):
         ("[csv]\nskip_rows = 'two'", r"csv\.skip_rows: Expected `int | null`, got `str`"),
         ("[columns]\nacc_x_g = 1", "columns: one of its values: Expected `str`, got"),
         ("[csv]\nheader = false\n[", "no TOML"),
-        ("[csv]\ndelimiter = ','\ndecimal = ','", "delimiter and decimal are both ','; set the delimiter"),
+        (
+            "[csv]\ndelimiter = ','\ndecimal = ','",
+            "delimiter and decimal are both ','",
+        ),
     ],
 )
 def test_a_mistake_in_a_map_has_line_and_key(tmp_path, text, message):

@@ -131,10 +131,15 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     """
     encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
     stream.seek(0)
-    if wide := encoding.startswith("utf-16") or encoding.startswith("utf-32"):
-        stream = _recoded(stream, stored, encoding)
-    text = Text(stream, 4 * stored if wide else stored)
-    head = _head(text, "utf-8" if wide else encoding)
+    if encoding.startswith(("utf-16", "utf-32")):
+        with _recoded(stream, stored, encoding) as recoded:
+            return _parsed(Text(recoded, 4 * stored), encoding, columns)
+    return _parsed(Text(stream, stored), encoding, columns)
+
+
+def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
+    """Find the dialect of a text, and read its wanted columns."""
+    head = _head(text, "utf-8" if encoding.startswith(("utf-16", "utf-32")) else encoding)
     lines = [line for _, line in head]
     stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
     dialect = stated or find_dialect(lines, columns)
@@ -158,8 +163,11 @@ def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:
         while block := reader.read(_HEAD_BYTES):
             n_written += file.write(block.removeprefix("\ufeff").encode())
             check_size(n_written, stored)
-    except UnicodeError as error:
-        raise corrupt(f"is no {encoding} text: {error}") from error
+    except BaseException as error:
+        file.close()
+        if isinstance(error, UnicodeError):
+            raise corrupt(f"is no {encoding} text: {error}") from error
+        raise
     file.seek(0)
     return file
 
@@ -292,9 +300,10 @@ _BINARY = (_GZIP_MAGIC, b"PAR1", b"\x89HDF")
 
 def _is_text(head: bytes) -> bool:
     """Return whether a file may begin so."""
-    wide = encoding_of(head).startswith("utf-16") or encoding_of(head).startswith("utf-32")
-    return (wide or b"\0" not in head) and not head.startswith(_BINARY)
+    return (
+        encoding_of(head).startswith(("utf-16", "utf-32")) or b"\0" not in head
+    ) and not head.startswith(_BINARY)
 
 
-CSV = Format("CSV", (".csv",), _is_text, _load)
+CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)
 CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)

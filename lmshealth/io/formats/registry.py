@@ -20,7 +20,7 @@ FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 # Exporters use them for delimited text, and people for notes: such files are read where they are
 # named, and not collected from folders.
-TEXT_SUFFIXES = (".txt", ".tsv", ".dat")
+TEXT_SUFFIXES = (".txt", ".tsv", ".dat", ".asc")
 
 _HEAD = 4096
 

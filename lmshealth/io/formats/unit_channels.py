@@ -49,31 +49,30 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
     with it, the named ones and those that keep the contract. Two channels that would be one column
     are refused as ``columns``, a name that contradicts the unit of its channel as ``unit``.
     """
-    found: dict[str, int] = {}
-    for k, channel in enumerate(channels):
-        column = _column(channel, columns)
-        if column in found:
-            both = listed([channels[found[column]].name, channel.name])
-            detail = f"{both} would both be read as {column}; rename them or map one of them"
-            raise Unusable("columns", detail)
-        if column is not None:
-            found[column] = k
-    counts = Counter(own for k in found.values() if (own := channels[k].rate) is not None)
-    if not counts:
-        return Chosen(found, {}, ())
-    # The rate of most channels, of several the highest.
-    rate = max(counts, key=lambda rate: (counts[rate], rate))
-    kept, refused = {}, []
-    for name, k in found.items():
+    named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
+    # Each group of channels may have times of its own: those of the chosen rate are read.
+    counts = Counter(
+        own for column, k in named
+        if (own := channels[k].rate) is not None and role_of(column) != "time"
+    )  # fmt: skip
+    rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
+    kept: dict[str, int] = {}
+    refused: dict[str, Refusal] = {}
+    for column, k in named:
         own = channels[k].rate
-        if own is None or abs(own / rate - 1) <= constants.AGREEMENT:
-            kept[name] = k
-            continue
-        detail = f"sampled at {own:.6g} Hz, the log at {rate:.6g} Hz; "
-        detail += "keep channels of one rate in one log"
-        refused.append(Refusal("", "time", detail, channel=name))
+        if own is None or rate is None or abs(own / rate - 1) <= constants.AGREEMENT:
+            if column in kept and (role_of(column) != "time" or own is None):
+                both = listed([channels[kept[column]].name, channels[k].name])
+                detail = f"{both} would both be read as {column}; rename them or map one of them"
+                raise Unusable("columns", detail)
+            kept.setdefault(column, k)
+        elif role_of(column) != "time":
+            detail = f"sampled at {own:.6g} Hz, the log at {rate:.6g} Hz; "
+            detail += "keep channels of one rate in one log"
+            refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
-    return Chosen(kept, {"sample_rate_hz": f"{rate:.10g}"}, tuple(refused))
+    metadata = {} if rate is None else {"sample_rate_hz": f"{rate:.10g}"}
+    return Chosen(kept, metadata, tuple(refused.values()))
 
 
 def present(channels: Iterable[Described]) -> tuple[str, ...]:
