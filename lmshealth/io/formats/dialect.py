@@ -118,7 +118,7 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
             heads = list(_heads(lines[: found.first], skip, found))
         _check_thousands(lines[found.first :], found)
     _check_no_row_before(lines[skip : found.first], found)
-    names, units, where = _names(heads, found, layout)
+    names, units, where = _names(heads, found, columns)
     guessed = _guessed(found, layout, where, begin)
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
     return Dialect(found.delimiter, found.decimal, channels, found.first, metadata, guessed)
@@ -224,10 +224,10 @@ def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
 
 
 def _names(
-    heads: Sequence[tuple[int, list[str]]], found: _Rows, layout: CsvLayout
+    heads: Sequence[tuple[int, list[str]]], found: _Rows, columns: ColumnMap
 ) -> tuple[list[str], list[str], int | None]:
     """Name the columns, with their units, and return the line of the names, if there is one."""
-    n = found.n_fields
+    n, layout = found.n_fields, columns.csv
     if isinstance(layout.header, list):
         if len(layout.header) != n:
             detail = f"[csv] header names {len(layout.header)} columns"
@@ -235,12 +235,20 @@ def _names(
         return list(layout.header), [""] * n, None
     if not heads:
         return [str(i) for i in range(n)], [""] * n, None
-    (where, last), *rest = heads
-    if n and len(last) < n:
-        raise corrupt(f"row 1 has {n} fields, the line of names {len(last)}")
-    if rest and len(rest[0][1]) == n and all(map(_is_unit, last)) and any(last):
-        return rest[0][1], [word.strip(" []()") for word in last], rest[0][0]
-    return last, [""] * len(last), where
+    # Names differ; a line of the names that the column map has needs no other sign.
+    mapped = set(columns.columns.values())
+    own = [one for one in heads if mapped and mapped <= set(one[1])]
+    own += [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
+    where, names = (own or heads)[0]
+    if n and len(names) < n:
+        raise corrupt(f"row 1 has {n} fields, the line of names {len(names)}")
+    k = heads.index((where, names))
+    if not mapped and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
+        k, (where, names) = k + 1, heads[k + 1]
+    units = heads[k - 1][1] if k else [""]
+    if len(units) != len(names) or not all(map(_is_unit, units)):
+        units = [""] * len(names)
+    return names, [word.strip(" []()") for word in units], where
 
 
 def _is_unit(word: str) -> bool:
