@@ -170,6 +170,7 @@ def _to_log(
         reference_velocity=velocity,
         pieces=ranges,
         refused=tuple(refused),
+        guessed=content.guessed,
     )
 
 

@@ -118,6 +118,7 @@ def test_dialects(tmp_path, delimiter, decimal, encoding, before, units):
             for k in range(400)]  # fmt: skip
     (tmp_path / "log.txt").write_text(before + "\n".join([names, *rows, ""]), encoding=encoding)
     log = read_log(tmp_path / "log.txt")
+    assert (decimal == ",") == ("decimal commas" in log.guessed)
     factor = 1.0 if units else 9.80665
     assert log.sample_rate == 1000
     np.testing.assert_allclose(log.channels[-1].values, factor * Y, atol=1e-12)
