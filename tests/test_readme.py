@@ -27,7 +27,7 @@ def test_files_of_the_first_five_minutes_are_understood(root: Path, tmp_path: Pa
     (tmp_path / "stage.toml").write_text(stage, encoding="utf-8")
     known = load_columns(tmp_path / "map.toml")
     assert known.target("PE(0)") == "delta_e_um"
-    assert known.csv.skip_rows == 3
+    assert known.csv.skip_rows is None
     described = load_stage(str(tmp_path / "stage.toml"))
     assert [mode.name for mode in described.modes] == ["pitch"]
     assert described.parameters == ()

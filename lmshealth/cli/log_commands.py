@@ -395,6 +395,11 @@ def _each(
                 terminal.print_notes(_sentences(faults))
             more = reading | {"overrides": manifests[path.parent].overrides(path)}
             items = [read_log(path, **more)] if read is None else read(path, **more)
+            terminal.print_notes(
+                f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
+                for log in items
+                if isinstance(log, Log) and log.guessed
+            )
         for item in items:
             with _refusing(lost):
                 found.append(analyse(item))

@@ -5,6 +5,7 @@ A column name of the log contract gives the quantity by its prefix and the unit 
 
 from __future__ import annotations
 
+import codecs
 import math
 import re
 from dataclasses import dataclass
@@ -40,6 +41,8 @@ _UNITS: dict[str, tuple[str, float]] = {
     "a": ("current", 1.0),
     "ma": ("current", 1e-3),
     "s": ("time", 1.0),
+    "ms": ("time", 1e-3),
+    "us": ("time", 1e-6),
 }
 # `_m_s2` must be tried before `_s`, or an acceleration would be read as a time.
 _LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
@@ -82,7 +85,7 @@ def role_of(column: str) -> Role | None:
 
     ``time`` alone is no prefix: a column such as ``time_of_day`` is no time axis.
     """
-    if column in ("time", "time_s"):
+    if column in ("time", "time_s", "time_ms", "time_us"):
         return "time"
     fitting = (
         role for prefix, (role, _) in _PREFIXES.items() if f"{column}_".startswith(f"{prefix}_")
@@ -144,17 +147,18 @@ def _choices(role: Role) -> str:
 
 
 class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
-    """Layout of a delimited text file.
+    """Layout of a delimited text file; what is None is found in the file.
 
-    ``skip_rows`` lines before the metadata lines and the header are skipped unread. ``header`` is
-    whether a header line names the columns (else they are called ``"0"``, ``"1"``, ...), or the
-    names for a file without a header line.
+    ``skip_rows`` lines before the metadata lines and the names are skipped unread. A blank as
+    delimiter is any run of blanks and tabs. ``header`` is whether a line names the columns (else
+    they are called ``"0"``, ``"1"``, ...), or the names for a file without such a line.
     """
 
-    skip_rows: Annotated[int, Meta(ge=0)] = 0
-    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] = ","
-    decimal: Literal[".", ","] = "."
-    header: bool | list[str] = True
+    skip_rows: Annotated[int, Meta(ge=0)] | None = None
+    delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None
+    decimal: Literal[".", ","] | None = None
+    header: bool | list[str] | None = None
+    encoding: str | None = None
 
 
 class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
@@ -242,8 +246,18 @@ def _check(columns: ColumnMap) -> None:
     for key, value in columns.metadata.items():
         if not isinstance(value, str | int | float | datetime):
             raise ValueError(f"[metadata] {key} is a {type(value).__name__}, needed one value")
-    delimiter = columns.csv.delimiter
-    if not delimiter.isascii() or delimiter in '\r\n"#':
+    _check_layout(columns.csv)
+
+
+def _check_layout(layout: CsvLayout) -> None:
+    """Check the marks and the encoding of text."""
+    delimiter, encoding = layout.delimiter, layout.encoding
+    if delimiter is not None and (not delimiter.isascii() or delimiter in '\r\n"#'):
         raise ValueError(f"[csv] delimiter is {delimiter!r}, needed one ASCII separator")
-    if delimiter == columns.csv.decimal:
+    try:
+        codecs.lookup(encoding or "utf-8")
+    except LookupError as error:
+        needed = "needed a name that Python has, such as cp1252"
+        raise ValueError(f"[csv] encoding is {encoding!r}, {needed}") from error
+    if delimiter is not None and delimiter == layout.decimal:
         raise ValueError(f"[csv] delimiter and decimal are both {delimiter!r}; set the delimiter")

@@ -90,6 +90,7 @@ class Log:
     reference_velocity: Samples | None  # set point in m/s, ``(n_samples,)``; NaN where missing
     pieces: tuple[tuple[int, int], ...]  # half-open sample ranges without gaps
     refused: tuple[Refusal, ...]  # channels that were left out, and parts of others
+    guessed: tuple[str, ...] = ()  # of the layout: what neither file nor column map states
 
     def __post_init__(self) -> None:
         if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):

@@ -181,13 +181,14 @@ def _to_log(
         reference_velocity=velocity,
         pieces=ranges,
         refused=tuple(refused),
+        guessed=content.guessed,
     )
 
 
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     """Name the columns, convert them to SI and compare their lengths."""
     there = f"there: {listed(content.present)}"
-    hint = f"; {content.hint}" if content.hint else ""
+    hint = f"; read with {', '.join(content.guessed)}" if content.guessed else ""
     left_out = {refusal.channel for refusal in content.refused}
     if absent := sorted(set(columns.columns.values()) - set(content.columns) - left_out):
         raise Unusable("columns", f"the column map needs {listed(absent)}; {there}{hint}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import shutil
 import sqlite3
 import subprocess
@@ -925,3 +926,15 @@ def test_without_weasyprint_pages_are_written_and_the_error_names_it(
     assert 'pip install "lmshealth[pdf]"' in result.stderr
     assert len(result.stderr.splitlines()) == 1
     assert (out / "test-A.html").is_file() and (out / "lmshealth.sqlite").is_file()
+
+
+def test_a_guessed_layout_is_reported(tmp_path: Path) -> None:
+    """What neither the file nor a column map states is reported in one line on standard error."""
+    rows = [f"{k / 1000:.3f};{math.sin(k):.3f}".replace(".", ",") for k in range(2000)]
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join(["Axis 7", "time_s;acc_x_m_s2", *rows]), encoding="utf-8")
+    result = call("error", path)
+    found = (
+        "is read with ';' between fields, decimal commas, names in line 2; [csv] of a column map"
+    )
+    assert result.stderr.count(found) == 1

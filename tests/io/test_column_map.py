@@ -96,10 +96,13 @@ def test_absent_map(tmp_path):
             r"csv\.delimeter: unknown key; known are skip_rows, delimiter, decimal, ",
         ),
         ("colums = 1", r"colums: unknown key; known are columns, units, metadata, "),
-        ("[csv]\nskip_rows = 'two'", r"csv\.skip_rows: Expected `int`, got `str`"),
+        ("[csv]\nskip_rows = 'two'", r"csv\.skip_rows: Expected `int | null`, got `str`"),
         ("[columns]\nacc_x_g = 1", "columns: one of its values: Expected `str`, got"),
         ("[csv]\nheader = false\n[", "no TOML"),
-        ("[csv]\ndecimal = ','", "delimiter and decimal are both ','; set the delimiter"),
+        (
+            "[csv]\ndelimiter = ','\ndecimal = ','",
+            "delimiter and decimal are both ','",
+        ),
     ],
 )
 def test_a_mistake_in_a_map_has_line_and_key(tmp_path, text, message):

@@ -20,15 +20,15 @@ class Content:
 
     ``columns`` are the wanted ones under their names in the file, ``(n_samples,)`` each; metadata
     are text as in the file; ``present`` are the names of all columns, for messages. Refused are
-    wanted channels that cannot go with the others; the name of the log is added later. The hint is
-    what in the column map may not fit the file, where wanted columns are not found.
+    wanted channels that cannot go with the others; the name of the log is added later. ``guessed``
+    lists what neither the file nor the column map states.
     """
 
     columns: dict[str, Samples]
     metadata: dict[str, str]
     present: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
-    hint: str = ""
+    guessed: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)

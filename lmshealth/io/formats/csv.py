@@ -1,4 +1,4 @@
-"""Delimited text: leading ``# key: value`` lines, a header line, rows of numbers.
+"""Delimited text: leading ``# key: value`` lines, names of the columns, rows of numbers.
 
 pandas reads the rows from a stream that checks the text before pandas does: pandas accepts rows
 that are cut off, and allocates without bound for lines and quotes that do not end.
@@ -6,37 +6,45 @@ that are cut off, and allocates without bound for lines and quotes that do not e
 
 from __future__ import annotations
 
-import csv
+import codecs
 import gzip
 import re
+import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from functools import partial
-from io import BufferedIOBase
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool
-from lmshealth.io.column_map import ColumnMap, CsvLayout
-from lmshealth.io.formats.content import Content, Format, check_size, not_numeric, wanted
+from lmshealth.io.buffers import Samples, Spool, blocks
+from lmshealth.io.column_map import ColumnMap, role_of
+from lmshealth.io.formats.content import Content, Format, check_size, not_numeric
+from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
+from lmshealth.io.formats.text_layouts import LAYOUTS
+from lmshealth.io.formats.unit_channels import choose, present
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
-# Delimiters of exports, and the number of lines in which the column names are searched.
-_DELIMITERS, _HEAD = ",;\t| ", 100
+# First bytes and lines from which the dialect is found.
+_HEAD_BYTES, _HEAD_LINES = 1 << 16, 200
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
 _ROWS = 1 << 16
 _FIELDS = 1 << 18
 _NO_ROWS = "a header line and no rows; needed rows"
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
+# The last row of some exports.
+_END = re.compile(rb"(?<=\n)EOF[^\r\n]*\s*$")
+# Least magnitude of time stamps that count ticks since an epoch, and the ticks of a second: ns, 100
+# ns (FILETIME), µs, ms.
+_TICKS = ((1e18, 1e9), (1e16, 1e7), (1e15, 1e6), (1e12, 1e3))
 
 
 class Text:
@@ -47,11 +55,10 @@ class Text:
     begun); ``pending`` counts the bytes since the last complete row.
     """
 
-    def __init__(self, stream: BufferedIOBase, stored: int, delimiter: str) -> None:
+    def __init__(self, stream: IO[bytes], stored: int) -> None:
         self._stream = stream
         self._stored = stored
-        self._delimiter = delimiter.encode()
-        self.n_fields = 0
+        self.begin_rows(",", 0)
         self.seek(0)
 
     def seek(self, position: int) -> None:
@@ -60,6 +67,11 @@ class Text:
         self.position = position
         self.pending = 0
         self._tail = b""  # bytes after the last line feed
+        self._ahead = b""  # the block that is read next
+
+    def begin_rows(self, delimiter: str, n_fields: int) -> None:
+        """Expect rows from here on."""
+        self._delimiter, self.n_fields = delimiter, n_fields
 
     def line(self) -> bytes:
         """Read a line with its end, with the checks of `read`; empty at the end of the file."""
@@ -71,10 +83,13 @@ class Text:
         `Unusable`: ``corrupt`` for a NUL byte, for lines or rows without end and for an end inside
         a row, ``too-large`` for more than the file can honestly hold.
         """
-        block = self._checked(self._stream.read(size))
+        block, self._ahead = self._ahead or self._stream.read(size), self._stream.read(size)
+        if not self._ahead:
+            block = _END.sub(b"", block)
+        block = self._checked(block)
         if not block and self._tail and not self._tail.endswith(b"\r"):
             # The last number of a file that ends inside a row may be incomplete.
-            n_found = self._tail.count(self._delimiter) + 1
+            n_found = len(fields_of(self._tail.decode(errors="replace"), self._delimiter))
             if n_found < self.n_fields:
                 raise corrupt(f"the last row is cut off: {n_found} of {self.n_fields} fields")
         self.pending += len(block)
@@ -91,7 +106,7 @@ class Text:
     def _checked(self, block: bytes) -> bytes:
         if b"\0" in block:
             at = self.position + block.index(0)
-            raise Unusable("corrupt", f"NUL byte at offset {at}; needed UTF-8 text")
+            raise Unusable("corrupt", f"NUL byte at offset {at}; needed text")
         self.position += len(block)
         check_size(self.position, self._stored)
         end = block.rfind(b"\n") + 1
@@ -110,126 +125,71 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 
 def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
-    """Read delimited UTF-8 text, with or without byte order mark, block by block.
+    """Read delimited text of any dialect, block by block.
 
     What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
     """
-    layout = columns.csv
-    text = Text(stream, stored, layout.delimiter)
-    # The skipped lines may be in any encoding.
-    text.seek(len(_BOM) if text.line().startswith(_BOM) else 0)
-    for _ in range(layout.skip_rows):
-        text.line()
-    metadata = _leading_lines(text)
-    names = _header(text, layout)
-    places = {name: names.index(name) for name in wanted(names, columns)}
-    if not places:
-        return Content({}, metadata, tuple(names), hint=_hint(text, columns))
-    text.n_fields = len(names)
-    # Time stamps place the other rows; without them an empty row is a missing sample.
-    placed = any(columns.target(name) == "time_s" for name in places)
-    return Content(_numbers(text, places, layout, placed), metadata, tuple(names))
+    encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
+    stream.seek(0)
+    if encoding.startswith(("utf-16", "utf-32")):
+        with _recoded(stream, stored, encoding) as recoded:
+            return _parsed(Text(recoded, 4 * stored), encoding, columns)
+    return _parsed(Text(stream, stored), encoding, columns)
 
 
-def _line(text: Text) -> str:
-    """Read a line before the rows."""
-    start = text.position
-    line = text.line()
+def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
+    """Find the dialect of a text, and read its wanted columns."""
+    head = _head(text, "utf-8" if encoding.startswith(("utf-16", "utf-32")) else encoding)
+    lines = [line for _, line in head]
+    stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
+    dialect = stated or find_dialect(lines, columns)
+    guessed = (*([f"{encoding} text"] if encoding != "utf-8" else []), *dialect.guessed)
+    chosen, names = choose(dialect.channels, columns), present(dialect.channels)
+    metadata, samples = chosen.metadata | dialect.metadata, dict[str, Samples]()
+    if chosen.columns:
+        text.seek(head[dialect.start][0] if dialect.start < len(head) else text.position)
+        text.begin_rows(dialect.delimiter, len(dialect.channels))
+        times = [c for c in chosen.columns if role_of(columns.target(c) or "") == "time"]
+        samples = _numbers(text, chosen.columns, dialect, times)
+        samples |= {name: _since_first(samples[name]) for name in times}
+    return Content(samples, metadata, names, chosen.refused, guessed)
+
+
+def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:
+    """Copy a text to a temporary file as UTF-8."""
+    file, n_written = tempfile.TemporaryFile(prefix="lmshealth-"), 0  # noqa: SIM115
     try:
-        return line.decode("utf-8")
-    except UnicodeDecodeError as error:
-        what = f"byte {line[error.start]:#04x} at offset {start + error.start}"
-        raise Unusable("corrupt", f"{what} is not UTF-8; save the file as UTF-8") from error
+        reader = codecs.getreader(encoding)(stream)
+        while block := reader.read(_HEAD_BYTES):
+            n_written += file.write(block.removeprefix("\ufeff").encode())
+            check_size(n_written, stored)
+    except BaseException as error:
+        file.close()
+        if isinstance(error, UnicodeError):
+            raise corrupt(f"is no {encoding} text: {error}") from error
+        raise
+    file.seek(0)
+    return file
 
 
-def _leading_lines(text: Text) -> dict[str, str]:
-    """Read the leading ``# key: value`` lines; those without a colon are remarks."""
-    metadata: dict[str, str] = {}
-    start = text.position
-    while line := _line(text):
-        if line.strip() and not line.startswith("#"):
-            break
-        key, colon, value = line.lstrip("# \t").partition(":")
-        key, value = key.strip(), value.strip()
-        if colon and metadata.setdefault(key, value) != value:
-            both = f"{metadata[key]!r} and {value!r}"
-            raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
+def _head(text: Text, encoding: str) -> list[tuple[int, str]]:
+    """Read the first lines, each with the position of its beginning."""
+    head: list[tuple[int, str]] = []
+    while text.position < _HEAD_BYTES and len(head) < _HEAD_LINES:
         start = text.position
-    text.seek(start)
-    return metadata
-
-
-def _header(text: Text, layout: CsvLayout) -> list[str]:
-    """Name the columns; the text stays at its position when no header line does it."""
-    start = text.position
-    line = _line(text).rstrip("\r\n")
-    if not line:
-        raise Unusable("empty", "no header line and no rows; needed a header line and rows")
-    try:
-        fields = next(csv.reader([line], delimiter=layout.delimiter), [])
-    except csv.Error as error:
-        raise Unusable("corrupt", f"header line cannot be read: {error}") from error
-    if layout.header is True:
-        return [field.strip() for field in fields]
-    text.seek(start)
-    if layout.header is False:
-        return [str(i) for i in range(len(fields))]
-    if len(layout.header) != len(fields):
-        found = f"[csv] header names {len(layout.header)} columns"
-        raise Unusable("columns", f"{found}, the first row has {len(fields)}")
-    return list(layout.header)
-
-
-def _hint(text: Text, columns: ColumnMap) -> str:
-    """Suggest ``[csv]`` keys for a file whose header names no wanted column."""
-    layout = columns.csv
-    if layout.header is not True:
-        return ""
-    text.seek(0)
-    head = b"".join(text.line() for _ in range(_HEAD)).removeprefix(_BOM).decode(errors="replace")
-    lines = head.splitlines()
-    # Leading "# key: value" lines before the header are not skipped, other lines are.
-    n_skip = 0
-    for n_before, line in enumerate(lines):
-        fitting = [d for d in (layout.delimiter, *_DELIMITERS) if _names(line, d, columns)]
-        if fitting:
-            wrong = [] if fitting[0] == layout.delimiter else [f'delimiter = "{fitting[0]}"']
-            if not n_skip <= layout.skip_rows <= n_before:
-                wrong.append(f"skip_rows = {n_skip}")
-            keys = " and ".join(wrong).replace("\t", "\\t")
-            return f"line {n_before + 1} names them: set {keys} under [csv] of the column map"
-        if line.strip() and not line.startswith("#"):
-            n_skip = n_before + 1
-    rows = [s for s in lines[layout.skip_rows :] if s.strip() and not s.startswith("#")]
-    if rows and any(_is_row(rows[0], delimiter) for delimiter in (layout.delimiter, *_DELIMITERS)):
-        keys = 'set header = false under [csv] and name the columns "0", "1", … under [columns]'
-        return f"the first line holds only numbers: if no line names the columns, {keys}"
-    fits = "do skip_rows and delimiter under [csv] of the column map fit the file?"
-    return fits if columns.columns else ""
-
-
-def _names(line: str, delimiter: str, columns: ColumnMap) -> bool:
-    """Return whether a line names the wanted columns; without a column map, any of the contract."""
-    fields = {field.strip().strip('"') for field in line.split(delimiter)}
-    if columns.columns:
-        return set(columns.columns.values()) <= fields
-    return any(columns.target(field) is not None for field in fields)
-
-
-def _is_row(line: str, delimiter: str) -> bool:
-    """Return whether all fields of a line are numbers."""
-    try:
-        return bool([float(field.replace(",", ".")) for field in line.split(delimiter)])
-    except ValueError:
-        return False
+        if not (line := text.line()):
+            break
+        head.append((start, line.removeprefix(_BOM).decode(encoding, "replace")))
+    return head
 
 
 def _numbers(
-    text: Text, places: dict[str, int], layout: CsvLayout, placed: bool
+    text: Text, places: dict[str, int], dialect: Dialect, times: Collection[str]
 ) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
 
-    Empty lines are left out where time stamps place the rows, and at the end.
+    Moments are read in the columns of times only, as seconds since the first of them. Empty lines
+    are left out where time stamps place the rows, and at the end.
     """
     import pandas as pd
 
@@ -241,14 +201,17 @@ def _numbers(
     read = partial(
         pd.read_csv,
         text,
-        sep=layout.delimiter,
-        decimal=layout.decimal,
+        sep=r"\s+" if dialect.delimiter == " " else dialect.delimiter,
+        decimal=dialect.decimal,
+        # Numbers are ASCII in every encoding that comes here.
+        encoding_errors="replace",
         header=None,
         names=list(range(text.n_fields + n_spare)),
         index_col=False,
         # A block is small enough as a whole.
         low_memory=False,
-        skip_blank_lines=placed,
+        # Time stamps place the other rows; without them an empty row is a missing sample.
+        skip_blank_lines=bool(times),
         chunksize=max(1, min(_ROWS, _FIELDS // text.n_fields)),
     )
     with _WARNINGS, warnings.catch_warnings():
@@ -256,12 +219,13 @@ def _numbers(
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places)
+            return _spooled(partial(read, dtype=numbers), text, places, {})
         except (ValueError, pd.errors.ParserWarning):
             # Half as fast, but accepts blanks and locates the fault.
             text.seek(start)
         try:
-            return _spooled(partial(read, skipinitialspace=True), text, places)
+            careful = partial(read, skipinitialspace=True)
+            return _spooled(careful, text, places, dict.fromkeys(times, None))
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
@@ -270,12 +234,14 @@ def _numbers(
             raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
-def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dict[str, Samples]:
-    """Read the rows block by block."""
+def _spooled(
+    read: Callable[[], Any], text: Text, places: dict[str, int], first: dict[str, Any]
+) -> dict[str, Samples]:
+    """Read the rows block by block; ``first`` receives the first moments of its columns."""
     n_rows = n_blank = 0
     taken = {name: Spool() for name in places}
-    with read() as blocks:
-        for table in blocks:
+    with read() as tables:
+        for table in tables:
             text.pending = 0
             for extra in table.columns[text.n_fields :]:
                 filled = table[extra].notna().to_numpy()
@@ -286,16 +252,42 @@ def _spooled(read: Callable[[], Any], text: Text, places: dict[str, int]) -> dic
             if n_used and table.iloc[-1].isna().all():
                 n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
-                if table[place].dtype.kind not in "fiu":
-                    raise not_numeric(name, _first_text(table[place].tolist(), n_rows))
+                values = table[place]
+                if values.dtype.kind not in "fiu" and name in first:
+                    values = _moments(values)
+                    first[name] = values.min() if first[name] is None else first[name]
+                    values = (values - first[name]).dt.total_seconds()
+                if values.dtype.kind not in "fiu":
+                    raise not_numeric(name, _first_text(values.tolist(), n_rows))
                 if n_used:
                     taken[name].append(np.full(n_blank, np.nan))
-                    taken[name].append(table[place].to_numpy()[:n_used])
+                    taken[name].append(values.to_numpy()[:n_used])
             n_rows += len(table)
             n_blank = len(table) - n_used + (0 if n_used else n_blank)
     if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
+
+
+def _moments(values: Any) -> Any:
+    """Read moments; what is none is missing."""
+    import pandas as pd
+
+    day_first = bool(values.astype(str).str.match(r"\d{1,2}\.").any())
+    text = values.astype(str).str.replace(",", ".") if values.dtype == object else values
+    return pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
+
+
+def _since_first(time: Samples) -> Samples:
+    """Convert times that count ticks since an epoch to s since the first; other times stay."""
+    start = next((value for _, block in blocks(time) for value in block[:1]), 0.0)
+    scale = next((ticks for least, ticks in _TICKS if abs(start) >= least), None)
+    if scale is None:
+        return time
+    spool = Spool()
+    for _, block in blocks(time):
+        spool.append((block - start) / scale)
+    return spool.samples()
 
 
 def _too_long(row: object, found: str, needed: int) -> Unusable:
@@ -308,14 +300,19 @@ def _first_text(values: list[object], n_before: int) -> str:
         try:
             float(value)  # type: ignore[arg-type]
         except (TypeError, ValueError):
-            found = f"{str(value)[:40]!r} in row {n_before + i + 1}"
-            hint = ' (for decimal commas set decimal = "," under [csv] of the column map)'
-            return found + (hint if _is_row(str(value), ";") else "")
+            return f"{str(value)[:40]!r} in row {n_before + i + 1}"
     return "text"
 
 
 _BINARY = (_GZIP_MAGIC, b"PAR1", b"\x89HDF")
-CSV = Format(
-    "CSV", (".csv",), lambda head: b"\0" not in head and not head.startswith(_BINARY), _load
-)
+
+
+def _is_text(head: bytes) -> bool:
+    """Return whether a file may begin so."""
+    return (
+        encoding_of(head).startswith(("utf-16", "utf-32")) or b"\0" not in head
+    ) and not head.startswith(_BINARY)
+
+
+CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)
 CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)

@@ -13,14 +13,15 @@ from lmshealth.io.formats.mat import MAT
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
+from lmshealth.io.formats.vendor_files import RTX, TRACE
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Binary formats first: text is recognised by the absence of other signatures.
-FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, UFF, CSV)
+FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, RTX, TRACE, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 # Exporters use them for delimited text, and people for notes: such files are read where they are
 # named, and not collected from folders.
-TEXT_SUFFIXES = (".txt", ".tsv", ".dat")
+TEXT_SUFFIXES = (".txt", ".tsv", ".dat", ".asc")
 
 _HEAD = 4096
 

@@ -12,6 +12,9 @@ from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, listed
 
+# Names that exporters give to the column of times.
+_TIME = re.compile(r"(time|zeit|temps|tiempo|tempo|t|x_value|timestamp)\b", re.IGNORECASE)
+
 
 @dataclass(frozen=True, slots=True)
 class Described:
@@ -48,40 +51,41 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
     with it, the named ones and those that keep the contract. Two channels that would be one column
     are refused as ``columns``, a name that contradicts the unit of its channel as ``unit``.
     """
-    found: dict[str, int] = {}
-    for k, channel in enumerate(channels):
-        column = _column(channel, columns)
-        if column in found:
-            both = listed([channels[found[column]].name, channel.name])
-            detail = f"{both} would both be read as {column}; rename them or map one of them"
-            raise Unusable("columns", detail)
-        if column is not None:
-            found[column] = k
-    counts = Counter(own for k in found.values() if (own := channels[k].rate) is not None)
-    if not counts:
-        return Chosen(found, {}, ())
-    # The rate of most channels, of several the highest.
-    rate = max(counts, key=lambda rate: (counts[rate], rate))
-    alike = {
-        name: k
-        for name, k in found.items()
-        if abs((channels[k].rate or rate) / rate - 1) <= constants.AGREEMENT
-    }
-    starts = [channels[k].start for k in alike.values()]
-    start = max(starts, key=starts.count)
-    kept, refused = {}, []
-    for name, k in found.items():
-        late = channels[k].start - start
-        if name in alike and abs(late) * rate <= 0.5:
-            kept[name] = k
-            continue
-        detail = f"sampled at {channels[k].rate or rate:.6g} Hz, the log at {rate:.6g} Hz; "
-        if name in alike:
-            detail = f"starts {late:.6g} s after the other channels; "
-        detail += "keep channels of one rate and start in one log"
-        refused.append(Refusal("", "time", detail, channel=name))
+    named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
+    # Each group of channels may have times of its own: those of the chosen rate are read.
+    counts = Counter(
+        own
+        for column, k in named
+        if (own := channels[k].rate) is not None and role_of(column) != "time"
+    )
+    rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
+    alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
+    starts = [channels[k].start for k in alike]
+    start = max(starts, key=starts.count, default=0.0)
+    kept: dict[str, int] = {}
+    refused: dict[str, Refusal] = {}
+    for column, k in named:
+        late, own = channels[k].start - start, channels[k].rate
+        if k in alike and (rate is None or abs(late) * rate <= 0.5):
+            if column in kept and (role_of(column) != "time" or own is None):
+                both = listed([channels[kept[column]].name, channels[k].name])
+                detail = f"{both} would both be read as {column}; rename them or map one of them"
+                raise Unusable("columns", detail)
+            kept.setdefault(column, k)
+        elif role_of(column) != "time":
+            detail = f"sampled at {own or rate:.6g} Hz, the log at {rate:.6g} Hz; "
+            if k in alike:
+                detail = f"starts {late:.6g} s after the other channels; "
+            detail += "keep channels of one rate and start in one log"
+            refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
-    return Chosen(kept, {"sample_rate_hz": f"{rate:.10g}"}, tuple(refused))
+    metadata = {} if rate is None else {"sample_rate_hz": f"{rate:.10g}"}
+    return Chosen(kept, metadata, tuple(refused.values()))
+
+
+def _agree(one: float, other: float) -> bool:
+    """Return whether two sample rates agree."""
+    return abs(one / other - 1) <= constants.AGREEMENT
 
 
 def present(channels: Iterable[Described]) -> tuple[str, ...]:
@@ -100,9 +104,14 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
     """Name a channel as a column of the log; None if it is not to be read."""
     if channel.name in columns.columns.values():
         return channel.name
+    if role_of(channel.name) is None and columns.target(channel.name) is not None:
+        return channel.name
     if role_of(channel.name) is not None:
         column = _with_unit(channel, columns)
     else:
+        time = unit_key(channel.unit, "time")
+        if time and channel.rate is None and _TIME.match(channel.name):
+            return f"time_{time}" if columns.target(f"time_{time}") is not None else None
         unit = unit_key(channel.unit, "acceleration")
         if columns.columns or (unit is None and not channel.acceleration):
             return None

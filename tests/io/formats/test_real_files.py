@@ -32,7 +32,7 @@ AS_IT_IS = {
     "fditools_two_inertia_bench/open/MultisineTypeA.mat": ("unit", "'time'"),
     "lsb250_linear_guide/open/exp1.mat": ("columns", "there: exp1"),
     "lsb250_linear_guide/open/exp2.mat": ("columns", "there: exp2"),
-    "dropbear_ds8/open/10steps_test0.txt.gz": ("columns", "PXIe-8880"),
+    "dropbear_ds8/open/10steps_test0.txt.gz": ("columns", "PinLoc"),
     "shake_3storey/open/Stiff_BonusEvent_3rd.csv": ("columns", "no signal"),
 }
 # With their column map.

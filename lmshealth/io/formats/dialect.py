@@ -1,0 +1,287 @@
+"""Dialect of delimited text: encoding, delimiter, decimal mark, names and units of the columns.
+
+All of it is found from the first lines of the file, unless the column map states it. A layout of a
+vendor (`text_layouts`) states it in a header of its own.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+from lmshealth.io.column_map import ColumnMap, CsvLayout, unit_key
+from lmshealth.io.formats.unit_channels import Described
+from lmshealth.io.refusal import Unusable, corrupt
+
+# Delimiters in the order in which equal candidates are preferred; a blank is any run of them.
+_DELIMITERS = ",;\t| :"
+_MARKS = {"\t": "tabs", " ": "blanks"}
+# Lines from which a candidate is judged, and the least share of their characters that are numbers.
+_JUDGED, _LEAST_SHARE = 100, 0.3
+_EMPTY = r"|nan|na|n/a|null|-|[+-]?inf"
+_NUMBER = {
+    mark: re.compile(rf"[+-]?({body})(e[+-]?\d+)?{_EMPTY}", re.IGNORECASE)
+    for mark, body in ((".", r"\d+\.?\d*|\.\d+"), (",", r"\d+(,\d+)?"))
+}
+# Numbers with marks between thousands: certainly, and possibly.
+_THOUSANDS = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d+|(\.\d{3})+,\d+|([,.]\d{3}){2,})")
+_MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
+_DATE = r"\d{4}-\d\d-\d\d|\d{1,2}[./]\d{1,2}[./]\d{4}"
+_CLOCK = r"\d{1,2}:\d\d(:\d\d([.,]\d+)?)?"
+_MOMENT = re.compile(rf"({_DATE})([T ]\s*{_CLOCK})?\s*(Z|[+-]\d\d:?\d\d)?|{_CLOCK}")
+_REMARK = re.compile(r"\s*(#+|%+|//)\s*")
+_UNIT_BEHIND = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]\s*")
+_UNNAMED = 'no line of names (the columns are "0", "1", ...)'
+_MICRO = str.maketrans("µμ", "uu")
+_OTHER_UNITS = frozenset(
+    "min h V mV N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """How a text is read: marks, a channel for each field of a row, and where the rows begin.
+
+    ``start`` counts the lines before the rows; ``guessed`` lists what neither the log contract nor
+    the column map states.
+    """
+
+    delimiter: str
+    decimal: str
+    channels: tuple[Described, ...]
+    start: int
+    metadata: dict[str, str] = field(default_factory=dict)
+    guessed: tuple[str, ...] = ()
+
+
+class _Rows(NamedTuple):
+    """Rows found with a delimiter and a decimal mark; better ones compare greater."""
+
+    share: float  # of the characters of fields that are in numbers or moments
+    several: bool  # whether a row has more than one field
+    order: int  # preference among equals
+    first: int  # line of the first row
+    n_fields: int
+    delimiter: str
+    decimal: str
+
+
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
+    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
+    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
+        return marked
+    # Without a mark: Latin letters in two bytes each, of which one is zero.
+    for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if len(head) > 3 and head[first::2].count(0) > 0.9 * len(head[first::2]):
+            return name
+    try:
+        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+        return "utf-8"
+    except UnicodeDecodeError:
+        from charset_normalizer import from_bytes
+
+        found = from_bytes(head).best()
+    # µ, ° and ² are these bytes in the Windows code page of Western Europe.
+    western = found is None or any(mark in head for mark in b"\xb5\xb0\xb2")
+    return "cp1252" if western or found is None else found.encoding
+
+
+def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
+    """Find marks, names, units and the first row from the first lines of a text.
+
+    `Unusable`: ``empty`` without names or rows, ``corrupt`` where row and names differ in number,
+    ``columns`` where the text can be read in two ways, ``metadata`` for a key with two values.
+    """
+    layout = columns.csv
+    skip = layout.skip_rows or 0
+    metadata, begin = _leading(lines, skip)
+    if begin == len(lines):
+        raise Unusable("empty", "no header line and no rows; needed a header line and rows")
+    found = max(_candidates(lines, skip, layout), default=None)
+    if found is None:
+        delimiter, decimal = layout.delimiter or ",", layout.decimal or "."
+        n_fields = len(fields_of(lines[begin], delimiter))
+        found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
+    stated = layout.header is False or isinstance(layout.header, list)
+    heads = [] if stated else list(_heads(lines[: found.first], skip, found))
+    if layout.delimiter is None and layout.decimal is None:
+        title = next((line.strip() for line in reversed(lines[skip : found.first])), "")
+        if found.n_fields == 2 and found.delimiter == "," and _is_one_name(title, columns):
+            # One name over rows such as "1,5".
+            found = found._replace(delimiter=";", decimal=",", n_fields=1)
+            heads = list(_heads(lines[: found.first], skip, found))
+        _check_thousands(lines[found.first :], found)
+    _check_no_row_before(lines[skip : found.first], found)
+    names, units, where = _names(heads, found, columns)
+    guessed = _guessed(found, layout, where, begin)
+    channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
+    return Dialect(found.delimiter, found.decimal, channels, found.first, metadata, guessed)
+
+
+def fields_of(line: str, delimiter: str) -> list[str]:
+    """Split a line; a blank as delimiter stands for any run of blanks and tabs."""
+    if delimiter == " ":
+        return line.split()
+    try:
+        return next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])
+    except csv.Error as error:
+        raise corrupt(f"a line cannot be split: {error}") from error
+
+
+def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
+    """Read the leading lines ``# key: value``, and return the line at which they end."""
+    metadata: dict[str, str] = {}
+    for k in range(skip, len(lines)):
+        if lines[k].strip() and not lines[k].startswith("#"):
+            return metadata, k
+        key, colon, value = (part.strip() for part in lines[k].lstrip("# \t").partition(":"))
+        if colon and metadata.setdefault(key, value) != value:
+            both = f"{metadata[key]!r} and {value!r}"
+            raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
+    return metadata, len(lines)
+
+
+def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[_Rows]:
+    """Yield the rows that each delimiter and decimal mark find."""
+    for order, delimiter in enumerate(layout.delimiter or _DELIMITERS):
+        split = [
+            (k, fields_of(line, delimiter))
+            for k, line in enumerate(lines)
+            if k >= skip and line.strip() and not line.startswith("#")
+        ]
+        for decimal in layout.decimal or ".,":
+            if delimiter != decimal and (first := _first_row(split, _NUMBER[decimal])) is not None:
+                k, fields = split[first]
+                judged = [_share(own, _NUMBER[decimal]) for _, own in split[first:][:_JUDGED]]
+                share = round(sum(judged) / len(judged), 2)
+                rank = -2 * order - (decimal == ",")
+                n = len(fields) - (len(fields) > 1 and not fields[-1].strip())
+                yield _Rows(share, n > 1, rank, k, n, delimiter, decimal)
+
+
+def _first_row(split: Sequence[tuple[int, list[str]]], number: re.Pattern[str]) -> int | None:
+    """Find the first line of numbers with as many fields as a line beside it."""
+    sizes = [len(fields) for _, fields in split]
+    for i, (_, fields) in enumerate(split):
+        beside = sizes[max(i - 1, 0) : i] + sizes[i + 1 : i + 4]
+        if _share(fields, number) > _LEAST_SHARE and (not beside or sizes[i] in beside):
+            return i
+    # A row cut off, or one too long, below its names.
+    shares = (i for i, (_, own) in enumerate(split) if _share(own, number) > _LEAST_SHARE)
+    return next(shares, None)
+
+
+def _share(fields: Sequence[str], number: re.Pattern[str]) -> float:
+    """Return the share of the characters of fields that are in numbers or moments."""
+    words = [word for one in fields if (word := one.strip())]
+    if not any(number.fullmatch(word) or _THOUSANDS.fullmatch(word) for word in words):
+        return 0.0
+    kinds = number, _MOMENT, _THOUSANDS
+    fitting = sum(len(word) for word in words if any(kind.fullmatch(word) for kind in kinds))
+    return fitting / sum(map(len, words))
+
+
+def _heads(lines: Sequence[str], skip: int, found: _Rows) -> Iterator[tuple[int, list[str]]]:
+    """Yield lines that may name the columns, the nearest to the rows first."""
+    for k in range(len(lines) - 1, skip - 1, -1):
+        text = _REMARK.sub("", lines[k], count=1)
+        remark = text != lines[k]
+        for delimiter in (found.delimiter, *_DELIMITERS) if text.strip() else ():
+            fields = [one.strip() for one in fields_of(text, delimiter)]
+            n = len(fields) - (len(fields) == found.n_fields + 1 and not fields[-1])
+            # A remark names several columns; a line of one field is a title of several.
+            if n == found.n_fields and not (remark and n == 1):
+                yield k, fields[:n]
+                break
+            if delimiter == found.delimiter and n > 1 and not remark:
+                yield k, fields
+
+
+def _check_no_row_before(lines: Sequence[str], found: _Rows) -> None:
+    """Require that the line before the first row is no row of another length."""
+    last = next((line for line in reversed(lines) if line.strip()), "")
+    fields = fields_of(last, found.delimiter)
+    if not last.startswith("#") and _share(fields, _NUMBER[found.decimal]) > _LEAST_SHARE:
+        step = "or set skip_rows under [csv] of the column map"
+        raise corrupt(f"row 1 has {len(fields)} fields, the next {found.n_fields}; {step}")
+
+
+def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
+    """Refuse rows whose commas or points may be decimal marks or marks between thousands."""
+    words = [word.strip() for line in lines for word in fields_of(line, found.delimiter)]
+    if sure := next(filter(_THOUSANDS.fullmatch, words), None):
+        raise Unusable("columns", f"{sure!r} has marks between thousands; export without them")
+    marked = [word for word in words if "," in word]
+    if found.delimiter != "," and marked and all(map(_MAYBE_THOUSANDS.fullmatch, marked)):
+        step = 'if these are decimals set decimal = "," under [csv] of the column map'
+        raise Unusable("columns", f"{marked[0]!r} may have a mark between thousands; {step}")
+
+
+def _names(
+    heads: Sequence[tuple[int, list[str]]], found: _Rows, columns: ColumnMap
+) -> tuple[list[str], list[str], int | None]:
+    """Name the columns, with their units, and return the line of the names, if there is one."""
+    n, layout = found.n_fields, columns.csv
+    if isinstance(layout.header, list):
+        if len(layout.header) != n:
+            detail = f"[csv] header names {len(layout.header)} columns"
+            raise Unusable("columns", f"{detail}, the first row has {n}")
+        return list(layout.header), [""] * n, None
+    if not heads:
+        return [str(i) for i in range(n)], [""] * n, None
+    # Names differ; a line of the names that the column map has needs no other sign.
+    mapped = set(columns.columns.values())
+    own = [one for one in heads if mapped and mapped <= set(one[1])]
+    own += [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
+    where, names = (own or heads)[0]
+    if n and len(names) < n:
+        raise corrupt(f"row 1 has {n} fields, the line of names {len(names)}")
+    k = heads.index((where, names))
+    if not mapped and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
+        k, (where, names) = k + 1, heads[k + 1]
+    units = heads[k - 1][1] if k else [""]
+    if len(units) != len(names) or not all(map(_is_unit, units)):
+        units = [""] * len(names)
+    return names, [word.strip(" []()") for word in units], where
+
+
+def _is_unit(word: str) -> bool:
+    """Return whether a field of a line of units may be one; it may be empty."""
+    bare = word.strip(" []()")
+    return not bare or bare in _OTHER_UNITS or unit_key(bare) is not None
+
+
+def _described(name: str, unit: str, columns: ColumnMap) -> Described:
+    """Describe a column; a unit in brackets behind its name is its unit."""
+    behind = _UNIT_BEHIND.fullmatch(name)
+    if name in columns.columns.values():
+        return Described(name, unit)
+    if unit or behind is None or not _is_unit(behind["unit"]):
+        return Described(name.translate(_MICRO), unit)
+    return Described(behind["name"], behind["unit"])
+
+
+def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> tuple[str, ...]:
+    """List what differs from the log contract without being stated by the column map."""
+    marks = _MARKS.get(found.delimiter, f"{found.delimiter!r}")
+    listed = [
+        (layout.delimiter is None and found.delimiter != ",", f"{marks} between fields"),
+        (layout.decimal is None and found.decimal != ".", "decimal commas"),
+        (where is not None and where != begin, f"names in line {(where or 0) + 1}"),
+        (
+            where is None and layout.header is None,
+            _UNNAMED,
+        ),
+    ]
+    return tuple(text for differs, text in listed if differs)
+
+
+def _is_one_name(title: str, columns: ColumnMap) -> bool:
+    """Return whether a line is the name of a single wanted column."""
+    return "," not in title and columns.target(title) is not None

@@ -1,0 +1,115 @@
+"""Layouts of delimited text that have a header of their own: TwinCAT, LabVIEW, PI, Klipper.
+
+A layout returns the `Dialect` that the first lines of a file state, or None for another file. The
+layouts were taken from public readers and samples; see the README of `io`.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import UTC, datetime, timedelta
+
+from lmshealth.io.formats.dialect import Dialect, fields_of
+from lmshealth.io.formats.unit_channels import Described, rate_of
+from lmshealth.io.refusal import Unusable, corrupt
+
+_GCS_LINE = re.compile(r"#\s*([A-Z_]+\d*)\s*=\s*(.*\S)\s*")
+_FILETIME_EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
+
+
+def twincat(lines: Sequence[str]) -> Dialect | None:
+    """TwinCAT Scope: rows of keys, groups of channels, each with a column of times in ms."""
+    delimiter = next((d for d in "\t;:, " if lines and lines[0].startswith(f"Name{d}")), None)
+    at = {fields_of(line, delimiter or ",")[0]: k for k, line in enumerate(lines) if line.strip()}
+    start = next((k for k, line in enumerate(lines) if line.startswith("Starttime of export")), 0)
+    if delimiter is None or not start:
+        return None
+    keys = {key: fields_of(lines[k], delimiter) for key, k in at.items() if k > start}
+    interval = keys.get("SampleTime[ms]", [])
+    if "Name" not in keys or len(interval) != len(keys["Name"]):
+        raise corrupt("a TwinCAT Scope export without Name and SampleTime[ms] of each channel")
+    blank = [""] * len(interval)
+    units, scales = keys.get("Unit", blank), keys.get("ScaleFactor", blank)
+    channels = []
+    for name, text, unit, scale in zip(keys["Name"], interval, units, scales, strict=False):
+        rate = _number(text)
+        if name == "Name":
+            # The key column of a group holds its times; its rate is that of the next channel.
+            channels.append(Described("time", "ms", None))
+        elif name:
+            own = None if rate is None else rate_of(rate / 1000)
+            if scale not in ("", "1", "1.0", "1,0"):
+                unit = f"{unit} x {scale}"
+            channels.append(Described(name, unit, own))
+            if len(channels) > 1 and channels[-2].name == "time" and channels[-2].rate is None:
+                channels[-2] = Described("time", "ms", own)
+    first = max(keys_at for key, keys_at in at.items() if key in keys and _number(key) is None)
+    while first + 1 < len(lines) and not lines[first + 1].strip():
+        first += 1
+    decimal = "," if any("," in word for word in fields_of(lines[min(first + 1, len(lines) - 1)],
+                         delimiter)) and delimiter != "," else "."  # fmt: skip
+    ticks = fields_of(lines[start], delimiter)[1:2]
+    moment = _FILETIME_EPOCH + timedelta(microseconds=int(ticks[0]) // 10) if ticks else None
+    metadata = {} if moment is None else {"recorded_at": moment.isoformat()}
+    return Dialect(delimiter, decimal, tuple(channels), first + 1, metadata)
+
+
+def labview(lines: Sequence[str]) -> Dialect | None:
+    """LabVIEW measurement file (.lvm) with one header of a segment."""
+    if not lines or not lines[0].startswith("LabVIEW Measurement"):
+        return None
+    delimiter = "," if any(line.startswith("Separator,") for line in lines) else "\t"
+    rows = [fields_of(line, delimiter) for line in lines]
+    keys = {row[0]: row[1:] for row in rows if len(row) > 1}
+    where = next((k for k, row in enumerate(rows) if row and row[0] == "X_Value"), None)
+    if where is None:
+        raise corrupt("a LabVIEW measurement without a line X_Value that names the columns")
+    decimal = (keys.get("Decimal_Separator") or ["."])[0]
+    names = [name for name in rows[where] if name]
+    units, deltas = keys.get("Y_Unit_Label", []), keys.get("Delta_X", [])
+    rate = rate_of(_number((deltas or [""])[0]))
+    own_x = (keys.get("X_Columns") or ["One"])[0]
+    if own_x == "Multi":
+        raise Unusable("format", "X_Columns is Multi; export one column of X values, or none")
+    channels = [Described("time", "s") if own_x == "One" else Described("X_Value", "")]
+    channels += [
+        Described(name, units[k] if k < len(units) else "", rate)
+        for k, name in enumerate(names[1:])
+    ]
+    return Dialect(delimiter, decimal, tuple(channels), where + 1)
+
+
+def gcs_array(lines: Sequence[str]) -> Dialect | None:
+    """PI GCS array: lines ``# KEY = value`` up to ``# END_HEADER``."""
+    end = next((k for k, line in enumerate(lines) if line.strip() == "# END_HEADER"), None)
+    if end is None:
+        return None
+    found = (_GCS_LINE.fullmatch(line.rstrip("\r\n")) for line in lines[:end])
+    keys = {match[1]: match[2] for match in found if match}
+    delimiter, n = chr(int(keys.get("SEPARATOR", "32"))), int(keys.get("DIM", "1"))
+    interval = _number(keys.get("SAMPLE_TIME", ""))
+    names = [keys.get(f"NAME{k}", str(k)) for k in range(n)]
+    rate = rate_of(interval)
+    return Dialect(delimiter, ".", tuple(Described(name, "", rate) for name in names), end + 1)
+
+
+def klipper(lines: Sequence[str]) -> Dialect | None:
+    """Klipper's accelerometer CSV: ``#time,accel_x,accel_y,accel_z`` in s and mm/s²."""
+    where = next((k for k, line in enumerate(lines[:3]) if line.startswith("#time,accel_")), None)
+    if where is None:
+        return None
+    names = lines[where].strip().split(",")[1:]
+    channels = Described("time", "s"), *(Described(name, "mm/s²") for name in names)
+    return Dialect(",", ".", tuple(channels), where + 1)
+
+
+LAYOUTS = (twincat, labview, gcs_array, klipper)
+
+
+def _number(text: str) -> float | None:
+    """Read a number with a decimal point or comma; None for any other text."""
+    try:
+        return float(text.strip().replace(",", "."))
+    except ValueError:
+        return None
