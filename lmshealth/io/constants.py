@@ -84,7 +84,13 @@ LONGEST_CELL = 50
 LONGEST_ATTRIBUTE = 1 << 16
 """Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
 MOST_COLUMNS = 1000
-"""Columns of a MAT matrix that are signals."""
+"""Columns of signals of a file, and those of a MAT matrix that are signals."""
+MOST_KEYS = 10_000
+"""Lines of metadata of a CSV file."""
+MOST_CELLS = 200
+"""Columns of a table next to logs, which has a dozen. Each row takes time for all of them."""
+MOST_ROWS = 1_000_000
+"""Rows of such a table: as many logs are an archive of several tables."""
 MOST_ARRAYS = 20_000
 """Arrays of a MAT variable."""
 DEEPEST = 32

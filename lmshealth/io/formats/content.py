@@ -41,14 +41,15 @@ class Format:
     ``name`` is for messages; the suffixes are in lower case, with the leading dot; ``sniff``
     returns whether a file has this format from its leading bytes; ``load`` reads a file: path,
     column map, most memory in bytes. It may raise anything: `load_by` turns it into a refusal.
-    With ``isolated`` it is called in a process of its own, and must be a function of a module.
+    With a ``library``, native code that can crash or hang, it is called in a process of its own,
+    and must be a function of a module.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
     load: Load
-    isolated: bool = False
+    library: str = ""
 
 
 def load_by(form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -89,6 +90,9 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     chosen = [name for name in names if columns.target(name) is not None]
     if twice := repeated(chosen):
         raise Unusable("columns", f"the file names {listed(twice)} more than once")
+    if len(chosen) > constants.MOST_COLUMNS:
+        found = f"{len(chosen)} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
     return chosen
 
 

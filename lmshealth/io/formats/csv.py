@@ -122,7 +122,8 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
         text.line()
     metadata = _leading_lines(text)
     names = _header(text, layout)
-    places = {name: names.index(name) for name in wanted(names, columns)}
+    place = {name: k for k, name in enumerate(names)}
+    places = {name: place[name] for name in wanted(names, columns)}
     if not places:
         return Content({}, metadata, tuple(names), hint=_hint(text, columns))
     text.n_fields = len(names)
@@ -152,6 +153,9 @@ def _leading_lines(text: Text) -> dict[str, str]:
         if colon and metadata.setdefault(key, value) != value:
             both = f"{metadata[key]!r} and {value!r}"
             raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
+        if len(metadata) > constants.MOST_KEYS:
+            found = f"more than {constants.MOST_KEYS} lines of metadata"
+            raise Unusable("metadata", f"{found}; keep those that a log needs")
         start = text.position
     text.seek(start)
     return metadata

@@ -101,4 +101,4 @@ def _attribute(file: Any, key: str) -> str:
     return as_text(value)
 
 
-HDF5 = Format("HDF5", (".h5", ".hdf5"), lambda head: head.startswith(_MAGIC), _load, isolated=True)
+HDF5 = Format("HDF5", (".h5", ".hdf5"), lambda head: head.startswith(_MAGIC), _load, library="h5py")

@@ -24,6 +24,7 @@ import tempfile
 import threading
 import time
 from contextlib import suppress
+from importlib import import_module
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -35,7 +36,7 @@ from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
 from lmshealth.io.buffers import Spool
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Load, load_by
+from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable
 
@@ -58,6 +59,7 @@ class _Request(NamedTuple):
     max_memory: float
     seconds: float
     memory: float
+    library: str  # imported before these count
 
 
 class _Answer(msgspec.Struct, omit_defaults=True):
@@ -84,9 +86,7 @@ class _Ended(Exception):
     """The process ended while it read a file."""
 
 
-def read_isolated(
-    form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float
-) -> Content:
+def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: float) -> Content:
     """Read a file as `load_by` does, in the process.
 
     `Unusable` also where the process ends (``corrupt``), where reading takes too long
@@ -95,7 +95,8 @@ def read_isolated(
     stored = path.stat().st_size
     memory = max(3 * constants.SMALL_ENOUGH, min(max_memory, 4 * stored))
     seconds = _max_seconds() + stored / constants.SLOWEST_READING
-    request = _Request(form, load, path.absolute(), columns, max_memory, seconds, memory)
+    arguments = form.name, form.load, path.absolute(), columns, max_memory
+    request = _Request(*arguments, seconds, memory, form.library)
     try:
         return _reader.read(request)
     except _Ended:
@@ -177,7 +178,7 @@ class _Process:
             self._requests.flush()
 
     def end(self, patience: float) -> int:
-        """End the process; return its own exit status within some seconds, negative for a signal."""
+        """Wait some seconds for its end, or end it; return its status, negative for a signal."""
         try:
             status = self.popen.wait(patience)
         except subprocess.TimeoutExpired:
@@ -270,6 +271,8 @@ def serve() -> None:
             request = pickle.load(requests)
         except EOFError:
             return
+        with suppress(ImportError):  # the function of the format refuses the file
+            import_module(request.library)
         _limit_memory(request.memory)
         # A thread that no library can hold ends the process.
         with open(os.devnull, "w") as file:

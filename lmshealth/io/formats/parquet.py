@@ -52,5 +52,5 @@ def _sniff(head: bytes) -> bool:
 
 
 PARQUET = Format(
-    "Parquet", (".parquet",), lambda head: head.startswith(_MAGIC), _load, isolated=True
+    "Parquet", (".parquet",), lambda head: head.startswith(_MAGIC), _load, library="pyarrow.parquet"
 )

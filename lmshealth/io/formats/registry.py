@@ -52,8 +52,9 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
     ``corrupt`` for content that cannot be read, and the reasons of the formats.
     """
     form = confirm(path)
-    read = read_isolated if form.isolated else load_by
-    return read(form.name, form.load, path, columns, max_memory)
+    if form.library:
+        return read_isolated(form, path, columns, max_memory)
+    return load_by(form.name, form.load, path, columns, max_memory)
 
 
 def confirm(path: Path) -> Format:

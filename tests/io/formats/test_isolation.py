@@ -14,7 +14,7 @@ import pytest
 from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats import isolation
-from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.content import Content, Format
 from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
@@ -86,7 +86,7 @@ def file(tmp_path):
 
 def attempt(function, path):
     """Read a file by a function in the process."""
-    return read_isolated("FORM", function, path, ColumnMap(), 2e9)
+    return read_isolated(Format("FORM", (), bool, function, "math"), path, ColumnMap(), 2e9)
 
 
 @pytest.mark.parametrize(
@@ -161,7 +161,7 @@ def test_fork(make):
 
 def test_threads(make):
     """Threads take turns at the process."""
-    paths = [make("a.h5"), make("b.parquet")] * 4
+    paths = [make("a.h5"), make("b.h5")] * 4
     sums = {}
 
     def read(k):
@@ -203,27 +203,26 @@ def alive(pid):
 
 
 @pytest.mark.slow
-def test_filters_that_end_the_library(tmp_path, monkeypatch):
-    """Bytes of the messages of filters, set to zero in turn, end no process of ours.
+def test_damaged_filters(tmp_path):
+    """Bytes of the header of a filtered column, changed in turn, give the samples or a refusal.
 
-    Some must end the process of the library, or the test is not about what it says.
+    The header has no checksum; a filter that does not fit the type of the samples is detected.
     """
-    monkeypatch.setenv("LMSHEALTH_MAX_SECONDS", "5")
     path = tmp_path / "log.h5"
+    samples = np.random.default_rng(0).normal(size=3000).astype("f4")
     with h5py.File(path, "w") as file:
-        samples = np.random.default_rng(0).normal(size=4000).astype("f4")
         options = {"chunks": (1000,), "compression": "lzf", "shuffle": True, "fletcher32": True}
         file.create_dataset("delta_e_um", data=samples, **options)
         file.attrs["sample_rate_hz"] = 1000.0
     data = path.read_bytes()
-    start = data.index(b"shuffle") - 24
-    details = []
-    for at in range(start, data.index(b"lzf") + 40):
-        path.write_bytes(data[:at] + bytes(1) + data[at + 1 :])
-        try:
-            values = read_log(path).channels[0].values
-        except BadLog as error:
-            details.append(error.detail)
-        else:
-            np.testing.assert_array_equal(values, samples.astype(float) * 1e-6)
-    assert any("crashes as it reads it" in detail for detail in details), details
+    start, refused = data.index(b"shuffle") - 100, 0
+    for at in range(start, start + 190):
+        for value in {0, 1, 255, data[at] ^ 2} - {data[at]}:
+            path.write_bytes(data[:at] + bytes([value]) + data[at + 1 :])
+            try:
+                values = read_log(path).channels[0].values
+            except BadLog:
+                refused += 1
+            else:
+                np.testing.assert_array_equal(values, samples.astype(float) * 1e-6)
+    assert refused > 100
