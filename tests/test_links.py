@@ -95,7 +95,7 @@ def test_logs_outside(tmp_path):
 def test_option(stage, tmp_path):
     """The command line has the option, wherever it stands."""
     path = stage("../outside.csv")
-    refused = CliRunner().invoke(main, ["check", "--stage", path])
+    refused = CliRunner().invoke(main, ["plan", "--stage", path])
     assert refused.exit_code and "--follow-links" in refused.output + refused.stderr
-    for words in (["--stage", path, "--follow-links"], ["--follow-links", "--stage", path]):
-        assert CliRunner().invoke(main, ["check", *words]).exit_code == 0
+    for words in ([path, "--follow-links"], ["--follow-links", path]):
+        assert CliRunner().invoke(main, ["stage", *words]).exit_code == 0

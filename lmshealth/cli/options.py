@@ -15,7 +15,7 @@ from loky import cpu_count
 from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
-from lmshealth.stage.description import load_stage
+from lmshealth.stage.description import Stage, load_stage
 
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
@@ -64,7 +64,7 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-_FOLLOW_LINKS = click.option(
+FOLLOW_LINKS = click.option(
     "--follow-links",
     is_flag=True,
     is_eager=True,  # it decides how --stage is read
@@ -79,15 +79,20 @@ def follow_links() -> bool:
     return bool(click.get_current_context().meta.get(__name__))
 
 
+def described(reference: str) -> Stage:
+    """Load a stage description as ``--follow-links`` allows."""
+    return load_stage(reference, follow_links=follow_links())
+
+
 def stage_option(*name: str, **settings: Any) -> Callable[[Callable[..., Any]], Any]:
     """Return the options ``--stage`` and ``--follow-links``."""
     given: dict[str, Any] = {
-        "type": lambda reference: load_stage(reference, follow_links=follow_links()),
+        "type": described,
         "metavar": "TEXT",
         "help": "Stage description: a .toml file or a shipped name.",
     }
     option = click.option("--stage", *name, **(given | settings))
-    return lambda command: option(_FOLLOW_LINKS(command))
+    return lambda command: option(FOLLOW_LINKS(command))
 
 
 out_option = partial(click.option, "--out", required=True, type=OUT)
