@@ -59,7 +59,6 @@ def _dataset(file: Any, name: str) -> Any:
     # Kind "O" would be strings or object references: never loaded.
     if item.dtype.kind not in "fiu" or item.ndim != 1:
         raise not_numeric(name, f"{item.dtype} of shape {item.shape}")
-    _check_header(item, name)
     # HDF5 reads blocks that a crashed recorder never wrote as zeros. More than are needed are there
     # where the size is damaged.
     needed, found = int(item.size > 0), int(item.id.get_storage_size() > 0)
@@ -67,6 +66,7 @@ def _dataset(file: Any, name: str) -> Any:
         needed, found = -(-item.size // item.chunks[0]), item.id.get_num_chunks()
     if found != needed:
         raise Unusable("corrupt", f"column {name!r}: {found} of {needed} blocks were ever written")
+    _check_header(item, name)
     return item
 
 
@@ -80,6 +80,15 @@ def _check_header(item: Any, name: str) -> None:
     is_odd = item.dtype.kind == "f" and kind != h5py.h5t.py_create(item.dtype)
     if is_odd or any(size != (item.dtype.itemsize,) for size in of_shuffle):
         raise corrupt(f"column {name!r} has a damaged type or filter")
+    if item.chunks is None:
+        return
+    # Only compression may be left out, of a block that it does not shorten.
+    always = (h5py.h5z.FILTER_SHUFFLE, h5py.h5z.FILTER_FLETCHER32)
+    mask = sum(1 << k for k, one in enumerate(filters) if one[0] in always)
+    found: list[tuple[int, int]] = []
+    item.id.chunk_iter(lambda one: found.append((one.chunk_offset[0], one.filter_mask & mask)))
+    if sorted(found) != [(start, 0) for start in range(0, item.size, item.chunks[0])]:
+        raise corrupt(f"column {name!r} has blocks that are not where they belong")
 
 
 def _attribute(file: Any, key: str) -> str:

@@ -153,6 +153,24 @@ def test_hdf5_unwritten_blocks(tmp_path):
     refused(tmp_path / "log.h5", "corrupt", "5 of 10")
 
 
+@pytest.mark.parametrize("damage", ["place", "mask"])
+def test_blocks_out_of_place(tmp_path, damage):
+    """A block at the place of another would be read as zeros, one without its filter as noise."""
+    path = tmp_path / "log.h5"
+    with h5py.File(path, "w") as file:
+        values = np.random.default_rng(0).normal(size=400).astype("f4")
+        file.create_dataset("delta_e_um", data=values, chunks=(100,), shuffle=True)
+        file.attrs["sample_rate_hz"] = 1000
+        place = file["delta_e_um"].id.get_chunk_info(2).byte_offset
+    data = path.read_bytes()
+    # Key of a block: its size, mask of its filters and place in the column; then its place here.
+    at = data.index(place.to_bytes(8, "little")) - 24
+    assert int.from_bytes(data[at + 8 : at + 16], "little") == 200
+    start, new = (at + 8, bytes(8)) if damage == "place" else (at + 4, b"\1")
+    path.write_bytes(data[:start] + new + data[start + len(new) :])
+    refused(path, "corrupt", "blocks that are not where they belong")
+
+
 def test_hdf5_damaged_heap(make, monkeypatch):
     """A heap of strings on which the HDF5 library would never return is refused."""
     monkeypatch.setenv("LMSHEALTH_MAX_SECONDS", "0.2")
