@@ -4,7 +4,10 @@ PYTHON ?= python3
 BIN := .venv/bin
 DEMO := demo
 
-.PHONY: demo picture check test slow coverage statistics bench clean
+# Of `make fuzz`: seconds in which files are damaged and read.
+SECONDS ?= 60
+
+.PHONY: demo picture check test slow coverage statistics bench fuzz compat clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -49,6 +52,15 @@ statistics: .venv/installed
 # Speed of every step relative to a peer, recorded in studies/bench/result.json.
 bench: .venv/installed
 	$(BIN)/python -m studies.bench.run
+
+# Damaged files of all formats, from another seed each time; what fails is kept and named.
+fuzz: .venv/installed
+	LMSHEALTH_FUZZ_EXAMPLES=$$(( 5 * $(SECONDS) )) $(BIN)/pytest -q -m slow tests/io/formats/test_fuzz.py
+	$(BIN)/python -m studies.bad_inputs.mutants --seconds $(SECONDS)
+
+# Fast tests on other Pythons, lowest dependencies, kernels and threads, as far as they are here.
+compat: .venv/installed
+	$(BIN)/python tests/compat.py
 
 # Reinstall when pyproject.toml is newer than the installation.
 .venv/installed: pyproject.toml

@@ -1,8 +1,10 @@
-"""Write files: completely or not at all."""
+"""Read small tables; write files: completely or not at all."""
 
 from __future__ import annotations
 
+import os
 import secrets
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +14,28 @@ from lmshealth.errors import BadTable
 
 if TYPE_CHECKING:
     from xarray import DataTree
+
+
+# Far above every table that is read as a whole.
+_LARGEST_TABLE = 64 << 20
+
+
+def read_table(path: Path) -> bytes:
+    """Read a file of settings or rows; `ValueError` for a device, a pipe, or one too large.
+
+    They would be read without end, or wait for a writer.
+    """
+    found = path.stat()
+    if not stat.S_ISREG(found.st_mode):
+        raise ValueError("is no regular file")
+    if found.st_size > _LARGEST_TABLE:
+        raise ValueError(f"{found.st_size} bytes are too many; needed at most {_LARGEST_TABLE}")
+    return path.read_bytes()
+
+
+def escapes(path: Path, folder: Path) -> bool:
+    """Return whether a path leads out of a folder, by its parts or by symbolic links."""
+    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(folder))
 
 
 def write_text(target: Path, text: str) -> None:

@@ -14,6 +14,12 @@ from msgspec.inspect import StructType, Type, UnionType, VarTupleType, type_info
 
 # A hundred modes take a tenth of it.
 _MOST_BYTES = 1 << 17
+# Parts of a dotted key; the schemas have four. tomllib takes the square of their number in time.
+_MOST_PARTS = 16
+# Each word is tried once, and given back by none: the time is linear.
+_WORD = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
+_LONG_KEY = re.compile(rf"(?<![\w-]){_WORD}(?:[ \t]*+\.[ \t]*+{_WORD}){{{_MOST_PARTS},}}+")
+_LONGEST_PLACE, _LONGEST_MESSAGE = 80, 400
 
 Kind = TypeVar("Kind")
 
@@ -33,7 +39,11 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     if len(content) > _MOST_BYTES:
         raise ValueError(f"{len(content)} bytes are too many; needed at most {_MOST_BYTES}")
     try:
-        table = tomllib.loads(content.decode("utf-8-sig"))
+        text = content.decode("utf-8-sig")
+        if found := _LONG_KEY.search(text):
+            line = text.count("\n", 0, found.start()) + 1
+            raise ValueError(f"line {line}: a key of more than {_MOST_PARTS} parts")
+        table = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"no TOML: {error}") from error
     except RecursionError as error:
@@ -41,8 +51,15 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        message = _explained(str(error), table, type_info(kind))
-        raise ValueError(message.lstrip(".: ")) from error
+        message = _explained(str(error), table, type_info(kind)).lstrip(".: ")
+        raise ValueError(_short(message, _LONGEST_MESSAGE)) from error
+
+
+def _short(text: str, most: int) -> str:
+    """Keep both ends of a text, and escape what cannot be seen."""
+    if len(text) > most:
+        text = f"{text[: most // 2]} … {text[-most // 2 :]}"
+    return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
 def _explained(error: str, table: Any, schema: Type) -> str:
@@ -61,15 +78,15 @@ def _explained(error: str, table: Any, schema: Type) -> str:
             error = f"missing; there are {', '.join(tags)}" if tags else "missing"
         else:
             error = f"unknown key; known are {', '.join(_known_keys(parts, value))}"
-        return f"{path}.{name}: {error}"
+        return f"{_short(f'{path}.{name}', _LONGEST_PLACE)}: {error}"
     if error.startswith("Invalid value"):
         tags = [str(part.tag) for part in _structs(schema, keys[:-1]) if part.tag_field == keys[-1]]
         error = f"there are {', '.join(tags)}" if tags else error
     if "matching regex" in error:
         error = "needed printable text"
     if "got" not in error and not isinstance(value, dict | list):
-        error = f"{error}, got {value!r}"
-    return f"{path}: {error.replace('object', 'table')}"
+        error = f"{error}, got {_short(repr(value), _LONGEST_PLACE)}"
+    return f"{_short(path, _LONGEST_PLACE)}: {error.replace('object', 'table')}"
 
 
 def _known_keys(parts: list[StructType], own: dict[str, Any]) -> list[str]:

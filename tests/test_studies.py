@@ -578,6 +578,13 @@ def test_bad_inputs_time_axes(root: Path) -> None:
     assert answer["sets_told_right"] == answer["sets"] >= 2
 
 
+def test_bad_inputs_mutants(root: Path) -> None:
+    """A few damaged files of all forms, texts and stores are refused or read right."""
+    answer = json.loads(run_study(root, "bad_inputs", "mutants"))
+    assert all(answer["passed"].values())
+    assert sum(row["mutants"] for row in answer["mutants_of_files"]) == 120
+
+
 def test_bad_inputs_injection(root: Path) -> None:
     """Some hostile names, files and addresses are text, reach nothing, and show no password."""
     answer = json.loads(run_study(root, "bad_inputs", "injection"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from typing import Annotated
 
 import pytest
@@ -60,6 +61,42 @@ def test_mistakes_are_named(text: str, message: str) -> None:
     with pytest.raises(ValueError) as caught:
         decode(text.encode(), _Tree)
     assert str(caught.value).startswith(message)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = 1\n" + "a." * 60_000 + "a = 1",
+        "x = 1\n[" + "a . " * 30_000 + "a]",
+        "x = 1\n" + '"a b".' * 20_000 + "a = 1",
+    ],
+)
+def test_keys_of_many_parts(text: str) -> None:
+    """Dotted keys, whose time grows with the square of their parts, are refused with their line."""
+    start = time.process_time()
+    with pytest.raises(ValueError, match=r"^line 2: a key of more than 16 parts$"):
+        decode(text.encode(), _Tree)
+    assert time.process_time() - start < 1
+
+
+@pytest.mark.parametrize("text", ['name = "1.2.3"', "x = [" + "1.5, " * 99 + "]", "x" * 130_000])
+def test_dots_that_are_no_keys(text: str) -> None:
+    """Numbers, texts and one long word are not taken for keys of many parts."""
+    try:
+        decode(text.encode(), _Tree)
+    except ValueError as error:
+        assert "parts" not in str(error)
+
+
+def test_messages_are_short_and_visible() -> None:
+    """A message keeps both ends of a long key, and shows what cannot be seen."""
+    deep = ".".join(["a\u00ad" * 40 for _ in range(15)])
+    with pytest.raises(ValueError) as caught:
+        decode(("name = 1\n" + 'part = "' + "x" * 9000 + '"').encode(), _Tree)
+    assert len(str(caught.value)) < 500
+    with pytest.raises(ValueError) as caught:
+        decode(f'"{deep}" = 1\nname = "a"'.encode(), _Tree)
+    assert len(str(caught.value)) < 500 and str(caught.value).isprintable()
 
 
 def test_text_that_is_not_utf_8_is_refused() -> None:

@@ -29,8 +29,9 @@ SERVER_TIMEOUT_S = 20
 SCHEMA = 5
 """Version of the tables of a store, part of their names: older tables are not read."""
 
-RETRIED_REASONS = ("missing-file", "changed", "too-large")
-"""Reasons of refusal that depend on more than the log: on the moment, or on ``--max-memory``. They
+RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow")
+"""Reasons of refusal that depend on more than the log: on the moment, ``--max-memory`` or
+the speed of the computer. They
 are not stored, and the next run tries the log again. The same holds for logs that fail for lack of
 resources, by an error of this program, or by a crash of their process."""
 

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.batch import constants
@@ -14,6 +15,7 @@ from lmshealth.batch.store import Identified, Store
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
@@ -43,6 +45,14 @@ class Resources:
     store: Store
     pool: Pool
     progress: Progress = lambda step, done, total: None
+
+
+class Reading(NamedTuple):
+    """How logs are read: columns and most memory in bytes of `read_log`, links of `find_logs`."""
+
+    columns: ColumnMap | None = None
+    max_memory: float = MAX_MEMORY
+    follow_links: bool = False
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,20 +90,19 @@ def ingest(
     resources: Resources,
     *,
     out: Path,
-    columns: ColumnMap | None,
-    max_memory: float,
+    reading: Reading,
 ) -> Ingested:
     """Identify every log of a folder whose outcome is not in the store yet.
 
     Each log is read with the first description that matches it. No file inside the folder of the
-    output is a log. The columns and the most memory in bytes are those of `read_log`.
+    output is a log.
     """
     store, pool, progress = resources.store, resources.pool, resources.progress
     folder = folder.absolute()  # workers may have another working directory
-    archive = find_logs(folder)
+    archive = find_logs(folder, follow_links=reading.follow_links)
     inside = out.resolve()
     found = [path for path in archive.logs if inside not in path.resolve().parents]
-    tasks, refused = _tasks(folder, found, columns, resources)
+    tasks, refused = _tasks(folder, found, reading, resources)
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}
     lost: list[Refusal] = []
@@ -111,7 +120,7 @@ def ingest(
         cached.add(task.name)
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in cached]
-    work = partial(identify_log, stages=tuple(stages), max_memory=max_memory)
+    work = partial(identify_log, stages=tuple(stages), max_memory=reading.max_memory)
     for k, (task, outcome) in enumerate(pool.map_unordered(work, left, _crashed), start=1):
         if outcome.lasting:
             store.put_identified(task.key(outcome.description), task.digest, outcome)
@@ -147,10 +156,10 @@ def _grouped(
 
 
 def _tasks(
-    folder: Path, found: Sequence[Path], columns: ColumnMap | None, resources: Resources
+    folder: Path, found: Sequence[Path], reading: Reading, resources: Resources
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
-    manifest = read_manifest(folder)
+    manifest = read_manifest(folder, follow_links=reading.follow_links)
     digests: dict[Path, str | BadLog] = {}
     resources.progress("reading", 0, len(found))
     size = constants.FILES_PER_HASH_TASK
@@ -180,7 +189,7 @@ def _tasks(
             refused.append(Refusal(name, error.reason, error.detail))
             continue
         seen[content] = name
-        tasks.append(_Task(path, name, overrides, digest, columns))
+        tasks.append(_Task(path, name, overrides, digest, reading.columns))
     return tasks, refused
 
 

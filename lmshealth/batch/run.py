@@ -11,7 +11,7 @@ from tempfile import TemporaryFile
 from lmshealth._serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
-from lmshealth.batch.ingest import Progress, Resources, ingest
+from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineRecord, write_pages, write_tables
 from lmshealth.batch.store import Store, StoreError, default_url
 from lmshealth.batch.workers import Pool, cluster, processes
@@ -48,14 +48,17 @@ class Settings:
         How logs are read; None where their columns are those of the log contract.
     max_memory : float
         Most memory in bytes that reading a log may take.
+    follow_links : bool
+        Whether symbolic links out of the folder of logs are followed.
 
     Examples
     --------
     Two processes, and a store for a team; the password that its address may hold is not shown:
 
     >>> import lmshealth
-    >>> lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
-    Settings(workers=2, scheduler=None, epochs=40, seed=0, columns=None, max_memory=2000000000.0)
+    >>> settings = lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
+    >>> settings.workers, settings.epochs, "secret" in repr(settings)
+    (2, 40, False)
     """
 
     store: str | None = field(default=None, repr=False)  # it may contain a password
@@ -65,6 +68,7 @@ class Settings:
     seed: int = 0
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
+    follow_links: bool = False
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""
@@ -138,11 +142,11 @@ def run(
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
     _prepare(out)
-    work = read_maintenance(folder)
+    work = read_maintenance(folder, follow_links=settings.follow_links)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         resources = Resources(store, pool, progress)
-        columns, limit = settings.columns, settings.max_memory
-        ingested = ingest(folder, stages, resources, out=out, columns=columns, max_memory=limit)
+        reading = Reading(settings.columns, settings.max_memory, settings.follow_links)
+        ingested = ingest(folder, stages, resources, out=out, reading=reading)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         by_digest = {stage.digest: stage for stage in stages}
         described = {name: by_digest[own] for name, own in ingested.descriptions.items()}

@@ -52,7 +52,9 @@ def run(
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
     pdf = given.pop("pdf")
     with terminal.progress_bars() as progress:
-        result = run_pipeline(logs, stages, out, Settings(**given), progress)
+        result = run_pipeline(
+            logs, stages, out, Settings(**given, follow_links=options.follow_links()), progress
+        )
     used = result.n_logs - result.n_refused
     again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
     click.echo(f"{used} of {result.n_logs} logs analysed{again}.")

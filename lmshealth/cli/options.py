@@ -15,7 +15,7 @@ from loky import cpu_count
 from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
-from lmshealth.stage.description import load_stage
+from lmshealth.stage.description import Stage, load_stage
 
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
@@ -64,13 +64,37 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-stage_option = partial(
-    click.option,
-    "--stage",
-    type=load_stage,
-    metavar="TEXT",
-    help="Stage description: a .toml file or a shipped name.",
+FOLLOW_LINKS = click.option(
+    "--follow-links",
+    is_flag=True,
+    is_eager=True,  # it decides how --stage is read
+    expose_value=False,
+    callback=lambda ctx, option, given: ctx.meta.update({__name__: given}),
+    help="Follow links out of the folder of logs, and maps out of that of a description.",
 )
+
+
+def follow_links() -> bool:
+    """Return whether ``--follow-links`` is set."""
+    return bool(click.get_current_context().meta.get(__name__))
+
+
+def described(reference: str) -> Stage:
+    """Load a stage description as ``--follow-links`` allows."""
+    return load_stage(reference, follow_links=follow_links())
+
+
+def stage_option(*name: str, **settings: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Return the options ``--stage`` and ``--follow-links``."""
+    given: dict[str, Any] = {
+        "type": described,
+        "metavar": "TEXT",
+        "help": "Stage description: a .toml file or a shipped name.",
+    }
+    option = click.option("--stage", *name, **(given | settings))
+    return lambda command: option(FOLLOW_LINKS(command))
+
+
 out_option = partial(click.option, "--out", required=True, type=OUT)
 # Of the store; addresses in arguments are visible to all users.
 store_option = partial(

@@ -10,12 +10,13 @@ from lmshealth.cli import options, terminal, views
 from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.constants import DURATIONS
-from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.description import Stage
 from lmshealth.stage.planning import plan as make_plan
 
 
 @options.command("stage lms-y", "stage my-stage.toml --format json")
-@click.argument("described", metavar="STAGE", type=load_stage)
+@click.argument("described", metavar="STAGE", type=options.described)
+@options.FOLLOW_LINKS
 @options.format_option("table", "json")
 def stage(described: Stage, style: str) -> None:
     """Check a stage description and the identifiability of its parameters.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import tempfile
 import weakref
-from collections.abc import Iterator
-from typing import IO
+from collections.abc import Callable, Iterator
+from typing import IO, ClassVar, cast
 
 import numpy as np
 
@@ -57,46 +57,67 @@ def blocks(
 
 
 class Spool:
-    """Collects the samples of one column in blocks.
+    """Collects the samples of one column in blocks, without a copy if their number is expected.
 
-    The temporary file of a long column has no name and is deleted with the `Stored` of it.
+    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
+    ``send`` is set, in the process that reads for others, blocks go there and are not kept.
     """
 
-    def __init__(self) -> None:
+    send: ClassVar[Callable[[Spool, np.ndarray], None] | None] = None
+
+    def __init__(self, expected: int = 0) -> None:
+        # Of a column in memory: its first samples, and what is more than expected.
+        self._whole = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
+        self._filled = 0
         self._parts: list[FloatArray] = []
         self._stored: Stored | None = None
+        self.expected = self._whole.size if Spool.send is None else expected
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        self.size += block.size
+        if Spool.send is not None:
+            Spool.send(self, block)
+            return
+        start, self.size = self.size, self.size + block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            self._parts.append(np.asarray(block, dtype=np.float64))
+            if self.size <= self._whole.size:
+                self._whole[start : self.size] = block
+                self._filled = self.size
+            else:
+                self._parts.append(np.asarray(block, dtype=np.float64))
         if self._stored is not None or self.size > MINUTE:
             self._write()
 
     def samples(self) -> Samples:
         """Return all samples."""
+        if Spool.send is not None:
+            return cast(Samples, self)  # a place for what was sent
         if self._stored is not None:
             self._stored.file.flush()
             self._stored.size = self.size
             return self._stored
-        if len(self._parts) != 1:
-            self._parts = [np.concatenate(self._parts) if self._parts else np.empty(0)]
-        return self._parts[0]
+        if len(self._parts) == 1 and not self._filled:
+            return self._parts[0]
+        if self._parts or self._filled < self._whole.size:
+            self._parts = [np.concatenate([self._whole[: self._filled], *self._parts])]
+            self._filled = 0
+            return self._parts[0]
+        return self._whole
 
     def _write(self) -> None:
         try:
             if self._stored is None:
                 file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
                 self._stored = Stored(file, 0)
-            for values in self._parts:
+            for values in (self._whole[: self._filled], *self._parts):
                 self._stored.file.write(np.ascontiguousarray(values).data)
         except OSError as error:
             found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
             needed = "set TMPDIR to a folder on a larger disk"
             raise Unusable("too-large", f"{found} ({error.strerror}); {needed}") from error
+        self._whole, self._filled = np.empty(0), 0
         self._parts.clear()
 
 
@@ -109,7 +130,7 @@ def as_samples(values: np.ndarray) -> Samples:
 
 def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
     """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    spool = Spool()
+    spool = Spool(samples.size)
     for _, values in blocks(samples):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):

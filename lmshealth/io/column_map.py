@@ -16,6 +16,7 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
+from lmshealth._files import read_table
 from lmshealth._toml import decode
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
@@ -220,7 +221,7 @@ def load_columns(path: str | Path) -> ColumnMap:
     that are not in the log contract.
     """
     try:
-        columns = decode(Path(path).read_bytes(), ColumnMap)
+        columns = decode(read_table(Path(path)), ColumnMap)
         _check(columns)
     except (OSError, ValueError) as error:
         raise BadTable(f"column map {path}: {error}") from error

@@ -10,6 +10,12 @@ MAX_MEMORY = 2e9
 """Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS) may
 take: ten minutes of 20 kHz take 0.1 GB per channel. The option ``--max-memory``."""
 
+READING_SECONDS = 30.0
+"""Most seconds (s) that reading a file may take in a process of its own, beyond one for each
+`SLOWEST_READING` bytes: it is a library that loops. The variable ``LMSHEALTH_MAX_SECONDS``."""
+SLOWEST_READING = 5e6
+"""Bytes per second of the slowest disk and library that are waited for."""
+
 LARGEST_RATIO = 200
 """Most bytes of decoded samples per byte of the file. Noise compresses by single digits; constant
 channels are refused anyway."""
@@ -88,10 +94,14 @@ LONGEST_CELL = 50
 """Lines of a cell of a table next to logs: an open quote again."""
 LONGEST_ATTRIBUTE = 1 << 16
 """Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
-LARGEST_HEAP = 1 << 20
-"""Bytes of an HDF5 heap of strings: the library writes 64 KiB, more only for a longer text."""
 MOST_COLUMNS = 1000
-"""Columns of a MAT matrix that are signals."""
+"""Columns of signals of a file, and those of a MAT matrix that are signals."""
+MOST_KEYS = 10_000
+"""Lines of metadata of a CSV file."""
+MOST_CELLS = 200
+"""Columns of a table next to logs, which has a dozen. Each row takes time for all of them."""
+MOST_ROWS = 1_000_000
+"""Rows of such a table: as many logs are an archive of several tables."""
 MOST_ARRAYS = 20_000
 """Arrays of a MAT variable."""
 DEEPEST = 32

@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
+from lmshealth._files import escapes
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io.formats.registry import is_log
 from lmshealth.io.log import Refusal
@@ -54,29 +55,31 @@ class Manifest:
         return dict(self.rows.get(path, {}))
 
 
-def find_logs(folder: str | Path) -> FileList:
+def find_logs(folder: str | Path, *, follow_links: bool = False) -> FileList:
     """Find the logs of a folder and its subfolders by their suffix; `BadTable` if it is none.
 
     Hidden files and folders are ignored. Symbolic links to files are followed as long as they
-    stay in the folder; links to folders are not.
+    stay in the folder, and with ``follow_links`` wherever they lead; links to folders are not.
     """
-    return _find(Path(folder), lambda path: path.name not in NOT_LOGS and is_log(path))
+    fits = lambda path: path.name not in NOT_LOGS and is_log(path)  # noqa: E731
+    return _find(Path(folder), fits, follow_links=follow_links)
 
 
-def find_sheets(folder: str | Path, name: str) -> FileList:
+def find_sheets(folder: str | Path, name: str, *, follow_links: bool = False) -> FileList:
     """Find the tables of a name, such as ``manifest.csv``, where `find_logs` finds logs."""
-    found = _find(Path(folder), lambda path: path.name == name)
+    found = _find(Path(folder), lambda path: path.name == name, follow_links=follow_links)
     # What else is wrong with the folder, `find_logs` lists.
     return FileList(found.logs, tuple(r for r in found.refused if Path(r.log).name == name))
 
 
-def read_manifest(folder: str | Path) -> Manifest:
+def read_manifest(folder: str | Path, *, follow_links: bool = False) -> Manifest:
     """Read every ``manifest.csv`` of a folder and its subfolders, as found by `find_sheets`.
 
     Paths in a manifest are relative to it. Where two manifests name a log, the one nearer to the
     log overrides the other. A bad row refuses the log that it names, and nothing else.
     """
-    return _merged(Path(folder), find_sheets(folder, MANIFEST))
+    found = find_sheets(folder, MANIFEST, follow_links=follow_links)
+    return _merged(Path(folder), found, follow_links=follow_links)
 
 
 def read_manifest_beside(log: str | Path) -> Manifest:
@@ -90,13 +93,13 @@ def read_manifest_beside(log: str | Path) -> Manifest:
     return _merged(root, found)
 
 
-def _merged(root: Path, found: FileList) -> Manifest:
+def _merged(root: Path, found: FileList, *, follow_links: bool = False) -> Manifest:
     """Read manifests of a folder, the nearest to the logs last."""
     manifest = Manifest({}, (), {})
     refused = list(found.refused)
     for path in sorted(found.logs, key=lambda path: (len(path.parts), path)):
         try:
-            refused += _add(manifest, path, root)
+            refused += _add(manifest, path, root, follow_links=follow_links)
         except Unusable as error:
             refused.append(Refusal(name_of(path, root), error.reason, error.detail))
     return replace(manifest, refused=tuple(refused))
@@ -111,7 +114,7 @@ def _absolute(path: Path) -> Path:
     return Path(os.path.abspath(path))
 
 
-def _find(root: Path, fits: Callable[[Path], bool]) -> FileList:
+def _find(root: Path, fits: Callable[[Path], bool], *, follow_links: bool) -> FileList:
     """Find files in a fixed order, without entering links or hidden folders."""
     if not root.is_dir():
         raise BadTable(f"{shown(root)} is no folder")
@@ -125,26 +128,23 @@ def _find(root: Path, fits: Callable[[Path], bool]) -> FileList:
     for parent, folders, files in os.walk(root, onerror=unreadable):
         folders[:] = sorted(name for name in folders if not name.startswith("."))
         for here in (Path(parent) / name for name in folders):
-            if here.is_symlink() and _escapes(here, root):
+            if here.is_symlink() and escapes(here, root):
                 detail = "a link out of the folder of logs"
                 refused.append(Refusal(name_of(here, root), "escapes", detail))
         visible = (Path(parent) / name for name in sorted(files) if not name.startswith("."))
         for path in filter(fits, visible):
-            if trouble := _trouble(path, root):
+            if trouble := _trouble(path, root, follow_links=follow_links):
                 refused.append(Refusal(name_of(path, root), *trouble))
             else:
                 logs.append(path)
     return FileList(tuple(logs), tuple(refused))
 
 
-def _escapes(path: Path, root: Path) -> bool:
-    return not Path(os.path.realpath(path)).is_relative_to(os.path.realpath(root))
-
-
-def _trouble(path: Path, root: Path) -> tuple[str, str] | None:
+def _trouble(path: Path, root: Path, *, follow_links: bool = False) -> tuple[str, str] | None:
     """Return reason and detail why a file must not be opened; None if it may."""
-    if _escapes(path, root):
-        return "escapes", "a link out of the folder of logs; copy the file into it"
+    if not follow_links and escapes(path, root):
+        step = "copy the file into it, or set --follow-links"
+        return "escapes", f"a link out of the folder of logs; {step}"
     try:
         regular = stat.S_ISREG(path.stat().st_mode)
     except OSError as error:
@@ -152,7 +152,7 @@ def _trouble(path: Path, root: Path) -> tuple[str, str] | None:
     return None if regular else ("missing-file", "is no regular file")
 
 
-def _add(manifest: Manifest, path: Path, root: Path) -> Iterator[Refusal]:
+def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> Iterator[Refusal]:
     """Add the rows of one table to a manifest; yield those that name no log of the folder."""
     own: dict[Path, dict[str, str]] = {}
     for where, cells, trouble in read_sheet(path, ("file",)):
@@ -163,7 +163,8 @@ def _add(manifest: Manifest, path: Path, root: Path) -> Iterator[Refusal]:
             yield Refusal(name_of(path, root), "bad-row", f"{where}: {detail}")
             continue
         log = _absolute(path.parent / file)
-        if not log.is_relative_to(_absolute(root)) or _escapes(log, root):
+        outside = not log.is_relative_to(_absolute(root))
+        if outside or (not follow_links and escapes(log, root)):
             yield Refusal(shown(file), "escapes", f"{place} names a file out of the folder")
             continue
         row = {key: cells[key] for key in KEYS if cells.get(key)}

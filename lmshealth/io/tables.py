@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from lmshealth._files import read_table
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
 from lmshealth.io.refusal import Unusable, listed, repeated
@@ -41,18 +42,21 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
     `Unusable`: ``missing-file``, ``too-large``, ``empty``, and ``columns`` where a needed one is
     missing, or any is there twice.
     """
-    allowed = constants.SMALL_ENOUGH
     try:
-        if (size := path.stat().st_size) > allowed:
-            raise Unusable("too-large", f"{size} bytes, allowed are {allowed}; split it")
-        text = path.read_bytes().decode("utf-8-sig", "surrogateescape")
+        content = read_table(path)
     except OSError as error:
         raise Unusable("missing-file", f"cannot be opened: {error.strerror}") from error
+    except ValueError as error:
+        raise Unusable("too-large", f"{error}; split it") from error
+    if (n_rows := content.count(b"\n") + content.count(b"\r")) > constants.MOST_ROWS:
+        raise Unusable("too-large", f"{n_rows} lines, allowed are {constants.MOST_ROWS}; split it")
+    text = content.decode("utf-8-sig", "surrogateescape")
     records = _records(io.StringIO(text, newline=None).readlines())
     names = [name.strip() for name in next(records, ("", [], ""))[1]]
     if not names:
         raise Unusable("empty", f"no header line; needed {listed(needed)}")
-    if repeated(filter(None, names)) or not set(needed) <= set(names):
+    wide = len(names) > constants.MOST_CELLS
+    if wide or repeated(filter(None, names)) or not set(needed) <= set(names):
         detail = f"needed {listed(needed)}, none twice, and commas between"
         raise Unusable("columns", f"columns are {listed(names)}; {detail}")
     for where, cells, trouble in records:

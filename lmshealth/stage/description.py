@@ -15,6 +15,7 @@ import numpy as np
 from msgspec import Meta, Struct
 
 from lmshealth._arrays import FloatArray
+from lmshealth._files import escapes, read_table
 from lmshealth._toml import decode
 from lmshealth.errors import BadStage
 from lmshealth.io.log import Metadata
@@ -27,8 +28,13 @@ from lmshealth.stage.priors import JointPrior, Prior
 _SHIPPED = Path(__file__).parent / "descriptions"
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
-# Names appear on terminals, in tables and pages: no control or bidirectional characters.
-_NAME = "^[^\x00-\x1f\x7f-\x9f\u200b-\u200f\u2028-\u202e\u2060-\u206f]*\\Z"
+# Names appear on terminals, in tables and pages: no control or bidirectional characters, and none
+# that cannot be seen (soft hyphens, byte order marks, tags, selectors of variants).
+_NAME = (
+    "^[^\x00-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f"
+    "\u2028-\u202e\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\uffff"
+    "\U000e0000-\U000e0fff\U000f0000-\U0010ffff]*\\Z"
+)
 Name = Annotated[str, Meta(max_length=200, pattern=_NAME)]
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
@@ -321,13 +327,15 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
-def load_stage(reference: str) -> Stage:
+def load_stage(reference: str, *, follow_links: bool = False) -> Stage:
     """Load and check a stage description.
 
     Parameters
     ----------
     reference : str
         A path ending in ``.toml``, or the name of a shipped description.
+    follow_links : bool, optional
+        Whether its modal map may lie outside the folder of the description.
 
     Raises
     ------
@@ -357,7 +365,7 @@ def load_stage(reference: str) -> Stage:
         needed = f"needed is a path ending in .toml, or one of {', '.join(shipped())}"
         raise BadStage(f"no stage description {reference!r}: {needed}")
     try:
-        content = path.read_bytes()
+        content = read_table(path)
         description = decode(content, Description)
     except OSError as error:
         raise BadStage(f"{path}: cannot read the stage description: {error.strerror}") from error
@@ -368,6 +376,10 @@ def load_stage(reference: str) -> Stage:
     if description.map is not None and description.parameter:
         map_path = path.parent / description.map.file
         names = tuple(parameter.name for parameter in description.parameter)
+        if not follow_links and escapes(map_path, path.parent):
+            found = "it leaves the folder of the description"
+            step = "copy the map into that folder, or set --follow-links"
+            raise BadStage(f"{path}: map.file: {found}; {step}")
         if not map_path.is_file():
             raise BadStage(f"{path}: map.file: there is no file {map_path}")
         modal_map = read_map(str(map_path), names)

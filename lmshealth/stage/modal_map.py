@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import reduce
+from io import BytesIO
+from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,6 +13,7 @@ from numpy.polynomial.chebyshev import chebder, chebvander
 from scipy.linalg import khatri_rao
 
 from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._files import read_table
 from lmshealth.errors import BadStage, OutsideMap
 
 # The degree is raised until the error of ln f is far below that of any measurement.
@@ -74,15 +77,19 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
     not full.
     """
     try:
-        # Blank lines are kept, so that the index of a row gives its line.
-        table = pd.read_csv(path, skip_blank_lines=False).dropna(how="all")
+        content = read_table(Path(path))
     except (OSError, ValueError) as error:
         why = getattr(error, "strerror", None) or error
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
+    try:
+        # Blank lines are kept, so that the index of a row gives its line.
+        table = pd.read_csv(BytesIO(content), skip_blank_lines=False).dropna(how="all")
+    except ValueError:
+        # A description may name any file: nothing of one that is no table is quoted.
+        raise BadStage(f"{path}: it is not a modal map: no table of numbers with commas") from None
     needed = {*parameters, "mode", "frequency_hz"}
     missing, extra = needed - set(table.columns), set(table.columns) - needed
     if missing:
-        # A description may name any file: the columns of one that is no map are not disclosed.
         there = "it is not a modal map" if missing == needed else f"there are {list(table.columns)}"
         raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
     if extra:

@@ -58,9 +58,9 @@ NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""
 
 
-def read_maintenance(folder: Path) -> Maintenance:
+def read_maintenance(folder: Path, *, follow_links: bool = False) -> Maintenance:
     """Read every ``maintenance.csv`` below a folder, or raise `BadTable` if it is none."""
-    found = find_sheets(folder, _FILE)
+    found = find_sheets(folder, _FILE, follow_links=follow_links)
     work = _read((path, name_of(path, folder)) for path in found.logs)
     return replace(
         work, unread=(*(UnreadableRow(one, None) for one in found.refused), *work.unread)

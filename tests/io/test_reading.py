@@ -16,7 +16,10 @@ from lmshealth import io as readers
 from lmshealth.cli.main import main
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.reading import content_digest, read_log, require_identity
+from lmshealth.io.refusal import Unusable
 
 ALL = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.hdf5", "log.tdms", "log.mat"]
 
@@ -146,7 +149,10 @@ def test_parquet_text_column(make):
 def test_parquet_without_pyarrow(make, monkeypatch):
     """Without pyarrow the error names the extra to install."""
     monkeypatch.setitem(sys.modules, "pyarrow.parquet", None)
-    refused(make("log.parquet"), "format", "lmshealth[formats]")
+    # Not by `read_log`: the process that reads Parquet has modules of its own.
+    with pytest.raises(Unusable, match=r"lmshealth\[formats\]") as caught:
+        PARQUET.load(make("log.parquet"), ColumnMap(), 2e9)
+    assert caught.value.reason == "format"
 
 
 def test_require_identity(make):

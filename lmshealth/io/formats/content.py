@@ -31,19 +31,41 @@ class Content:
     guessed: tuple[str, ...] = ()
 
 
+Load = Callable[[Path, ColumnMap, float], Content]
+
+
 @dataclass(frozen=True, slots=True)
 class Format:
     """One file format.
 
     ``name`` is for messages; the suffixes are in lower case, with the leading dot; ``sniff``
     returns whether a file has this format from its leading bytes; ``load`` reads a file: path,
-    column map, most memory in bytes. It may raise anything: the registry turns it into a refusal.
+    column map, most memory in bytes. It may raise anything: `load_by` turns it into a refusal.
+    With a ``library``, native code that can crash or hang, it is called in a process of its own,
+    and must be a function of a module.
     """
 
     name: str
     suffixes: tuple[str, ...]
     sniff: Callable[[bytes], bool]
-    load: Callable[[Path, ColumnMap, float], Content]
+    load: Load
+    library: str = ""
+
+
+def load_by(form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float) -> Content:
+    """Read a file by the function of its format; whatever that raises becomes `Unusable`."""
+    try:
+        return load(path, columns, max_memory)
+    except Unusable:
+        raise
+    except MemoryError as error:
+        detail = f"reading it as {form} takes more memory than a log of its size does"
+        raise Unusable("too-large", f"{detail}; copy the file again") from error
+    except Exception as error:
+        # Libraries raise any exception on damaged files; one file must not end a batch.
+        text = " ".join(str(error).split())[:200]
+        detail = f"cannot be read as {form} ({type(error).__name__}: {text})"
+        raise Unusable("corrupt", detail) from error
 
 
 def check_size(decoded: int, stored: int) -> None:
@@ -68,6 +90,9 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     chosen = [name for name in names if columns.target(name) is not None]
     if twice := repeated(chosen):
         raise Unusable("columns", f"the file names {listed(twice)} more than once")
+    if len(chosen) > constants.MOST_COLUMNS:
+        found = f"{len(chosen)} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
     return chosen
 
 

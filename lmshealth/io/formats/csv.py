@@ -33,7 +33,7 @@ _WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
 # First bytes and lines from which the dialect is found.
-_HEAD_BYTES, _HEAD_LINES = 1 << 16, 200
+_HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
 _ROWS = 1 << 16
 _FIELDS = 1 << 18

@@ -6,9 +6,10 @@ from pathlib import Path
 
 from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Format
+from lmshealth.io.formats.content import Content, Format, load_by
 from lmshealth.io.formats.csv import CSV, CSV_GZ
 from lmshealth.io.formats.hdf5 import HDF5
+from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.mat import MAT
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
@@ -52,15 +53,9 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
     ``corrupt`` for content that cannot be read, and the reasons of the formats.
     """
     form = confirm(path)
-    try:
-        return form.load(path, columns, max_memory)
-    except Unusable:
-        raise
-    except Exception as error:
-        # Libraries raise any exception on damaged files; one file must not end a batch.
-        text = " ".join(str(error).split())[:200]
-        detail = f"cannot be read as {form.name} ({type(error).__name__}: {text})"
-        raise Unusable("corrupt", detail) from error
+    if form.library:
+        return read_isolated(form, path, columns, max_memory)
+    return load_by(form.name, form.load, path, columns, max_memory)
 
 
 def confirm(path: Path) -> Format:

@@ -52,6 +52,9 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
     are refused as ``columns``, a name that contradicts the unit of its channel as ``unit``.
     """
     named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
+    if len(named) > constants.MOST_COLUMNS:
+        found = f"{len(named)} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
     # Each group of channels may have times of its own: those of the chosen rate are read.
     counts = Counter(
         own
