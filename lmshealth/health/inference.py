@@ -94,7 +94,7 @@ def infer(
     >>> health = lmshealth.infer(track, stage, seed=0, epochs=[len(track.recorded_at) - 1])
     >>> for name, median in zip(health.parameters, health.latest(0.5)):
     ...     print(f"{name}: {median:.0%}")
-    guide_preload: 71%
+    guide_preload: 70%
     mount_stiffness: 88%
     >>> low, high = health.latest(0.05), health.latest(0.95)
     >>> bool((low < [0.72, 0.87]).all() and (high > [0.72, 0.87]).all())
