@@ -372,6 +372,8 @@ def health_of(
         laplace_ratio=np.full((n, p), 1.01),
         prior_shift=np.full((n, p), 0.01),
         prior_ratio=np.full((n, p), 1.02),
+        judge_shift=np.full((n, p), 0.01),
+        judge_ratio=np.full((n, p), 1.01),
         fit=np.full(n, 0.4),
         at_edge=np.zeros((n, p), dtype=bool),
         seed=(0,),

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError, Executor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any, TypeVar
 
@@ -16,7 +16,7 @@ from lmshealth.batch.ingest import LogKey, Resources, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
-from lmshealth.health.inference import epochs_to_infer, infer
+from lmshealth.health.inference import Epoch, epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.io.log import Notice
 from lmshealth.prognosis.fleet_prior import (
@@ -29,6 +29,7 @@ from lmshealth.prognosis.fleet_prior import (
     fleet_priors,
     machine_evidence,
 )
+from lmshealth.prognosis.life_posterior import LifeStart
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise
@@ -40,6 +41,8 @@ from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
+
+_Job = tuple["Machine", PackedLogs, dict[str, bytes]]
 
 Part = TypeVar("Part")
 Work = TypeVar("Work")
@@ -94,6 +97,14 @@ def assess(
     >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
+    mapper = map if executor is None else partial(map_in_order, executor)
+    machine = Machine("", (), stage, work, epochs, seed)
+    return _assess(readings, machine, Parts({}, mapper))
+
+
+def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) -> Assessment:
+    """Assess a machine, whose name and keys of logs play no part, as `assess` does."""
+    stage, work = machine.stage, machine.work
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
@@ -110,17 +121,17 @@ def assess(
         judgement=judge(stage, history, None),
         refused=(*not_excited, *refused),
         notices=tuple(notices),
-        seed=seed,
+        seed=machine.seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
     )
-    made = _with_results(made, used, epochs, executor)
+    made = _with_results(made, used, machine.epochs, parts)
     judgement = judge(stage, history, made.present, made.track, doubt=made.doubt)
     return replace(made, judgement=judgement)
 
 
 def _with_results(
-    made: Assessment, readings: Sequence[LogEstimates], epochs: int, executor: Executor | None
+    made: Assessment, readings: Sequence[LogEstimates], epochs: int, parts: Parts
 ) -> Assessment:
     """Add the results up to the first that fails, and a notice why it does."""
     history, stage = made.history, made.stage
@@ -135,15 +146,18 @@ def _with_results(
         history = accepted_estimates(history, tracked)
         # The prognosis takes longest: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
-        mapper = map if executor is None else partial(map_in_order, executor)
-        life = mapper(_prognose, [history], [stage], [seed]) if has_limit else None
+        life_key = fingerprint(VERSION, "life", stage.digest, seed)
+        before = unpack_or_none(parts.known.get(life_key), LifeStart)
+        life = parts.mapper(_prognose, [history], [stage], [seed], [before]) if has_limit else None
         if has_limit:
             made = replace(made, ended=ended_lives(history, stage, seed))
         chosen = epochs_to_infer(tracked, stage, epochs)
+        mapper = partial(parts.map, Epoch)
         made = replace(made, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
         if life is None:
             return made
-        prognosis, evidence = next(iter(life))
+        prognosis, evidence, start = next(iter(life))
+        parts.used[life_key] = pack(start)
         return replace(made, prognosis=prognosis, evidence=evidence)
     except LmshealthError as error:
         why = str(error)
@@ -153,6 +167,32 @@ def _with_results(
             "with modes.csv"
         )
     return replace(made, notices=(*made.notices, Notice("no-result", "serious", "", why)))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Parts:
+    """Results of parts of an assessment, packed, by the fingerprint of what they depend on.
+
+    `known` are those of the assessment before, `used` those that this one has used or computed.
+    """
+
+    known: Mapping[str, bytes]
+    mapper: Callable[..., Iterable[Any]] = map
+    used: dict[str, bytes] = field(default_factory=dict)
+
+    def map(
+        self, kind: Any, function: Callable[..., object], *columns: Iterable[Any]
+    ) -> Iterator[Any]:
+        """Map a function over columns of arguments, except where its result is known."""
+        rows = [*zip(*columns, strict=True)]
+        keys = [fingerprint(VERSION, kind.__name__, *row) for row in rows]
+        found = {key: unpack_or_none(self.known.get(key), kind) for key in keys}
+        left = {key: row for key, row in zip(keys, rows, strict=True) if found[key] is None}
+        if left:
+            made = self.mapper(function, *zip(*left.values(), strict=True))
+            found |= dict(zip(left, made, strict=True))
+        self.used.update((k, pack(found[k]) if k in left else self.known[k]) for k in keys)
+        return (found[key] for key in keys)
 
 
 def map_in_order(
@@ -166,11 +206,14 @@ def map_in_order(
 
 
 def _prognose(
-    history: History, stage: Stage, seed: tuple[int, int]
-) -> tuple[Prognosis, MachineEvidence]:
-    """Return the prognosis and the evidence for a fleet prior: smaller than the posterior."""
-    prognosis, posterior = prognose_with_posterior(history, stage, seed)
-    return prognosis, machine_evidence(stage, posterior)
+    history: History, stage: Stage, seed: tuple[int, int], before: LifeStart | None
+) -> tuple[Prognosis, MachineEvidence, LifeStart]:
+    """Return a prognosis, the evidence for a fleet prior, and the start of the next posterior.
+
+    They are smaller than the posterior.
+    """
+    prognosis, posterior = prognose_with_posterior(history, stage, seed, before=before)
+    return prognosis, machine_evidence(stage, posterior), posterior.start
 
 
 # All machines of a run
@@ -205,7 +248,7 @@ def assess_all(
     left = [m for m in machines if force or not store.has_assessment(m.name, m.key)]
     n_cached = len(machines) - len(left)
     resources.progress("assessing", n_cached, len(machines))
-    for k, (machine, made) in enumerate(_assessed(left, resources), start=1):
+    for k, (machine, made) in enumerate(_assessed(left, resources, force), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         else:
@@ -215,20 +258,25 @@ def assess_all(
 
 
 def _assessed(
-    machines: Sequence[Machine], resources: Resources
+    machines: Sequence[Machine], resources: Resources, force: bool
 ) -> Iterator[tuple[Machine, PackedAssessment | str]]:
-    """Assess machines in parallel; where they are fewer than workers, the parts of each."""
-    pool = resources.pool
-    jobs = ((machine, packed_logs(machine, resources.store)) for machine in machines)
+    """Assess machines in parallel; where they are fewer than workers, the parts of each.
+
+    With ``force`` no part of an earlier assessment is used.
+    """
+    pool, store = resources.pool, resources.store
+    jobs: Iterator[_Job] = (
+        (one, packed_logs(one, store), {} if force else store.parts(one.name)) for one in machines
+    )
     if pool.executor is None or len(machines) >= pool.size:
-        for (machine, _), made in pool.map_unordered(_assess_packed, jobs, lambda _, why: why):
+        for (machine, *_), made in pool.map_unordered(_assess_packed, jobs, lambda _, why: why):
             yield machine, made
         return
-    for machine, logs in jobs:
+    for job in jobs:
         try:
-            yield machine, _assess_packed((machine, logs), pool.executor, pool.crashes)
+            yield job[0], _assess_packed(job, pool.executor, pool.crashes)
         except pool.crashes:  # a worker was killed: without workers it only takes longer
-            yield machine, _assess_packed((machine, logs))
+            yield job[0], _assess_packed(job)
 
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
@@ -252,18 +300,18 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
 
 
 def _assess_packed(
-    job: tuple[Machine, PackedLogs],
+    job: _Job,
     executor: Executor | None = None,
     crashes: tuple[type[Exception], ...] = (),
 ) -> PackedAssessment | str:
     """Assess a machine; return why it fails, but raise what workers fail of."""
-    machine, logs = job
-    stage, done, epochs, seed = machine.stage, machine.work, machine.epochs, machine.seed
+    machine, logs, known = job
+    mapper = map if executor is None else partial(map_in_order, executor)
 
     def work() -> PackedAssessment:
-        readings = unpack_logs(logs)
-        made = assess(readings, stage, done, epochs=epochs, seed=seed, executor=executor)
-        return pack_assessment(made)
+        parts = Parts(known, mapper)
+        made = pack_assessment(_assess(unpack_logs(logs), machine, parts))
+        return replace(made, parts=parts.used)
 
     return reason_if_failed(work, machine.name, (CancelledError, *crashes))
 

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
-from lmshealth._serialize import pack
+from lmshealth._files import write_text
+from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
-from lmshealth.batch.outputs import MachineRecord, write_pages, write_tables
-from lmshealth.batch.store import Store, StoreError, default_url
+from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
+from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
@@ -257,10 +258,7 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        records = (
-            _record(m.name, keys[m.name], files[m.name], store, packed_logs(m, store)) for m in left
-        )
-        for name, output in write_pages(records, resources.pool, out):
+        for name, output in _outputs(left, keys, files, resources, out):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -275,6 +273,35 @@ def _report(
     write_tables(out, names, packed)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     return rows, excluded, not_updated | unread | failed
+
+
+def _outputs(
+    machines: Sequence[Machine],
+    keys: Mapping[str, str],
+    files: Mapping[str, str],
+    resources: Resources,
+    out: Path,
+) -> Iterator[tuple[str, MachineOutput | str]]:
+    """Write pages as `write_pages` does; those of unchanged results are taken from the store."""
+    store, missing = resources.store, dict[str, tuple[Machine, str]]()
+    for machine in machines:
+        name = machine.name
+        record = _record(name, keys[name], files[name], store)
+        key = fingerprint(VERSION, record, machine.logs)
+        kept: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
+        if kept is None:
+            missing[name] = machine, key
+        else:
+            write_text(out / files[name], kept.page.text)
+            yield name, kept
+    records = (
+        _record(name, keys[name], files[name], store, packed_logs(machine, store))
+        for name, (machine, _) in missing.items()
+    )
+    for name, output in write_pages(records, resources.pool, out):
+        if isinstance(output, MachineOutput):
+            store.put_part(name, missing[name][1], pack(output))
+        yield name, output
 
 
 def _record(

@@ -66,6 +66,8 @@ def _table(table: str, keys: str, columns: str) -> sql.Table:
 _IDENTIFIED = _table("identified", "key", "digest description version machine content")
 # The present assessment of each machine, and the one before the fleet prior was applied.
 _ASSESSED = _table("assessed", "machine key", "content evidence summary")
+# Parts of the last assessment of each machine, by the fingerprint of what they depend on.
+_PARTS = _table("parts", "machine key", "content")
 # Which assessment of each machine was published last, and the key of its list of refused logs.
 _PRESENT = _table("present", "machine", "name key refused")
 # Summaries of all published assessments, numbered in the order of publication.
@@ -106,11 +108,16 @@ def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PackedAssessment:
-    """An assessment as bytes: as a whole, its evidence for a fleet prior, and its summary."""
+    """An assessment as bytes: as a whole, its evidence for a fleet prior, and its summary.
+
+    ``parts`` are those of its results that the next assessment may use, by key; None if all that
+    are stored stay.
+    """
 
     content: bytes
     evidence: bytes
     summary: bytes
+    parts: dict[str, bytes] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,8 +212,35 @@ class Store:
         return cast(bytes | None, self._of_assessment(_ASSESSED.c.evidence, machine, key))
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
-        """Store an assessment of a machine."""
-        self._put(_ASSESSED, {"machine": _id(machine), "key": key, **asdict(made)})
+        """Store an assessment of a machine, and its parts in place of those stored before."""
+        own = {"machine": _id(machine)}
+        row = own | {name: value for name, value in asdict(made).items() if name != "parts"}
+        with self._begin() as connection:
+            connection.execute(self._upsert(_ASSESSED, row | {"key": key}))
+            if made.parts is None:
+                return
+            of_this = _PARTS.c.machine == own["machine"]
+            connection.execute(
+                sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(made.parts)))
+            )
+            for part, content in made.parts.items():
+                row = own | {"key": part, "content": content}
+                connection.execute(self._upsert(_PARTS, row))
+
+    def put_part(self, machine: str, key: str, content: bytes) -> None:
+        """Store one more part of the last assessment of a machine."""
+        self._put(_PARTS, {"machine": _id(machine), "key": key, "content": content})
+
+    def part(self, machine: str, key: str) -> bytes | None:
+        """Fetch a part of the last assessment of a machine; None where it is not stored."""
+        where = _PARTS.c.machine == _id(machine), _PARTS.c.key == key
+        return cast(bytes | None, self._first(sql.select(_PARTS.c.content).where(*where)))
+
+    def parts(self, machine: str) -> dict[str, bytes]:
+        """Fetch the parts of the last assessment of a machine by key."""
+        query = sql.select(_PARTS.c.key, _PARTS.c.content).where(_PARTS.c.machine == _id(machine))
+        with self._begin() as connection:
+            return {row.key: row.content for row in connection.execute(query)}
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""

@@ -6,7 +6,7 @@ A parameter is informed above `lmshealth.stage.constants.INFORMED`, which planni
 from __future__ import annotations
 
 MAX_EPOCHS = 40
-"""Epochs that `infer` takes by default, some two seconds each; a trend shows no more detail."""
+"""Epochs that `infer` takes by default: a trend shows no more detail."""
 
 # Convergence. Four chains are the least that [Vehtari2021] recommends for R-hat, and 1.01 is its
 # recommended limit; 50 autocorrelation times are what the authors of emcee require for an estimate
@@ -18,6 +18,12 @@ MAX_STEPS = 20_000
 MIN_ESS = 400
 """Effective draws of a posterior by importance sampling: as many as [Vehtari2021] asks of chains.
 The relative standard deviation of the evidence is then at most 5 %."""
+
+MAX_PARETO_K = 0.7
+"""Largest Pareto k of importance weights [Vehtari2024]: above it their variance is not finite in
+practice, and chains are run."""
+JUDGED_EVERY = 16
+"""Of so many epochs one, and the last, is sampled by chains too; the difference is published."""
 
 MIN_FIT = 1e-4
 """Drifts whose probability under the best state of the parameters is lower are unexplained.

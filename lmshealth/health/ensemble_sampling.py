@@ -27,6 +27,7 @@ _FIRST_STEPS, _START_ATTEMPTS = 250, 100
 _MIN_WALKERS, _WALKERS_PER_DIMENSION = 32, 16
 # Draws of the prior, and of the importance sampler, that starts are chosen from.
 _N_PRIOR, _N_START = 1000, 1000
+_N_WEIGHTED = 1000  # weighted draws of each importance sampler
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,39 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
         random_state = RandomState(MT19937(chain_seed)).get_state(legacy=False)
         samplers.append((sampler, emcee.State(points, random_state=random_state)))
     return _run(samplers)
+
+
+def sample_by_importance(
+    log_probability: LogProbability,
+    draw_prior: Callable[[np.random.Generator, int], FloatArray],
+    seed: np.random.SeedSequence,
+) -> Sample:
+    """Sample a posterior by independent adaptive importance samplers, started from the prior.
+
+    They take the place of the ensembles of `sample`; effective sample sizes are those of their
+    weights, together. `NotConverged`, with the draws, is raised if too few of any are effective, if
+    their weights have heavy tails, or if R-hat is not below 1.01: `sample` then needs to decide.
+    """
+    drawn, ess = [], 0.0
+    for own in seed.spawn(constants.N_ENSEMBLES):
+        rng = np.random.default_rng(own)
+        found = importance_sample(log_probability, draw_prior(rng, _N_PRIOR), rng, _N_WEIGHTED)
+        if not found.reliable():
+            raise NotConverged(
+                f"{found.ess:.0f} draws of {_N_WEIGHTED} are effective, and Pareto k of their "
+                f"weights is {found.pareto_k:.2f}; needed are {constants.MIN_ESS} and less than "
+                f"{constants.MAX_PARETO_K}; chains are needed",
+                found.points,
+            )
+        drawn.append(found.resampled(rng, _N_WEIGHTED))
+        # Resampling to equal weights loses some.
+        ess += 1 / (1 / found.ess + 1 / _N_WEIGHTED)
+    draws = np.stack(drawn)
+    r_hat = _diagnose("rhat", draws[:, :, None])
+    if not (r_hat < constants.MAX_R_HAT).all():
+        raise NotConverged(f"R-hat of importance samplers is {r_hat.max():.3f}", draws)
+    sizes = np.full(draws.shape[2], ess)
+    return Sample(draws, sizes, sizes, r_hat, np.full(draws.shape[2], np.nan))
 
 
 def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import gammaln, logsumexp
@@ -17,6 +18,9 @@ _FREEDOM = 5
 _N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
 # Effective share of the draws at which the proposal is good enough for the last round.
 _GOOD_SHARE = 0.3
+# Share of a wide component about all draws, which covers tails between and beyond the kernels, and
+# its width in standard deviations [Hesterberg1995].
+_WHOLE_SHARE, _WHOLE_WIDTH = 0.2, 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -31,6 +35,18 @@ class WeightedDraws(ReadOnly):
     def ess(self) -> float:
         """Effective sample size; its inverse bounds the relative variance of the evidence."""
         return float(1 / np.sum(self.weight**2))
+
+    @property
+    def pareto_k(self) -> float:
+        """Shape of the Pareto distribution of the largest weights [Vehtari2024]."""
+        from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
+
+        diagnostic: Any = array_stats  # the library has no types
+        return float(diagnostic.psislw(-np.log(self.weight))[1])
+
+    def reliable(self) -> bool:
+        """Return whether enough draws are effective, and their weights have light tails."""
+        return self.ess >= constants.MIN_ESS and self.pareto_k < constants.MAX_PARETO_K
 
     def resampled(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw points of equal weight, shape ``(n, n_dim)``."""
@@ -108,19 +124,29 @@ def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
 def _propose(
     draws: WeightedDraws, rng: np.random.Generator, n: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Draw from a mixture of Student's t at draws: ``(n, n_dim)``, and its log density ``(n,)``."""
+    """Draw from Student's t at draws, and about all: ``(n, n_dim)``, and log density ``(n,)``."""
     d = draws.points.shape[1]
-    off = draws.points - draws.weight @ draws.points
+    mean = draws.weight @ draws.points
+    off = draws.points - mean
     cov = (draws.weight[:, None] * off).T @ off + 1e-18 * np.eye(d)
+    factor = np.linalg.cholesky(cov)
     # Silverman's width, of the effective number of kernels.
     width = (4 / (d + 2)) ** (1 / (d + 4)) * min(_N_KERNELS, draws.ess) ** (-1 / (d + 4))
-    factor = width * np.linalg.cholesky(cov)
     centres = draws.resampled(rng, _N_KERNELS)
     t = rng.standard_normal((n, d)) / np.sqrt(rng.chisquare(_FREEDOM, (n, 1)) / _FREEDOM)
-    points = centres[rng.integers(_N_KERNELS, size=n)] + t @ factor.T
-    unit, whitened = (np.linalg.solve(factor, x.T).T for x in (points, centres))
+    near = centres[rng.integers(_N_KERNELS, size=n)] + width * t @ factor.T
+    whole = (rng.uniform(size=n) < _WHOLE_SHARE)[:, None]
+    points = np.where(whole, mean + _WHOLE_WIDTH * t @ factor.T, near)
+    unit, whitened = (np.linalg.solve(factor, (x - mean).T).T for x in (points, centres))
     square = (unit**2).sum(1)[:, None] + (whitened**2).sum(1) - 2 * unit @ whitened.T
-    density = -0.5 * (_FREEDOM + d) * np.log1p(np.maximum(square, 0) / _FREEDOM)
+    kernels = logsumexp(_log_t(np.maximum(square, 0), width, d), axis=1) - np.log(_N_KERNELS)
+    about_all = _log_t((unit**2).sum(1), _WHOLE_WIDTH, d)
+    density = np.logaddexp(kernels + np.log1p(-_WHOLE_SHARE), about_all + np.log(_WHOLE_SHARE))
+    return points, density - np.sum(np.log(np.diag(factor)))
+
+
+def _log_t(square: FloatArray, width: float, d: int) -> FloatArray:
+    """Return the log density of Student's t of a width in d dimensions at squared distances."""
     scale = gammaln((_FREEDOM + d) / 2) - gammaln(_FREEDOM / 2) - d / 2 * np.log(np.pi * _FREEDOM)
-    scale -= np.sum(np.log(np.diag(factor))) + np.log(_N_KERNELS)
-    return points, logsumexp(density, axis=1) + scale
+    tail = np.log1p(square / (_FREEDOM * width**2))
+    return np.asarray(scale - d * np.log(width) - 0.5 * (_FREEDOM + d) * tail)

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
 from functools import cache
 from typing import Any
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import constants
 from lmshealth.health.ensemble_sampling import (
     Sample,
     flattened,
     sample,
+    sample_by_importance,
     start_from_prior,
     start_near,
     stream,
@@ -41,14 +43,18 @@ _LEVELS = (0.05, 0.5, 0.95)
 
 
 def epochs_to_infer(track: Drifts | Track, stage: Stage, most: int) -> tuple[int, ...]:
-    """Choose at most so many epochs after the baseline, evenly spaced and with the last."""
+    """Choose at most so many epochs after the baseline, with the last, nested as logs are added.
+
+    Of the others those whose number divides by the highest power of two go first, and of these the
+    latest: after one more log, no epoch is among them that was not before, or was not the last.
+    """
     columns = [track.modes.index(name) for name in stage.informative if name in track.modes]
     usable = np.flatnonzero(_has_drift(track)[:, columns].any(axis=1))
-    if usable.size <= most:
-        return tuple(usable.tolist())
-    # Counted from the last, which is chosen even as the only one.
-    spaced = np.unique(np.linspace(usable.size - 1, 0, most).round().astype(int))
-    return tuple(usable[spaced].tolist())
+    number = np.arange(usable.size)
+    power = np.where(number > 0, number & -number, 2 * number.size + 1)
+    power[-1:] = 4 * number.size + 1
+    chosen = np.lexsort((number, power))[max(usable.size - most, 0) :]
+    return tuple(usable[np.sort(chosen)].tolist())
 
 
 def infer(
@@ -88,7 +94,7 @@ def infer(
     >>> health = lmshealth.infer(track, stage, seed=0, epochs=[len(track.recorded_at) - 1])
     >>> for name, median in zip(health.parameters, health.latest(0.5)):
     ...     print(f"{name}: {median:.0%}")
-    guide_preload: 71%
+    guide_preload: 70%
     mount_stiffness: 88%
     >>> low, high = health.latest(0.05), health.latest(0.95)
     >>> bool((low < [0.72, 0.87]).all() and (high > [0.72, 0.87]).all())
@@ -238,14 +244,31 @@ def _drifts_at(
     return modes, track.drift[k][columns], np.array(track.drift_cov[k][np.ix_(columns, columns)])
 
 
-def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
-    """Draw ln parameters from the posterior of an epoch; return Laplace's approximation too."""
-    from scipy.stats import qmc  # late: it takes longer to import than all else here
+@dataclass(frozen=True, slots=True, eq=False)
+class Epoch(ReadOnly):
+    """Result of one epoch: draws of ln parameters ``(n_ensembles, n_draws, n_parameters)``.
 
-    low, high = posterior.prior.support
-    halton = qmc.Halton(low.size, scramble=False).random(_N_SEARCHED + 1)[1:]
-    points = posterior.prior.quantile(halton)
-    normal = approximate(posterior.log_probability, points, low, high)
+    All else is as in `Health`.
+    """
+
+    draws: FloatArray
+    converged: bool
+    fit: float
+    at_edge: BoolArray
+    ess_bulk: FloatArray
+    ess_tail: FloatArray
+    r_hat: FloatArray
+    laplace_shift: FloatArray
+    laplace_ratio: FloatArray
+    prior_shift: FloatArray
+    prior_ratio: FloatArray
+    judge_shift: FloatArray
+    judge_ratio: FloatArray
+
+
+def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
+    """Draw ln parameters of an epoch by emcee; return Laplace's approximation, its start, too."""
+    normal = laplace(posterior)
     if normal is None:
         start = start_from_prior(posterior.log_probability, posterior.prior.draw)
     else:
@@ -253,36 +276,66 @@ def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sampl
     return sample(posterior.log_probability, start, seed), normal
 
 
-def _infer_epoch(
-    posterior: EpochPosterior, seed: int | Sequence[int], epoch: int
-) -> dict[str, Any]:
-    """Sample one epoch; return ``draws`` of ln parameters and the fields of `Health`."""
-    chain_seed, wider_seed = stream(seed, epoch).spawn(2)
-    found: dict[str, Any] = dict.fromkeys(CHECKS, np.full(len(posterior.prior.names), np.nan))
+def laplace(posterior: EpochPosterior) -> Laplace | None:
+    """Approximate the posterior of an epoch by a normal distribution, if that is possible."""
+    from scipy.stats import qmc  # late: it takes longer to import than all else here
+
+    low, high = posterior.prior.support
+    halton = qmc.Halton(low.size, scramble=False).random(_N_SEARCHED + 1)[1:]
+    return approximate(posterior.log_probability, posterior.prior.quantile(halton), low, high)
+
+
+def _drawn(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, bool]:
+    """Draw by importance sampling, else by chains; return which of them it was."""
+    by_importance, by_chains = seed.spawn(2)
+    logp, prior = posterior.log_probability, posterior.prior
     try:
-        drawn, normal = draw(posterior, chain_seed)
+        return sample_by_importance(logp, prior.draw, by_importance), True
+    except NotConverged:
+        return draw(posterior, by_chains)[0], False
+
+
+def _infer_epoch(
+    posterior: EpochPosterior, seed: int | Sequence[int], epoch: int, judged: bool
+) -> Epoch:
+    """Sample one epoch; where it is judged, by chains too."""
+    chain_seed, wider_seed, judge_seed = stream(seed, epoch).spawn(3)
+    missing = np.full(len(posterior.prior.names), np.nan)
+    found: dict[str, Any] = dict.fromkeys(CHECKS, missing)
+    try:
+        drawn, weighted = _drawn(posterior, chain_seed)
     except NotConverged as error:
         chains = np.asarray(error.chains)
         if chains.ndim != 4:  # no start: a fault of the description, not of this epoch
             raise
         draws = thin(flattened(chains), _N_KEPT)
         x = np.concatenate(draws)
-        found["converged"] = False
     else:
-        draws, x, found["converged"] = thin(drawn.draws, _N_KEPT), drawn.flat, True
-        low, middle, high = np.quantile(x, _LEVELS, axis=0)
-        try:
-            wider = _wider_quantiles(posterior, drawn, wider_seed)
-        except NotConverged:  # only the check is missing
-            wider = np.full((len(_LEVELS), x.shape[1]), np.nan)
+        draws, x = thin(drawn.draws, _N_KEPT), drawn.flat
         found |= {name: getattr(drawn, name) for name in ("ess_bulk", "ess_tail", "r_hat")}
-        if normal is not None:
+        if (normal := laplace(posterior)) is not None:
             found["laplace_shift"] = (x.mean(axis=0) - normal.mode) / normal.std
             found["laplace_ratio"] = x.std(axis=0) / normal.std
-        found["prior_shift"] = (wider[1] - middle) / x.std(axis=0)
-        found["prior_ratio"] = (wider[2] - wider[0]) / (high - low)
-    fit = posterior.fit(x[:: x.shape[0] // _N_FIT])
-    return found | {"draws": draws, "fit": fit, "at_edge": posterior.at_edge(x)}
+        with suppress(NotConverged):  # only the check is missing
+            wider = _wider_quantiles(posterior, drawn, wider_seed)
+            found |= _change("prior", drawn, wider)
+        if judged and weighted:
+            with suppress(NotConverged):  # only the judge is missing
+                other = draw(posterior, judge_seed)[0].flat
+                found |= _change("judge", drawn, np.quantile(other, _LEVELS, axis=0))
+    converged = bool(np.isfinite(found["r_hat"]).all())
+    fit, edge = posterior.fit(x[:: max(x.shape[0] // _N_FIT, 1)]), posterior.at_edge(x)
+    return Epoch(draws=draws, converged=converged, fit=fit, at_edge=edge, **found)
+
+
+def _change(name: str, drawn: Sample, quantiles: FloatArray) -> dict[str, FloatArray]:
+    """Return the shift of the median in standard deviations, and the ratio of the 90 % intervals.
+
+    Of quantiles ``(3, n_parameters)`` from draws.
+    """
+    low, middle, high = np.quantile(drawn.flat, _LEVELS, axis=0)
+    shift = (quantiles[1] - middle) / drawn.flat.std(axis=0)
+    return {f"{name}_shift": shift, f"{name}_ratio": np.ptp(quantiles[::2], axis=0) / (high - low)}
 
 
 def _wider_quantiles(
@@ -297,7 +350,7 @@ def _wider_quantiles(
     log_weight = wider.prior.log_density(x) - prior.log_density(x)
     weight = np.exp(log_weight - log_weight.max())
     if weight.sum() ** 2 / np.sum(weight**2) < _MIN_SHARE * weight.size:
-        quantiles = np.quantile(draw(wider, seed)[0].flat, _LEVELS, axis=0)
+        quantiles = np.quantile(_drawn(wider, seed)[0].flat, _LEVELS, axis=0)
     else:
         options: dict[str, Any] = {"weights": weight, "method": "inverted_cdf"}
         quantiles = np.column_stack([np.quantile(one, _LEVELS, **options) for one in x.T])
@@ -314,12 +367,12 @@ def _infer_all(
     seed: int | Sequence[int],
     mapper: Callable[..., object],
 ) -> Health:
+    judged = [k % constants.JUDGED_EVERY == 0 or k == chosen[-1] for k in chosen]
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
-        found: list[dict[str, Any]] = list(
-            mapper(_infer_epoch, tasks, [seed] * len(tasks), chosen)  # type: ignore[call-overload]
-        )
-    stacked = {field: np.stack([one[field] for one in found]) for field in found[0]}
+        columns = tasks, [seed] * len(tasks), chosen, judged
+        found: list[Epoch] = list(mapper(_infer_epoch, *columns))  # type: ignore[call-overload]
+    stacked = {one.name: np.stack([getattr(e, one.name) for e in found]) for one in fields(Epoch)}
     x, prior = stacked.pop("draws"), tasks[0].prior
     variance = prior.variance
     low, high = prior.quantile(np.array([[0.05], [0.95]]))

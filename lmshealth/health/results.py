@@ -24,6 +24,7 @@ QUANTILES = {"median": 0.5, "q05": 0.05, "q25": 0.25, "q75": 0.75, "q95": 0.95}
 CHECKS = (
     *("r_hat", "ess_bulk", "ess_tail"),
     *("laplace_shift", "laplace_ratio", "prior_shift", "prior_ratio"),
+    *("judge_shift", "judge_ratio"),
 )
 
 
@@ -39,8 +40,9 @@ class Health:
     travel: FloatArray  # odometer in m, ``(n_epochs,)``
     parameters: tuple[str, ...]
     chains: FloatArray  # draws, ``(n_epochs, n_ensembles, n_draws, n_parameters)``
-    # Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles, and
-    # rank-normalised split R-hat; NaN where the sampler did not converge, as are shifts and ratios.
+    # Effective sample size over all ensembles, for the middle and for the 5 and 95 % quantiles (of
+    # importance samplers by their weights, for both), and rank-normalised split R-hat; NaN where
+    # the sampler did not converge, as are shifts and ratios.
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray
@@ -60,6 +62,10 @@ class Health:
     # deviations, and ratio of the 90 % intervals; NaN also where the map hardly lets them widen.
     prior_shift: FloatArray
     prior_ratio: FloatArray
+    # The same from importance sampling to the ensembles of emcee that judge it at some epochs; NaN
+    # at others.
+    judge_shift: FloatArray
+    judge_ratio: FloatArray
     fit: FloatArray  # upper bound of the p value of the drifts under the best draw, ``(n_epochs,)``
     at_edge: BoolArray  # whether the posterior ends at an end of the map, which bounds the value
     seed: tuple[int, ...]

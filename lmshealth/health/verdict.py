@@ -99,9 +99,9 @@ def judge(
     >>> health = lmshealth.infer(track, stage, seed=0, epochs=[len(track.recorded_at) - 1])
     >>> judgement = lmshealth.judge(stage, history, health, track)
     >>> print(f"{judgement.verdict}, {judgement.probability:.1%}")
-    both, 94.1%
+    both, 93.8%
     >>> judgement.why.split(".")[0]
-    'Guide preload is at 71 % of its baseline value (90 %: 67 to 74 %)'
+    'Guide preload is at 70 % of its baseline value (90 %: 67 to 75 %)'
     >>> lmshealth.judge(stage, history, None).why
     'The logs do not contain enough information for the health parameters.'
     """

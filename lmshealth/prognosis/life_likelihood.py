@@ -27,6 +27,7 @@ from lmshealth.tracking.history import History
 # Lives of the prior per scenario that the nodes are chosen by, and the drift in ln f that the QR
 # decomposition may leave: other lives are met within some 1e-6, those of a posterior within 1e-8.
 _N_EXAMPLES, _RESIDUAL = 300, 1e-8
+_CACHED = 2_000_000  # whitened drifts that are computed at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -199,6 +200,13 @@ class LifeLikelihood:
 
     def quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return χ² with the map error marginalised, and ln |M|, both ``(n_points, n)``."""
+        # A few lives at a time: intermediate results stay in the processor's cache.
+        size = x.shape[0] * (1 + x.shape[2]) * grid.design.size // x.shape[1]
+        parts = [self._quadratic(grid, one) for one in np.array_split(x, size // _CACHED + 1)]
+        chi_square, log_det = (np.concatenate(one, axis=1) for one in zip(*parts, strict=True))
+        return chi_square, log_det
+
+    def _quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         r, v, m = self._residuals(grid, x)
         w = (v @ r[..., None])[..., 0]
         solved = np.linalg.solve(m, w[..., None])[..., 0]

@@ -12,8 +12,8 @@ import pandas as pd
 from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
-from lmshealth.errors import NotEnoughData
+from lmshealth._arrays import FloatArray, ReadOnly, expect_shape, freeze
+from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin
 from lmshealth.health.importance_sampling import (
     WeightedDraws,
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _STEP = 1 << 20  # of the random stream: beyond the epochs of health
 _N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
 _N_ROUGH, _N_FINE = 600, 2000
+# Draws of an update, and those of each scenario that are kept for the next one.
+_N_UPDATE, _N_START = 4000, 300
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
 _NEGLIGIBLE = 0.01
 _CHECKS = ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage")
@@ -165,6 +167,24 @@ class ScenarioPosterior:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class LifeStart(ReadOnly):
+    """Draws of a posterior from which that with further logs is sampled.
+
+    `points`, ``(n_scenarios, n_draws, n_dim)``, are coordinates of the scenarios called `names`,
+    with zeros after the last coordinate of each.
+    """
+
+    names: tuple[str, ...]
+    points: FloatArray
+
+    def of(self, scenario: Scenario) -> FloatArray:
+        """Return the draws of a scenario, ``(n_draws, n_dim)``; none of one that is new."""
+        if scenario.name not in self.names:
+            return np.empty((0, scenario.n_dim))
+        return self.points[self.names.index(scenario.name), :, : scenario.n_dim]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class LifePosterior:
     """Posterior of a life, a mixture over its scenarios."""
 
@@ -183,6 +203,7 @@ class LifePosterior:
     walk: float  # walk, noise_scale, deviation: as in `Prognosis`
     noise_scale: float
     deviation: float
+    start: LifeStart  # of the next posterior
     seed: tuple[int, ...]
 
     def __post_init__(self) -> None:
@@ -213,10 +234,15 @@ class LifePosterior:
 
     @property
     def ess(self) -> float:
-        """Smallest effective sample size of chains; infinite without any."""
-        chains = [one for one in self.scenarios if np.isfinite(one.r_hat).all()]
-        found = [value for one in chains for value in (*one.ess_bulk, *one.ess_tail)]
-        return float(np.min(found, initial=np.inf))
+        """Smallest effective sample size of the scenarios that chains sample; infinite without any.
+
+        After an update by importance sampling it is that of the weights.
+        """
+        least = constants.MIN_CHAIN_PROBABILITY
+        sizes = [
+            (*one.ess_bulk, *one.ess_tail) for one in self.scenarios if one.probability >= least
+        ]
+        return float(np.min(np.concatenate([*sizes, []]), initial=np.inf))
 
     @property
     def worst_r_hat(self) -> float:
@@ -277,6 +303,7 @@ def fit_life(
     *,
     chains: bool = True,
     n_draws: int = 10_000,
+    before: LifeStart | None = None,
 ) -> LifePosterior:
     """Fit the degradation laws of a stage to all logs since its baseline.
 
@@ -294,6 +321,9 @@ def fit_life(
         least 400 effective draws), in a fraction of the time.
     n_draws : int
         Draws of all ensembles, a multiple of 4.
+    before : LifeStart, optional
+        `start` of the posterior with fewer logs, which is updated by importance sampling. Where
+        its weights fail, the life is fitted from nothing.
 
     Raises
     ------
@@ -320,13 +350,20 @@ def fit_life(
     mount_stiffness: 87%
     """
     likelihood = LifeLikelihood.of(history, stage)
-    explore_seed, chain_seed, off_seed = stream(seed, _STEP).spawn(3)
     n_kept = n_draws // _N_ENSEMBLES
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
-        found = _weighted_scenarios(likelihood, explore_seed)
-        min_probability = constants.MIN_CHAIN_PROBABILITY if chains else np.inf
-        scenarios = _sampled_scenarios(found, chain_seed, n_kept, min_probability)
+        found = None
+        if before is not None:
+            # Updates one after the other must not repeat their random numbers.
+            *seeds, off_seed = stream(seed, _STEP, len(history.logs)).spawn(3)
+            found = _updated(likelihood, before, seeds, n_kept)
+        if found is None:
+            *seeds, off_seed = stream(seed, _STEP).spawn(3)
+            weighted, start = _weighted_scenarios(likelihood, seeds[0])
+            min_probability = constants.MIN_CHAIN_PROBABILITY if chains else np.inf
+            found = _sampled_scenarios(weighted, seeds[1], n_kept, min_probability), start
+        scenarios, start = found
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.data.now])
     draws, settings = [], []
@@ -354,6 +391,7 @@ def fit_life(
         walk=walk,
         noise_scale=noise_scale,
         deviation=deviation,
+        start=start,
         seed=tuple(np.atleast_1d(seed).tolist()),
     )
 
@@ -366,34 +404,69 @@ def _log_probability(found: _Explored) -> float:
     return float(np.log(found[0].scenario.weight) + found[1].log_evidence)
 
 
+def _updated(
+    likelihood: LifeLikelihood,
+    before: LifeStart,
+    seeds: Sequence[np.random.SeedSequence],
+    n_kept: int,
+) -> tuple[tuple[ScenarioPosterior, ...], LifeStart] | None:
+    """Sample the scenarios by importance from earlier draws; None where weights are unreliable.
+
+    The weights are those of the posterior with all logs, not of the last log alone: errors of one
+    update do not reach the next.
+    """
+    try:
+        found, start = _weighted_scenarios(likelihood, seeds[0], before)
+    except NotConverged:
+        return None
+    probability = softmax([_log_probability(one) for one in found])
+    large = probability >= constants.MIN_CHAIN_PROBABILITY
+    if not all(one[1].reliable() for one, own in zip(found, large, strict=True) if own):
+        return None
+    return _sampled_scenarios(found, seeds[1], n_kept, np.inf), start
+
+
 def _weighted_scenarios(
-    likelihood: LifeLikelihood, seed: np.random.SeedSequence
-) -> list[_Explored]:
-    """Return weighted draws and evidences of the scenarios that a rough evidence does not drop."""
+    likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None = None
+) -> tuple[list[_Explored], LifeStart]:
+    """Return weighted draws and evidences of the scenarios that a rough evidence does not drop.
+
+    The start of the next posterior has draws of all scenarios: one that is dropped may return.
+    """
     grid = likelihood.grid
     densities = [LifeDensity(likelihood, one, grid) for one in likelihood.data.scenarios]
     generators = [np.random.default_rng(own) for own in seed.spawn(len(densities))]
-    rough = [_rough(one, rng) for one, rng in zip(densities, generators, strict=True)]
+    rough = [_rough(one, rng, before) for one, rng in zip(densities, generators, strict=True)]
     least = max(map(_log_probability, rough)) - constants.MAX_LOG_ODDS
+    n = _N_FINE if before is None else _N_UPDATE
     found = []
-    for (density, draws), rng in zip(rough, generators, strict=True):
-        if _log_probability((density, draws)) <= least:
-            continue
-        if density.scenario.n_dim:
+    widest = max(one.scenario.n_dim for one in densities)
+    points = np.zeros((len(densities), _N_START, widest))
+    for k, ((density, draws), rng) in enumerate(zip(rough, generators, strict=True)):
+        likely, n_dim = _log_probability((density, draws)) > least, density.scenario.n_dim
+        if likely and n_dim:
             start = draws.resampled(rng, _N_ROUGH)
             density = density.narrowed(start[: _N_ROUGH // 3])
-            draws = importance_sample_to_ess(density.log_probability, start, rng, _N_FINE)
-        found.append((density, draws))
-    return found
+            draws = importance_sample_to_ess(density.log_probability, start, rng, n)
+        if likely:
+            found.append((density, draws))
+        points[k, :, :n_dim] = draws.resampled(rng, _N_START)
+    return found, LifeStart(tuple(one.scenario.name for one in densities), points)
 
 
-def _rough(density: LifeDensity, rng: np.random.Generator) -> _Explored:
+def _rough(density: LifeDensity, rng: np.random.Generator, before: LifeStart | None) -> _Explored:
     """Return rough draws of a scenario; without coordinates they are exact."""
     if density.scenario.n_dim == 0:
         point = np.empty((1, 0))
         value = float(density.log_probability(point)[0])
         return density.narrowed(point), WeightedDraws(point, np.ones(1), value)
-    start = density.scenario.draw(rng, _N_ROUGH)
+    start, earlier = density.scenario.draw(rng, _N_ROUGH), np.empty((0, 0))
+    if before is not None:
+        earlier = before.of(density.scenario)
+    if earlier.shape[0]:
+        density = density.narrowed(earlier[: _N_ROUGH // 6])
+        # Draws of the prior stay among them, for a mode that the earlier logs did not show.
+        start = np.concatenate([earlier, start[: _N_START // 4]])
     return density, importance_sample(density.log_probability, start, rng, _N_ROUGH)
 
 

@@ -10,7 +10,7 @@ from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.prognosis import constants
-from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
+from lmshealth.prognosis.life_posterior import LifePosterior, LifeStart, fit_life
 from lmshealth.prognosis.map_error import modes_off_map
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.prognosis.scenarios import DegradationPath
@@ -76,13 +76,18 @@ def prognose(
 
 
 def prognose_with_posterior(
-    history: History, stage: Stage, seed: int | Sequence[int], *, chains: bool = True
+    history: History,
+    stage: Stage,
+    seed: int | Sequence[int],
+    *,
+    chains: bool = True,
+    before: LifeStart | None = None,
 ) -> tuple[Prognosis, LifePosterior]:
-    """Return the prognosis and the posterior of the life; see `prognose`."""
+    """Return the prognosis and the posterior of the life; see `prognose` and `fit_life`."""
     if not parameters_with_limit(stage):
         raise BadStage(f"{stage.name}: no [[parameter]] has a limit, so there is no end of life")
     seeds = stream(seed, _STEP).spawn(4)
-    life = fit_life(history, stage, seed, chains=chains)
+    life = fit_life(history, stage, seed, chains=chains, before=before)
     limited = identifiable_limits(stage, life.modes)
     if not limited:
         raise NotEnoughData(

@@ -98,6 +98,12 @@ class Scenario:
         return tuple(len(path.names) for path in self.paths)
 
     @property
+    def name(self) -> str:
+        """Name by the kind and the begin of each law, and the steps, in m."""
+        laws = " ".join(f"{path.law.kind}@{path.begin:.0f}" for path in self.paths)
+        return " ".join([laws, *(f"{step:.0f}" for step in self.paths[0].steps)])
+
+    @property
     def n_dim(self) -> int:
         """Number of coordinates."""
         return sum(self.sizes)

@@ -46,7 +46,7 @@ COLUMNS = {
     "events": "stage recorded_at travel_km kind mode source size std evidence declared known_at",
     "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged "
     "identifiable at_edge fit prior_width informed ess_bulk ess_tail laplace_shift "
-    "laplace_ratio prior_shift prior_ratio",
+    "laplace_ratio prior_shift prior_ratio judge_shift judge_ratio",
     "prognosis": "stage parameter limit "
     + " ".join(
         f"rul_{unit}_q{100 * level:02.0f}"

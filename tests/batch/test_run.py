@@ -182,12 +182,52 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 ) -> None:
     """With truth.csv deleted a second run remembers every log and result: the same bytes."""
     (done.logs / "truth.csv").unlink()
-    monkeypatch.setattr(assessing, "assess", None)  # nothing may be inferred again
+    monkeypatch.setattr(assessing, "_assess", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
     # The broken file is identified by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
     assert tables(done.out) == done.written
     assert pages(done.out) == done.pages
+
+
+def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A second run writes the same page and tables without drawing; after a new log it is drawn."""
+    logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
+    drawn: list[str] = []
+    whole = outputs.make_page
+
+    def counted(found: Assessment, file: str, **options: Any) -> Any:
+        drawn.append(file)
+        return whole(found, file, **options)
+
+    monkeypatch.setattr(outputs, "make_page", counted)
+    run(logs, [modes_only], out)
+    before = tables(out), pages(out)
+    (out / "test-A.html").unlink()
+    run(logs, [modes_only], out)
+    assert (tables(out), pages(out)) == before
+    assert drawn == ["test-A.html"]
+    (logs / "log-01.h5").unlink()
+    run(logs, [modes_only], out)
+    assert drawn == ["test-A.html"] * 2
+
+
+def test_known_parts_are_not_computed_again() -> None:
+    """Of the parts of an assessment only those whose inputs are new are computed."""
+    computed: list[int] = []
+
+    def double(x: int) -> int:
+        computed.append(x)
+        return 2 * x
+
+    first = assessing.Parts({})
+    assert list(first.map(int, double, [1, 2])) == [2, 4]
+    second = assessing.Parts(first.used)
+    assert list(second.map(int, double, [2, 3])) == [4, 6]
+    assert computed == [1, 2, 3]
+    assert len(second.used) == 2
 
 
 @pytest.mark.slow
@@ -395,14 +435,14 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     """It is named with the reason, and the others are reported."""
     logs = write_archive(tmp_path / "logs", 2)
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
-    whole = assessing.assess
+    whole = assessing._assess
 
     def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
         if readings[0].metadata.stage == "other-A":
             raise ZeroDivisionError("a mistake of ours")
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "assess", fail)
+    monkeypatch.setattr(assessing, "_assess", fail)
     result = run(logs, [modes_only], tmp_path / "out")
     assert [row.identity for row in result.rows] == ["test-A"]
     assert set(result.failed) == {"other-A"}
@@ -424,13 +464,13 @@ def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) 
 def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List the machines that are assessed and not remembered."""
     machines: list[str] = []
-    whole = assessing.assess
+    whole = assessing._assess
 
     def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
         machines.append(str(readings[0].metadata.stage))
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "assess", listen)
+    monkeypatch.setattr(assessing, "_assess", listen)
     return machines
 
 

@@ -380,7 +380,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
         Store(f"sqlite:///{path}").close()
     finally:
         event.remove(Engine, "before_cursor_execute", be_quicker)
-    assert len(made) == 5
+    assert len(made) == 6
 
 
 @pytest.mark.slow

@@ -222,6 +222,46 @@ def test_epochs_are_spread_and_end_with_the_last(stage: Stage) -> None:
     assert epochs_to_infer(make_track(drift, cov), stage, 1)[-1] == 49
 
 
+def test_epochs_are_nested_as_logs_are_added(stage: Stage) -> None:
+    """After one more log only the last epoch is new, and no gap is much longer than another."""
+    drift, cov = np.zeros((90, 2)), np.tile(COV, (90, 1, 1))
+    before = set(epochs_to_infer(make_track(drift[:20], cov[:20]), stage, 9))
+    for n in range(21, 91):
+        found = epochs_to_infer(make_track(drift[:n], cov[:n]), stage, 9)
+        assert len(found) == 9
+        assert set(found) - before == {n - 1}
+        assert np.diff(found).max() <= 2 * (n - 1) / 8 + 1
+        before = set(found)
+
+
+@pytest.mark.usefixtures("quick")
+def test_an_epoch_does_not_depend_on_later_logs(stage: Stage, worn: Track) -> None:
+    """An epoch that was the last one has the same draws when another follows; its judge goes."""
+    drift, cov = worn.drift, worn.drift_cov
+    earlier = infer(make_track(drift[:2], cov[:2]), stage, 5)
+    later = infer(worn, stage, 5)
+    np.testing.assert_array_equal(earlier.chains[-1], later.chains[0])
+    np.testing.assert_array_equal(earlier.fit[-1], later.fit[0])
+    assert np.isfinite(earlier.judge_shift[-1]).all()
+    assert np.isnan(later.judge_shift[0]).all()
+
+
+def test_importance_sampling_that_fails_gives_way_to_chains(
+    stage: Stage, worn: Track, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where weights are unreliable the chains are published, and nothing judges them."""
+    monkeypatch.setattr("lmshealth.health.constants.MAX_PARETO_K", -9.0)
+    chains = 0.01 * np.random.default_rng(3).standard_normal((4, 500, 2))
+    full = np.full(2, 2000.0)
+    monkeypatch.setattr(
+        inference, "sample", lambda *_: Sample(chains, full, full, np.ones(2), np.ones(2))
+    )
+    found = infer(worn, stage, 5, epochs=[2])
+    assert found.converged.all()
+    assert np.isnan(found.judge_shift).all()
+    np.testing.assert_allclose(np.std(np.log(found.samples)), 0.01, rtol=0.1)
+
+
 def test_the_baseline_of_a_real_track_is_no_epoch(tmp_path: Path) -> None:
     """Epochs of a track come after its baseline, whatever rounding leaves of its covariance."""
     stage = make_stage(tmp_path, n_modes=3)
@@ -256,6 +296,7 @@ def test_a_sampler_that_fails_is_reported_by_epoch(
         raise NotConverged("stuck", np.full((4, 50, 16, 2), -0.1))
 
     monkeypatch.setattr(inference, "sample", fail)
+    monkeypatch.setattr(inference, "sample_by_importance", fail)
     found = infer(worn, stage, 1)
     assert not found.converged.any()
     assert np.isnan(found.ess).all()
@@ -359,7 +400,11 @@ def test_the_wider_posterior_may_have_draws_of_its_own(
         full = np.full(2, 2000.0)
         return Sample(next(own), full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
 
-    monkeypatch.setattr(inference, "sample", fake)
+    def no_judge(*_: object) -> Sample:
+        raise NotConverged("stuck", np.zeros((4, 50, 32, 2)))
+
+    monkeypatch.setattr(inference, "sample_by_importance", fake)
+    monkeypatch.setattr(inference, "draw", no_judge)
     monkeypatch.setattr(inference, "_MIN_SHARE", 1.1)
     found = infer(worn, stage, 5, epochs=[2])
     middle, std = np.median(first, axis=(0, 1)), np.std(first, axis=(0, 1))
@@ -527,6 +572,7 @@ def test_an_epoch_without_convergence_informs_no_parameter(
         raise NotConverged("stuck", np.full((4, 50, 32, 2), [low, -0.1]))
 
     monkeypatch.setattr(inference, "sample", fail)
+    monkeypatch.setattr(inference, "sample_by_importance", fail)
     found = infer(worn, stage, 1)
     assert (found.informed > 0.9).all()
     assert not found.publishable_parameters().any()

@@ -172,7 +172,7 @@ def test_importance_sampling_alone_has_the_same_posterior(
     (way,) = quick.scenarios
     assert np.isnan(way.r_hat).all()
     assert way.ess_bulk.min() >= 400
-    assert quick.ess == np.inf
+    assert quick.ess == way.ess_bulk.min()
     assert quick.worst_r_hat == 1
     one, two = (
         np.concatenate([fit.health, fit.scenarios[0].chains], axis=2).reshape(-1, 6)
@@ -181,6 +181,42 @@ def test_importance_sampling_alone_has_the_same_posterior(
     ess = both_ess(found.ess, both_ess(float(way.ess_bulk.min()), 2000))
     assert agree(one, two, ess)
     assert not agree(one, 1.01 * two, ess)  # negative control
+
+
+@pytest.mark.slow
+def test_a_life_updated_log_by_log_is_that_from_nothing(history: History, stage: Stage) -> None:
+    """After five updates in a row quantiles are those of a fit from nothing, within its error."""
+    one = fit_life(first_logs(history, 7), stage, 11, chains=False, n_draws=400)
+    for n in range(8, 13):
+        one = fit_life(first_logs(history, n), stage, 11, n_draws=2000, before=one.start)
+        assert np.isnan(one.scenarios[0].r_hat).all()  # no chains
+    whole = fit_life(history, stage, 12, chains=False, n_draws=2000)
+    draws = [
+        np.concatenate([fit.health, fit.scenarios[0].chains], axis=2).reshape(-1, 6)
+        for fit in (one, whole)
+    ]
+    ess = both_ess(both_ess(one.ess, 2000), both_ess(whole.ess, 2000))
+    assert agree(*draws, ess)
+    assert not agree(draws[0], 1.02 * draws[1], ess)  # negative control
+
+
+def test_an_update_that_fails_is_a_fit_from_nothing(
+    history: History, stage: Stage, unchained: LifePosterior, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where the weights of an update are unreliable, its result is that without a start."""
+    monkeypatch.setattr("lmshealth.health.constants.MAX_PARETO_K", -9.0)
+    start = unchained.start
+    again = fit_life(history, stage, 11, chains=False, n_draws=400, before=start)
+    np.testing.assert_array_equal(again.health, unchained.health)
+
+
+def first_logs(history: History, n: int) -> History:
+    """Return the history of the first logs."""
+    names = ("logs", "recorded_at", "travel", "ln_frequency", "ln_damping", "cov", "loop_error")
+    covariates = {name: values[:n] for name, values in history.covariates.items()}
+    return replace(
+        history, covariates=covariates, **{name: getattr(history, name)[:n] for name in names}
+    )
 
 
 def test_linear_algebra_keeps_to_one_thread(
@@ -202,9 +238,9 @@ def test_linear_algebra_keeps_to_one_thread(
 
 
 def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> None:
-    """Without chains there is no R-hat to be worse than 1, and no chain with few draws."""
+    """Without chains there is no R-hat to be worse than 1, and the sample size is of weights."""
     assert np.isnan(unchained.scenarios[0].r_hat).all()
-    assert unchained.ess == np.inf
+    assert unchained.ess == unchained.scenarios[0].ess_bulk.min()
     assert unchained.worst_r_hat == 1
 
 
