@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import secrets
 import stat
@@ -21,13 +22,13 @@ _LARGEST_TABLE = 64 << 20
 
 
 def read_table(path: Path) -> bytes:
-    """Read a file of settings or rows; `ValueError` for a device, a pipe, or one too large.
+    """Read a file of settings or rows; `OSError` for a device or a pipe, `ValueError` if too large.
 
     They would be read without end, or wait for a writer.
     """
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        raise ValueError("is no regular file")
+        raise OSError(errno.EINVAL, "is no regular file")
     if found.st_size > _LARGEST_TABLE:
         raise ValueError(f"{found.st_size} bytes are too many; needed at most {_LARGEST_TABLE}")
     return path.read_bytes()
