@@ -67,7 +67,7 @@ def test_no_device_is_read(tmp_path, kind):
         load_columns(path)
     with pytest.raises(BadStage, match="no regular file"):
         load_stage(str(path))
-    with pytest.raises(ValueError, match="no regular file"):
+    with pytest.raises(OSError, match="no regular file"):
         read_table(path)
 
 
