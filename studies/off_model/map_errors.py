@@ -7,7 +7,9 @@ Method
     returns a mode; it names the right one if that is the first. Control: the exact map, where at
     most 2 % may be warned of; intervals are by Clopper and Pearson, one life each.
 Answer
-    Not recorded yet.
+    With the exact map none of 60 lives is warned of. A mode whose drifts are 30 % larger is warned
+    of in 22 of 36 lives, each time by its right name and with a size whose interval holds the
+    truth: less than the 80 % that were hoped for.
 Run time
     Six minutes on one processor.
 """
@@ -33,6 +35,11 @@ SEED, N_LOGS, LENGTH_M = 20261126, 20, 2e6
 N_EXACT, N_WRONG, SIZE = 60, 12, 0.3
 MOST_FALSE, LEAST_NAMED = 0.02, 0.8
 EXACT = "exact"
+_POWER = (
+    "a mode that is 30 % off the map passes for the declared error of the map and an error of the "
+    "other modes in two of five lives; more modes, or larger losses, would separate them"
+)
+NOT_MET = {f"{mode}: named": _POWER for mode in MODES}
 
 
 def main() -> None:
@@ -54,7 +61,7 @@ def main() -> None:
             "std": float(np.median([row["std"] for row in named])) if named else None,
         }
     answer["passed"] = verdicts(answer["worlds"])
-    study.conclude(answer, quick_may_fail=True)
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 @cache
