@@ -32,6 +32,9 @@ _COMMANDS = {
 }
 
 
+_INTERRUPTED = 130  # as shells report SIGINT
+
+
 class _Group(click.Group):
     """Group that reports errors in one line on standard error, with exit status 1."""
 
@@ -57,7 +60,10 @@ class _Group(click.Group):
         except OSError as error:
             print_errors([f"{error.filename or 'output'}: {error.strerror}"])
         except KeyboardInterrupt:
-            print_errors(["interrupted; run again to continue"])
+            # Only a run keeps what is finished.
+            kept = "; run again to continue" if ctx.invoked_subcommand == "run" else ""
+            print_errors([f"interrupted{kept}"])
+            ctx.exit(_INTERRUPTED)
         ctx.exit(1)
 
 
@@ -65,7 +71,7 @@ class _Group(click.Group):
     cls=_Group,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit status: 0 done, 1 failed (one line on standard error gives the reason), 2 wrong "
-    "usage, 3 done but some logs were refused.",
+    "usage, 3 done but some logs were refused, 130 interrupted.",
 )
 @click.version_option(package_name="lmshealth")
 def main() -> None:

@@ -522,7 +522,8 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
         }
         for one in summaries[: constants.TERMINAL_ROWS]
     ]
-    title = f"{len(summaries)} stages, most urgent first (medians with 90 % intervals)"
+    n = "1 stage" if len(summaries) == 1 else f"{len(summaries)} stages, most urgent first"
+    title = f"{n} (medians with 90 % intervals)"
     print_table(title, shown, 5)
     if rest := len(summaries) - len(shown):
         click.echo(f"{rest} more stages; verdict.csv and prognosis.csv list all.")

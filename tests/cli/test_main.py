@@ -938,3 +938,20 @@ def test_a_guessed_layout_is_reported(tmp_path: Path) -> None:
         "is read with ';' between fields, decimal commas, names in line 2; [csv] of a column map"
     )
     assert result.stderr.count(found) == 1
+
+
+@pytest.mark.parametrize(("command", "kept"), [("run", True), ("stage", False)])
+def test_an_interrupt_has_its_status(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, command: str, kept: bool
+) -> None:
+    """An interrupt ends with 130; only a run is said to continue."""
+
+    def interrupted(*arguments: object, **options: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("lmshealth.cli.archive_commands.run_pipeline", interrupted)
+    monkeypatch.setattr("lmshealth.cli.stage_commands.check_stage", interrupted)
+    words = [tmp_path, "--stage", "lms-y", "--out", tmp_path / "out"] if kept else ["lms-y"]
+    result = call(command, *words)
+    assert result.exit_code == 130
+    assert ("run again to continue" in result.stderr) is kept
