@@ -383,9 +383,11 @@ def _update(
 
     def work() -> PackedAssessment | None:
         found: Assessment | None = unpack_or_none(content, Assessment)
-        if found is None or found.track is None or found.prognosis is None:
+        if found is None or found.track is None:
             return None
         if prior is None:
+            if found.prognosis is None:
+                return None
             return pack_assessment(replace(found, calibration=calibrate(found.prognosis, ended)))
         history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
         prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))

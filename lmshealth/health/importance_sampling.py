@@ -42,7 +42,9 @@ class WeightedDraws(ReadOnly):
         from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
 
         diagnostic: Any = array_stats  # the library has no types
-        return float(diagnostic.psislw(-np.log(self.weight))[1])
+        # A weight may be too small for a float.
+        weight = np.maximum(self.weight, np.finfo(float).tiny)
+        return float(diagnostic.psislw(-np.log(weight))[1])
 
     def reliable(self) -> bool:
         """Return whether enough draws are effective, and their weights have light tails."""

@@ -9,9 +9,10 @@ Method
     damaged 200 times at random bytes: opening it and reading every outcome must give what
     it held, nothing, or a `StoreError`. In silence wrong is a log whose samples differ from those
     written, where the format has a checksum of them (gzip, packed MAT, Parquet with CRC, HDF5 with
-    fletcher32). Time and peak memory of both processes are measured. Controls: a
-    reader that raises a `KeyError`, one that returns other samples, one that ends its process
-    and one that loops must be detected or refused.
+    fletcher32). Measured are time, the memory by which this process grows, and the peak of the one
+    that reads HDF5 and Parquet. Controls: a
+    reader that raises a `KeyError` and one that returns other samples must be detected, one that
+    ends its process, one that loops and one that takes memory must be refused.
 Run time
     About eight processor minutes.
 """
@@ -19,12 +20,12 @@ Run time
 from __future__ import annotations
 
 import os
-import resource
 import sys
 import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,12 +37,15 @@ from scipy.io import savemat
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io import reading
-from lmshealth.io.column_map import load_columns
-from lmshealth.io.formats import isolation
+from lmshealth.io.column_map import ColumnMap, load_columns
+from lmshealth.io.formats import hdf5, isolation
+from lmshealth.io.formats.content import Load
 from lmshealth.io.manifest import read_manifest
 from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import Unusable
 from lmshealth.stage.description import load_stage
-from studies.bad_inputs import logfiles
+from studies.bad_inputs import logfiles, misbehave
+from studies.common.cost import memory_bytes
 from studies.harness.claims import Claim, controls_seen, counted
 from studies.harness.study import Row, Study
 
@@ -125,7 +129,7 @@ def outcome(work: Callable[[], object]) -> str:
     """Return what a reader does: its reason, or the kind of a foreign exception."""
     try:
         verdict = work()
-    except LmshealthError as error:
+    except (LmshealthError, Unusable) as error:
         detail = str(error)
         if "Traceback" in detail or not all(c.isprintable() or c == "\n" for c in detail):
             return "not printable"
@@ -157,7 +161,7 @@ def mutants(name: str, n: int, seconds: float = 1e9) -> Row:
     write, checked = FORMS[name]
     os.environ["LMSHEALTH_MAX_SECONDS"] = _PATIENCE
     counts: Counter[str] = Counter()
-    slowest, start = 0.0, time.monotonic()
+    slowest, start, most, own = 0.0, time.monotonic(), 0, memory_bytes()
     with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
         path = Path(folder) / name
         write(path)
@@ -170,6 +174,7 @@ def mutants(name: str, n: int, seconds: float = 1e9) -> Row:
             before = time.monotonic()
             found = outcome(lambda: judged(path, checked))
             slowest = max(slowest, time.monotonic() - before)
+            most = max(most, _memory_of_reader())
             counts[found] += 1
             if bad(found):
                 keep = Path(tempfile.gettempdir()) / f"mutant-{counts[found]}-{name}"
@@ -178,7 +183,8 @@ def mutants(name: str, n: int, seconds: float = 1e9) -> Row:
             if time.monotonic() - start > seconds:
                 break
     return {"form": name, "mutants": counts.total(), "outcomes": dict(counts),
-            "slowest_s": round(slowest, 2), "peak_bytes": peak()}  # fmt: skip
+            "slowest_s": round(slowest, 2),
+            "peak_bytes": max(most, memory_bytes() - own)}  # fmt: skip
 
 
 def bad(found: str) -> bool:
@@ -186,11 +192,10 @@ def bad(found: str) -> bool:
     return found.startswith(("FOREIGN", "WRONG", "not printable"))
 
 
-def peak() -> int:
-    """Return the most memory in bytes of this process or of one that it has waited for."""
-    isolation._reader.close()
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    return max(resource.getrusage(kind).ru_maxrss for kind in kinds) << 10
+def _memory_of_reader() -> int:
+    """Return the peak memory in bytes of the process that reads files, if it runs."""
+    process = isolation._reader._process
+    return 0 if process is None else memory_bytes(process=process.popen.pid)
 
 
 _STAGE = logfiles.DESCRIPTION.encode()
@@ -233,12 +238,17 @@ HOSTILE: tuple[bytes, ...] = (
 )
 
 
+def _manifest_rows(path: Path) -> str:
+    """Read a manifest, which refuses rows."""
+    return "rows refused" if read_manifest(path.parent).refused else "read"
+
+
 def texts(n: int) -> list[Row]:
     """Read mutated and hostile descriptions, column maps and manifests."""
     readers: dict[str, tuple[bytes, Callable[[Path], object]]] = {
-        "stage.toml": (_STAGE, lambda path: load_stage(str(path))),
-        "columns.toml": (_MAP, load_columns),
-        "manifest.csv": (_MANIFEST, lambda path: read_manifest(path.parent)),
+        "stage.toml": (_STAGE, lambda path: load_stage(str(path)) and "read"),
+        "columns.toml": (_MAP, lambda path: load_columns(path) and "read"),
+        "manifest.csv": (_MANIFEST, _manifest_rows),
     }
     rows = []
     for k, (name, (intact, read)) in enumerate(readers.items()):
@@ -250,7 +260,7 @@ def texts(n: int) -> list[Row]:
             for data in (*HOSTILE, *(mutate(intact, rng) for _ in range(n))):
                 path.write_bytes(data)
                 start = time.monotonic()
-                counts[outcome(lambda read=read, path=path: read(path) and "read")] += 1
+                counts[outcome(lambda read=read, path=path: read(path))] += 1
                 slowest = max(slowest, time.monotonic() - start)
         rows.append({"text": name, "cases": counts.total(), "outcomes": dict(counts),
                      "slowest_s": round(slowest, 2)})  # fmt: skip
@@ -281,10 +291,18 @@ def controls() -> dict[str, bool]:
         log.channels[0].values[3] *= 1.5
         return log
 
+    def isolated(load: Load) -> str:
+        form = replace(hdf5.HDF5, load=load)
+        return outcome(lambda: isolation.read_isolated(form, Path(__file__), ColumnMap(), 1e9))
+
+    os.environ["LMSHEALTH_MAX_SECONDS"] = "1"
     return {
         "an exception of a library": bad(caught(raise_key)),
         "another sample": bad(caught(change)),
         "no fault": caught(lambda log: log) == "read",
+        "a reader that ends its process": isolated(misbehave.crash) == "library crashed: refused",
+        "a reader that loops": isolated(misbehave.loop) == "refused: too-slow",
+        "a reader that takes memory": isolated(misbehave.swell) == "refused: too-large",
     }
 
 

@@ -33,7 +33,7 @@ from scipy.stats import binom, norm
 
 import lmshealth
 from lmshealth.errors import BadLog
-from lmshealth.io import constants
+from lmshealth.io import reading
 from studies.bad_inputs.logfiles import Archive, LogFile, write
 from studies.harness.claims import Claim, controls_seen, counted
 from studies.harness.study import Row, Study
@@ -234,14 +234,16 @@ def try_set(name: str, number: int, checked: bool = True) -> Row:
     make, reasons = SETS[name]
     columns = {_SAMPLES: values}
     columns |= {f"acc_{k}_m_s2": other for k, other in enumerate(make(values, rng))}
-    before, constants.DEPENDENT = constants.DEPENDENT, constants.DEPENDENT if checked else -1.0
+    independent = reading.independent
+    if not checked:
+        reading.independent = lambda values, *_: list(range(len(values)))
     try:
         with tempfile.TemporaryDirectory(prefix="axes-") as folder:
             path = Path(folder) / "set.h5"
             write(Archive(path.parent), path, LogFile(columns, {"sample_rate_hz": repr(RATE)}))
             found = _found(path, truth)
     finally:
-        constants.DEPENDENT = before
+        reading.independent = independent
     told = {one.split(": ")[1] for one in found["named"]}
     return {"kind": name, "told_right": told == set(reasons.split()), **found}
 

@@ -54,10 +54,10 @@ def in_own_process(module: str, *arguments: object) -> Any:
     return json.loads(done.stdout.splitlines()[-1])
 
 
-def memory_bytes(entry: str = "VmHWM") -> int:
-    """Return the peak memory of this process, or another entry of its status, in bytes.
+def memory_bytes(entry: str = "VmHWM", process: int | str = "self") -> int:
+    """Return the peak memory of a process, or another entry of its status, in bytes.
 
     `resource` would include the peak of the parent.
     """
-    status = Path("/proc/self/status").read_text()
+    status = Path(f"/proc/{process}/status").read_text()
     return int(re.findall(rf"{entry}:\s*(\d+) kB", status)[0]) << 10

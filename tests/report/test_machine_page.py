@@ -50,7 +50,7 @@ __all__ = ["make"]
 
 PER_PARAMETER = (
     *("ess_bulk", "ess_tail", "r_hat", "informed", "laplace_shift", "laplace_ratio"),
-    *("prior_shift", "prior_ratio", "at_edge", "identifiable"),
+    *("prior_shift", "prior_ratio", "judge_shift", "judge_ratio", "at_edge", "identifiable"),
 )
 
 

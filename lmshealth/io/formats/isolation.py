@@ -5,8 +5,8 @@ process per session reads such files, one after the other. It starts with the fi
 ends with this one. It is no fork, which is unsafe beside threads, and does not import the module
 ``__main__`` of a user. Requests and answers pass through its standard input and output, samples
 through a temporary file that both processes map, so that no shared memory of the system is needed.
-Answers are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
-their sender.
+Both are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
+the sender of an answer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ import faulthandler
 import json
 import mmap
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -41,7 +40,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable
 
 _START = (
-    "import pickle, sys; sys.path[:] = pickle.load(sys.stdin.buffer); "
+    "import json, sys; sys.path[:] = json.loads(sys.stdin.buffer.readline()); "
     "from lmshealth.io.formats.isolation import serve; serve()"
 )
 # Bytes of samples that are handed over at once: they stay in the processor's cache.
@@ -53,9 +52,9 @@ class _Request(NamedTuple):
     """Arguments of `load_by`, and what the process may take: seconds, and bytes of memory."""
 
     form: str
-    load: Load
-    path: Path
-    columns: ColumnMap
+    load: str  # module and name of the function
+    path: str
+    columns: dict[str, Any]  # of a `ColumnMap`
     max_memory: float
     seconds: float
     memory: float
@@ -95,7 +94,8 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
     stored = path.stat().st_size
     memory = max(3 * constants.SMALL_ENOUGH, min(max_memory, 4 * stored))
     seconds = _max_seconds() + stored / constants.SLOWEST_READING
-    arguments = form.name, form.load, path.absolute(), columns, max_memory
+    load = f"{form.load.__module__}:{form.load.__qualname__}"
+    arguments = form.name, load, str(path.absolute()), msgspec.to_builtins(columns), max_memory
     request = _Request(*arguments, seconds, memory, form.library)
     try:
         return _reader.read(request)
@@ -138,18 +138,20 @@ class _Process:
             assert self.popen.stdin is not None and self.popen.stdout is not None
             self._requests: IO[bytes] = self.popen.stdin
             self._answers: Any = self.popen.stdout
-            pickle.dump(sys.path, self._requests)
-            pickle.dump(file.name, self._requests)
-            self._requests.flush()
+            for text in (sys.path, file.name):
+                self._write(text)
             self._answers.readline()
         finally:
             with suppress(OSError):  # Windows keeps it until the process has ended
                 os.unlink(file.name)
 
+    def _write(self, content: object) -> None:
+        self._requests.write(json.dumps(content).encode() + b"\n")
+        self._requests.flush()
+
     def read(self, request: _Request) -> Content:
         """Send a request and receive samples and content, or raise the refusal."""
-        pickle.dump(request, self._requests)
-        self._requests.flush()
+        self._write(request)
         spools: dict[int, Spool] = {}
         while True:
             answer = msgspec.convert(json.loads(self._answers.readline()), _Answer)
@@ -261,16 +263,13 @@ def serve() -> None:
     requests, answers = sys.stdin.buffer, os.fdopen(os.dup(1), "wb")
     # What a library prints is no answer.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    with open(pickle.load(requests), "r+b") as file:
+    with open(json.loads(requests.readline()), "r+b") as file:
         window = mmap.mmap(file.fileno(), _WINDOW)
     sender = _Sender(answers, window, requests)
     answers.write(b"\n")
     answers.flush()
-    while True:
-        try:
-            request = pickle.load(requests)
-        except EOFError:
-            return
+    while line := requests.readline():
+        request = _Request(*json.loads(line))
         with suppress(ImportError):  # the function of the format refuses the file
             import_module(request.library)
         _limit_memory(request.memory)
@@ -309,7 +308,11 @@ class _Sender:
         """Send all that a file holds, or why it is refused."""
         self._numbers.clear()
         try:
-            content = load_by(*request[:5])
+            module, name = request.load.split(":")
+            load: Load = getattr(import_module(module), name)
+            columns = msgspec.convert(request.columns, ColumnMap)
+            path, most = Path(request.path), request.max_memory
+            content = load_by(request.form, load, path, columns, most)
             numbers = {name: self._number(spool) for name, spool in content.columns.items()}
             parts = content.metadata, content.present, content.refused, content.guessed
             self._line(_Answer(0, "", 0, 0, numbers, *parts))

@@ -1,0 +1,114 @@
+"""Run a machine after one new log, and from nothing, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import sys
+import tempfile
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from lmshealth._serialize import fingerprint
+from lmshealth.batch import run as running
+from lmshealth.batch.assess import Machine, assess, assess_all
+from lmshealth.batch.ingest import Resources
+from lmshealth.batch.store import Identified, Store, unpack_or_none
+from lmshealth.batch.workers import processes
+from lmshealth.io.log import Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report.assessment import Assessment
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import LogEstimates
+from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from studies.common.cost import cpu_s, memory_bytes
+from studies.common.lives import drawn, history_of, life_of, plan_of, recorded, rng_of
+from studies.harness.study import Row
+
+NAME, EPOCHS, SEED = "AX-1", 40, 0
+
+
+def readings(n: int) -> list[LogEstimates]:
+    """Draw the estimates of the logs of a life."""
+    life = life_of(plan_of("lms-y", "both", SEED, n))
+    history = history_of(life, drawn(life, *recorded("lms-y"), rng_of(41, 0, SEED)))
+    m, found = len(history.modes), []
+    for k in range(n):
+        modes = Modes(
+            names=history.modes, sources=("joint",) * m, channels=("acc_pitch",) * m,
+            ln_frequency=history.ln_frequency[k], ln_damping=history.ln_damping[k],
+            cov=history.cov[k], snr=np.full(m, 50.0), dispersion=np.ones(m), flags=("",) * m,
+            shape_channels=(), shapes=np.zeros((m, 0)), lines=(), refused=(),
+        )  # fmt: skip
+        covariates = {name: float(values[k]) for name, values in history.covariates.items()}
+        metadata = Metadata(NAME, history.recorded_at[k], float(history.travel[k]), covariates)
+        digest, error = fingerprint("log", n, k), float(history.loop_error[k])
+        found.append(LogEstimates(history.logs[k], digest, metadata, modes, error))
+    return found
+
+
+def run_with(logs: list[LogEstimates], stage: Stage, store: Store, out: Path) -> Assessment:
+    """Assess the machine with some of its logs, and write its page, as a run does."""
+    keys = []
+    for log in logs:
+        keys.append((log.log, fingerprint("key", log.digest)))
+        store.put_identified(keys[-1][1], log.digest, Identified(log, stage.digest, NAME))
+    machine = Machine(NAME, tuple(keys), stage, NO_MAINTENANCE, EPOCHS, SEED)
+    with processes(1) as pool:
+        resources = Resources(store, pool)
+        assert not assess_all([machine], resources)
+        running._report([machine], (), resources, out)
+    found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
+    assert found is not None and found.prognosis is not None
+    return found
+
+
+def main() -> None:
+    """Print costs, and what differs from a run from nothing, as JSON."""
+    n, stage = int(sys.argv[1]), load_stage("lms-y")
+    logs = readings(n)
+    kept: list[Assessment] = []
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        with closing(Store(f"sqlite:///{out / 'store.sqlite'}")) as store:
+            parts = {"first": logs[:-1], "new": logs, "unchanged": logs}
+            cost = {
+                name: cpu_s(lambda part=part: kept.append(run_with(part, stage, store, out)))
+                for name, part in parts.items()
+            }
+    peak = memory_bytes() / 2**20
+    fresh = assess(logs, stage, epochs=EPOCHS, seed=SEED)
+    short = assess(logs[: 2 * n // 3], stage, epochs=EPOCHS, seed=SEED)
+    print(json.dumps({"cpu_s": cost, "peak_mb": peak, **compared(kept[1], fresh, short)}))
+
+
+def compared(updated: Assessment, fresh: Assessment, short: Assessment) -> Row:
+    """Compare the answers after a new log with those from nothing, and with another life's."""
+    own, other = updated.health, fresh.health
+    assert own is not None and other is not None
+    return {
+        "epochs_equal": bool(np.array_equal(own.samples, other.samples)),
+        "apart": _apart(updated.prognosis, fresh.prognosis),
+        "control_apart": _apart(updated.prognosis, short.prognosis),
+    }
+
+
+def _apart(one: Prognosis | None, other: Prognosis | None) -> float:
+    """Return how far medians of the remaining travel to any limit are apart, in standard errors."""
+    assert one is not None and other is not None
+    medians, errors = [], []
+    for found in (one, other):
+        travel = np.where(
+            np.isfinite(found.remaining[:, -1]), found.remaining[:, -1], found.horizon
+        )
+        medians.append(np.log(np.median(travel) + 1.0))
+        # Of a median: 1.25 standard deviations of the mean, by the interquartile range.
+        low, high = np.log(np.quantile(travel, (0.25, 0.75)) + 1.0)
+        errors.append(1.25 * (high - low) / 1.349 / np.sqrt(found.ess))
+    return float(abs(medians[0] - medians[1]) / np.hypot(*errors))
+
+
+if __name__ == "__main__":
+    main()

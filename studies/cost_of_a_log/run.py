@@ -1,0 +1,110 @@
+"""What does one new log of a machine cost, beside its whole history?
+
+Method
+    A life of stage Y whose preload wears and whose mount loosens, from estimates as identified, in
+    a store and a process of its own for each length of the history (`life`). Three runs of what
+    `run` does after identification (assessment, page, rows of tables): all logs but the last, then
+    all, then nothing new. Then the machine is assessed from nothing. Epochs are drawn from seeds
+    that depend on their content only and must be equal; of the remaining travel both answers are
+    random, and its medians must agree within four standard errors, from the published effective
+    sample sizes. Control, which must fail: the life without the last third of its logs.
+Answer
+    Not recorded yet.
+Run time
+    About ten minutes on one processor.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+from studies.common.cost import in_own_process
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+STEP = "run"
+LENGTHS, QUICK_LENGTHS = (60, 600), (8,)
+# Asked: s of processor time of a new log and of a first run of 60 logs; growth; memory in MB.
+MOST_NEW, MOST_FIRST, MOST_GROWTH, MOST_MB = 5.0, 45.0, 1.5, 350.0
+MOST_APART = 4.0
+NOT_MET = {
+    "a new log takes at most 5 s": (
+        "emcee judges the last epoch, the life is fitted from its former draws, and the page is "
+        "drawn anew, each about a third of it"
+    ),
+    "a first run of 60 logs takes at most 45 s": "40 epochs are drawn, four of which emcee judges",
+    "growth with the history": (
+        "association, tracker and page start from nothing, and the likelihood of a life grows with "
+        "its logs until they are condensed"
+    ),
+    "memory": "the likelihood of a life holds a matrix for each choice of its nuisance terms",
+}
+
+
+def main() -> None:
+    """Run the study; ``--quick`` takes a short history and records nothing."""
+    study = Study(__file__, __doc__)
+    lengths = QUICK_LENGTHS if study.quick else LENGTHS
+    also = ("studies.cost_of_a_log.life",)
+    rows = [study.trials.once(measured, n, also=also) for n in lengths]
+    study.conclude(
+        {"histories": rows, "passed": verdicts(rows)}, not_met=NOT_MET, quick_may_fail=True
+    )
+
+
+def measured(n: int) -> Row:
+    """Measure a history of so many logs."""
+    found: Row = in_own_process("studies.cost_of_a_log.life", n)
+    cost = found["cpu_s"]
+    shares = {"new_over_first": cost["new"] / cost["first"]}
+    return {"logs": n, **found, **shares, "unchanged_over_new": cost["unchanged"] / cost["new"]}
+
+
+def verdicts(rows: Sequence[Row]) -> dict[str, bool]:
+    """Return what is asked, by name."""
+    first, last = rows[0], rows[-1]
+    return {
+        "a new log takes at most 5 s": all(row["cpu_s"]["new"] <= MOST_NEW for row in rows),
+        "a first run of 60 logs takes at most 45 s": first["cpu_s"]["first"] <= MOST_FIRST,
+        "growth with the history": last["cpu_s"]["new"] <= MOST_GROWTH * first["cpu_s"]["new"],
+        "memory": all(row["peak_mb"] <= MOST_MB for row in rows),
+        "an unchanged machine costs nothing": all(row["unchanged_over_new"] < 0.05 for row in rows),
+        "epochs are those of a run from nothing": all(row["epochs_equal"] for row in rows),
+        "lives are those of a run from nothing": all(row["apart"] < MOST_APART for row in rows),
+        "another life is told apart": any(row["control_apart"] > MOST_APART for row in rows),
+    }
+
+
+def claims(record: Row) -> Iterator[Claim]:
+    """Claim costs of a new log, their growth, and the equality of the answers."""
+    passed = record["passed"]
+    for row in record["histories"]:
+        cost = row["cpu_s"]
+        yield Claim(
+            f"processor time after one new log of {row['logs']}, over that of the first run",
+            number(row["new_over_first"]),
+            "",
+            f"{number(cost['new'])} s beside {number(cost['first'])} s; without a new log "
+            f"{number(cost['unchanged'])} s; peak memory {row['peak_mb']:.0f} MB",
+            met=passed["a new log takes at most 5 s"],
+        )
+    first, last = record["histories"][0], record["histories"][-1]
+    yield Claim(
+        f"growth of that time from {first['logs']} to {last['logs']} logs",
+        number(last["cpu_s"]["new"] / first["cpu_s"]["new"]),
+        beside=f"at most {MOST_GROWTH} required",
+        met=passed["growth with the history"],
+    )
+    apart = ", ".join(number(row["apart"]) for row in record["histories"])
+    control = ", ".join(number(row["control_apart"]) for row in record["histories"])
+    yield Claim(
+        "median remaining travel after an update and from nothing, apart in standard errors",
+        apart,
+        beside=f"without the last third of the logs {control}; epochs are equal bit for bit: "
+        + ("yes" if passed["epochs are those of a run from nothing"] else "no"),
+        met=passed["lives are those of a run from nothing"],
+    )
+
+
+if __name__ == "__main__":
+    main()
