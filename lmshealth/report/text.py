@@ -12,7 +12,7 @@ from lmshealth.report import constants
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
-_UNITS = {"c": "°C", "kg": "kg", "mm": "mm"}
+_UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB"}
 
 Number = float | np.floating[Any]
 

@@ -28,6 +28,8 @@ StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 # Order of the series of one mode.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
+EXCITATION = "excitation_db"
+"""Covariate that the identification measures: needed where frequencies depend on the amplitude."""
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 
 
@@ -276,6 +278,8 @@ def build_history(
         name: np.array([r.metadata.covariates.get(name) for r in ordered], dtype=float)
         for name in names
     }
+    if stage is not None and any(c.name == EXCITATION for c in stage.description.covariate):
+        covariates.setdefault(EXCITATION, _excitation(ordered))
     steps = _steps(ordered, actions)
     regressed = regressors(covariates, stage)
     estimates = _estimates(ordered, stage)
@@ -313,6 +317,28 @@ def build_history(
         steps=steps,
     )
     return history, refused
+
+
+def _excitation(ordered: Sequence[LogEstimates]) -> FloatArray:
+    """Return the level of the excitation of each log in dB, ``(n_logs,)``, NaN where unknown.
+
+    It is the mean over its modes of the levels that each mode has over those of its first log.
+    """
+    first: dict[str, float] = {}
+    found = np.full(len(ordered), np.nan)
+    for k, reading in enumerate(ordered):
+        modes = reading.modes
+        known = {
+            name: 20 * np.log10(level)
+            for name, level in zip(modes.names, modes.excitation, strict=True)
+            if level > 0
+        }
+        if known:
+            # A mode that appears later begins at the level of the others.
+            others = [level - first[name] for name, level in known.items() if name in first]
+            found[k] = float(np.mean(others)) if others else 0.0
+            first |= {n: x - found[k] for n, x in known.items() if n not in first}
+    return found
 
 
 def _without_contradictions(

@@ -25,10 +25,10 @@ from lmshealth.tracking import constants
 from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.maintenance import read_actions
 
-_KM, _MICRO = 1000.0, 1e-6
+_KM, _MILLI, _MICRO = 1000.0, 1e-3, 1e-6
 _NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
 _DAMPING = ("damping_ratio", "damping_ratio_std")
-_NUMBERS = (*_NEEDED[1:], *_DAMPING, "travel_km", "correlation_f_zeta", "snr")
+_NUMBERS = (*_NEEDED[1:], *_DAMPING, "travel_km", "correlation_f_zeta", "snr", "excitation_mm_s2")
 _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, "baseline")
@@ -294,6 +294,7 @@ def _log(
         cov=_covariance(path, log, rows, terms),
         snr=rows["snr"].to_numpy(float),
         dispersion=np.full(n, np.nan),
+        excitation=rows["excitation_mm_s2"].to_numpy(float) * _MILLI,
         flags=("",) * n,
         shape_channels=tuple(name[len(_SHAPE) :] for name in shapes),
         shapes=rows[list(shapes)].to_numpy(float),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
@@ -14,6 +15,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import (
     History,
+    LogEstimates,
     Series,
     build_history,
     missing_mode_notices,
@@ -206,6 +208,69 @@ def test_covariates_are_nan_where_a_log_has_none(stage: Stage) -> None:
     history, _ = build_history(readings, stage)
     np.testing.assert_array_equal(history.covariates["temperature_c"], [20.0, np.nan])
     np.testing.assert_array_equal(history.covariates["payload_kg"], [np.nan, 3.0])
+
+
+_DEPENDS_ON_AMPLITUDE = """
+[[covariate]]
+name = "excitation_db"
+reference = 0.0
+prior_std = 0.002
+"""
+
+
+def excited(levels: Sequence[Mapping[str, float]], softening: float = 0.0) -> list[LogEstimates]:
+    """Make readings whose modes are excited to m/s², and soften by as much per dB."""
+    readings = []
+    rng = np.random.default_rng(2)
+    for k, level in enumerate(levels):
+        ln_f = {
+            name: float(
+                4.8 + 0.1 * i + 2e-4 * rng.normal() - softening * np.nan_to_num(20 * np.log10(a))
+            )
+            for i, (name, a) in enumerate(level.items())
+        }
+        one = make_reading(f"{k:02d}", k, 1e5 * k, ln_f)
+        cov = np.diag([2e-4] * len(level) + [0.05] * len(level)) ** 2
+        modes = replace(one.modes, cov=cov, excitation=np.array(list(level.values())))
+        readings.append(replace(one, modes=modes))
+    return readings
+
+
+def test_the_level_of_the_excitation_is_a_covariate_where_it_is_described(tmp_path: Path) -> None:
+    """It is 0 dB in the first log; a mode that is missing, or comes later, does not change it."""
+    levels = [
+        {"roll": 0.1, "pitch": 0.5},
+        {"roll": 0.2, "pitch": 1.0},
+        {"pitch": 5.0},
+        {"roll": np.nan, "pitch": 0.5},
+        {},
+    ]
+    described = make_stage(tmp_path / "described", (FADING,), tail=_DEPENDS_ON_AMPLITUDE)
+    found, _ = build_history(excited(levels), described)
+    expected = [0, 20 * np.log10(2), 20, 0, np.nan]
+    np.testing.assert_allclose(found.covariates["excitation_db"], expected, atol=1e-9)
+    later, _ = build_history(excited([{"roll": 0.1}, *levels[1:]]), described)
+    np.testing.assert_allclose(later.covariates["excitation_db"][2], 20, atol=1e-9)
+    silent, _ = build_history(excited(levels), make_stage(tmp_path / "other", (FADING,)))
+    assert "excitation_db" not in silent.covariates
+
+
+def test_frequencies_that_depend_on_the_amplitude_are_no_drift(tmp_path: Path) -> None:
+    """A guide that softens with the level is tracked at one level, and drifts without."""
+    rng = np.random.default_rng(4)
+    # The machine is excited more and more, by 20 dB in all.
+    levels = [
+        {name: a * 10 ** (k / 30 + 0.1 * rng.normal()) for name, a in (("roll", 1), ("pitch", 2))}
+        for k in range(30)
+    ]
+    readings = excited(levels, softening=1e-3)
+    drifts = {}
+    for name, tail in (("with", _DEPENDS_ON_AMPLITUDE), ("without", "")):
+        own = make_stage(tmp_path / name, (FADING,), tail=tail)
+        found = track(build_history(readings, own)[0], own)
+        drifts[name] = found.drift[-1] / np.sqrt(np.diagonal(found.drift_cov[-1]))
+    assert (np.abs(drifts["with"]) < 3).all()
+    assert (drifts["without"] < -5).all()
 
 
 def test_no_reading_is_refused(stage: Stage) -> None:
