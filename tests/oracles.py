@@ -15,8 +15,9 @@ from lmshealth.tracking.history import History, Series
 
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.
 LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
-# Logs in a life, and what modes have in common of the variances of rates and of wander.
-LIFE, COMMON_RATE, COMMON_WANDER = 150, 0.9, 0.3
+# Logs in a life, and until ln f has settled; what modes have in common of the variances of rates
+# and of wander.
+LIFE, SETTLING_LOGS, COMMON_RATE, COMMON_WANDER = 150, 1.0, 0.9, 0.3
 BIAS = (0.005, 0.2)
 # Standard deviations of the jumps of ln f and ln ζ.
 JUMPS = {
@@ -33,7 +34,8 @@ class Wander:
     """One setting: walks and rate of ln f in a life, factors on the std of each source.
 
     A rate decays by ``decay`` per life. Readings wander by ``size`` of their first scaled errors,
-    with the correlation ``keep`` from log to log.
+    with the correlation ``keep`` from log to log. In the first logs ln f of all modes walks by
+    ``settling``.
     """
 
     level: float
@@ -43,6 +45,17 @@ class Wander:
     decay: float = 0.0
     size: float = 0.0
     keep: float = 0.0
+    settling: float = 0.0
+
+    def settled(self, history: History) -> FloatArray:
+        """Give the variance by which ln f has settled up to each log, since every baseline anew."""
+        gone, total, start = lives(history) * LIFE / SETTLING_LOGS, [0.0], 0.0
+        for k in range(1, gone.size):
+            more = np.exp(start - gone[k - 1]) - np.exp(start - gone[k])
+            if k in history.baselines:
+                more, start = 0.0, gone[k]
+            total.append(total[-1] + self.settling**2 * more)
+        return np.array(total)
 
     def moved(self, t: FloatArray) -> FloatArray:
         """Give the change of ln f after so many lives, per initial rate."""
@@ -209,7 +222,8 @@ class Textbook:
             alike = _alike(COMMON_RATE, m)
             bend = wander.bend**2
             f[level, rate], f[rate, rate] = far, left
-            q[np.ix_(level, level)] = (bend * tick**3 / 3 + anew * far**2) * alike
+            settled = float(np.diff(wander.settled(history)[k - 1 : k + 1])[0])
+            q[np.ix_(level, level)] = (bend * tick**3 / 3 + anew * far**2 + settled) * alike
             q[level, level] += wander.level**2 * tick
             q[np.ix_(level, rate)] = (bend * tick**2 / 2 + anew * far * left) * alike
             q[np.ix_(rate, level)] = q[np.ix_(level, rate)]
@@ -326,6 +340,8 @@ def _levels(history: History, wander: Wander, known: Known) -> list[np.ndarray]:
     low, high = np.minimum.outer(t, t), np.maximum.outer(t, t)
     rates = wander.rate**2 * np.outer(wander.moved(t), wander.moved(t))
     rates += wander.bend**2 * low**2 * (3 * high - low) / 6
+    settled = wander.settled(history)
+    rates += np.minimum.outer(settled, settled)
     level = LEVEL_STD**2 + wander.level**2 * low
     damping = DAMPING_STD**2 + DAMPING_WALK**2 * low
     for k in known.reopened:

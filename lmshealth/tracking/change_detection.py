@@ -46,12 +46,17 @@ def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> F
     return np.asarray(sums + np.array([innovation @ own, own.sum(axis=0)]))
 
 
-def suspect(sums: FloatArray, first: int, loop_changes: list[int]) -> int | None:
+def suspect(
+    sums: FloatArray,
+    first: int,
+    loop_changes: list[int],
+    gate: float,
+) -> int | None:
     """Return the log since which the following error, or else innovations, differ suspiciously.
 
     `sums` are the running sums before the first log and after every log so far, `first` is the
     first log of the regime, and `loop_changes` those of `unexplained_loop_changes`, which
-    locate a retuning better than innovations do.
+    locate a retuning better than innovations do. Mean innovations are beyond the `gate`.
     """
     k = len(sums) - 2
     recent = [j for j in loop_changes if first <= j < k]
@@ -64,7 +69,7 @@ def suspect(sums: FloatArray, first: int, loop_changes: list[int]) -> int | None
     windows = sums[-1] - sums[start]
     mean = np.abs(windows[:, 0]) / np.sqrt(np.maximum(windows[:, 1], 1))
     window, row = np.unravel_index(np.argmax(mean), mean.shape)
-    return int(start[window]) if mean[window, row] > constants.SUSPICION_GATE else None
+    return int(start[window]) if mean[window, row] > gate else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,6 +162,18 @@ def _gains(
         unchanged = checkpoints[now].log_evidence - before.log_evidence
         gains["drift", "", j] = changed - unchanged + place
     return gains
+
+
+def begun(
+    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, first: int
+) -> tuple[FilterBank, float]:
+    """Return the filters of a machine that changes anew since a log, and their log Bayes factor."""
+    before = checkpoints[first - 1]
+    anew = restart(model, before)
+    anew = anew[~anew.hyperparameters.healthy]
+    after = advance(model, anew, first, now)
+    unchanged = checkpoints[now].log_evidence - before.log_evidence
+    return after, after.log_evidence - anew.log_evidence - unchanged
 
 
 def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:

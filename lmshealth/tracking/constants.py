@@ -18,6 +18,8 @@ ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
+# The same from which published states allow for a change that began lately, and its probability.
+BEGUN_GATE, BEGUN_PROBABILITY = 3.0, 0.5
 # Standardised innovations count at most so much there: a single one opens no weighing for long.
 MOST_INNOVATION = 6.0
 # The kind of a change is settled at these odds over all other kinds, or after so many logs.
@@ -76,10 +78,17 @@ HEALTHY_WALKS = ((1e-5, 0.3), (3e-4, 0.25), (1e-3, 0.25))
 # A new or repaired machine may run in: its rate decays within so many logs, with probabilities,
 # and ln f moves by so much altogether (standard deviation).
 RUNNING_IN_LOGS, RUNNING_IN_STD = ((0.5, 0.07), (1.5, 0.07), (4.0, 0.06)), 0.03
-# Random walk of ln f of a changing machine, its initial rates, and the random walks of the rate.
+# Random walk of ln f of a changing machine; its initial rates, the random walks of the rate, and
+# probabilities.
 CHANGING_WALKS = (1e-5, 1e-3)
 # The last are of a machine that changes from log to log, by up to LN_F_STD or a few times that.
-CHANGING_RATES = ((0.03, 0.01), (0.03, 0.1), (0.3, 0.1), (0.3, 1.0), (1.0, 3.0), (30.0, 300.0))
+CHANGING_RATES = (
+    (0.03, 0.01, 0.2), (0.03, 0.1, 0.2), (0.3, 0.1, 0.2), (0.3, 1.0, 0.2), (1.0, 3.0, 0.1),
+    (30.0, 300.0, 0.1),
+)  # fmt: skip
+# A machine that changes slowly (initial rates up to this) may have run in as well: random walk of
+# ln f that ends within so many logs, altogether of this standard deviation, with probabilities.
+SETTLING, SETTLING_LOGS, SLOW_RATE = ((0.0, 0.65), (0.004, 0.35)), 1.0, 0.03
 # Share of the variance of rates that all modes have in common: damage lowers most modes.
 RATE_COMMON = 0.9
 # Prior probability of the healthy group. It cancels in the Bayes factor of an alarm.

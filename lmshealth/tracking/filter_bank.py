@@ -37,6 +37,7 @@ class Hyperparameters(Rows):
     rate_decay: FloatArray  # by which a rate decays exponentially, per life, ``(n,)``
     wander: FloatArray  # size of the wander in scaled errors of the first estimates, ``(n,)``
     wander_keep: FloatArray  # its correlation from one log to the next, ``(n,)``
+    settling: FloatArray  # of the random walk of ln f that ends after a few logs, ``(n,)``
 
     @property
     def healthy(self) -> BoolArray:
@@ -53,23 +54,26 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
     """Return the grid of hyperparameters that is averaged over."""
     walks, rates = constants.CHANGING_WALKS, constants.CHANGING_RATES
     chance = constants.HEALTHY_PROBABILITY
-    courses = [(w, 0.0, 0.0, 0.0, chance * p) for w, p in constants.HEALTHY_WALKS]
+    courses = [(w, 0.0, 0.0, 0.0, 0.0, chance * p) for w, p in constants.HEALTHY_WALKS]
     for logs, p in constants.RUNNING_IN_LOGS:
         decay = constants.LOGS_PER_LIFE / logs
         size = constants.RUNNING_IN_STD * decay
-        courses.append((constants.HEALTHY_WALKS[0][0], size, 0.0, decay, chance * p))
-    share = (1 - chance) / (len(walks) * len(rates))
-    courses += [(w, r, d, 0.0, share) for w, (r, d) in product(walks, rates)]
+        courses.append((constants.HEALTHY_WALKS[0][0], size, 0.0, decay, 0.0, chance * p))
+    for w, (r, d, share) in product(walks, rates):
+        share *= (1 - chance) / len(walks)
+        sizes = constants.SETTLING if r <= constants.SLOW_RATE else ((0.0, 1.0),)
+        courses += [(w, r, d, 0.0, size, p * share) for size, p in sizes]
     rows = []
     for course, scales, wander in product(courses, _scales(n_sources), constants.WANDERS):
         size, logs, p = wander
         keep = np.exp(-1 / logs) if logs else 0.0
-        weight = course[4] * prod(chance for _, chance in scales) * p
-        rows.append((*course[:4], size, keep, weight, *(scale for scale, _ in scales)))
+        weight = course[5] * prod(chance for _, chance in scales) * p
+        rows.append((*course[:5], size, keep, weight, *(scale for scale, _ in scales)))
     table = np.array(rows)
-    prior = table[:, 6] / table[:, 6].sum()
-    walk, rate, drive, decay, size, keep = table[:, :6].T
-    return Hyperparameters(walk, rate, drive, table[:, 7:], np.log(prior), decay, size, keep)
+    prior = table[:, 7] / table[:, 7].sum()
+    walk, rate, drive, decay, settling, size, keep = table[:, :7].T
+    noise = table[:, 8:]
+    return Hyperparameters(walk, rate, drive, noise, np.log(prior), decay, size, keep, settling)
 
 
 def _scales(n_sources: int) -> list[tuple[tuple[float, float], ...]]:
@@ -222,6 +226,8 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
         cov[:, rate, :] *= left[:, :, None]
         cov[:, :, rate] *= left[:, None, :]
         _diagonal(cov, level)[:] += own.level_walk[:, None] ** 2 * tick
+        settling = own.settling[:, None, None] ** 2 * space.settling[k]
+        cov[:, level, level] += settling * model.together
         drive = own.rate_walk[:, None, None] ** 2 * model.together
         cov[:, level, level] += drive * tick**3 / 3
         cov[:, level, rate] += drive * tick**2 / 2

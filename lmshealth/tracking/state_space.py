@@ -22,7 +22,8 @@ class StateSpace:
 
     Rates and random walks are per life of `constants.LOGS_PER_LIFE` logs at their mean distance so
     far. `ticks` are the parts of it between each log that has estimates (`seen`) and the one
-    before, ``(n_logs,)``, and `size` is the length of the state.
+    before, and `settling` the parts of the variance of settling, ``(n_logs,)`` each; `size` is the
+    length of the state.
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
@@ -43,6 +44,11 @@ class StateSpace:
         clock = np.maximum.accumulate(clock)
         logs = (np.cumsum(self.seen) - 1) / np.where(clock > 0, clock, 1.0)
         self.ticks = np.diff(clock, prepend=0.0) * logs / constants.LOGS_PER_LIFE
+        logs = np.cumsum(self.ticks) * constants.LOGS_PER_LIFE
+        for first in history.baselines:  # a machine settles anew after work on it
+            logs[first:] -= logs[first]
+        left = np.exp(-logs / constants.SETTLING_LOGS)
+        self.settling = np.maximum(-np.diff(left, prepend=1.0), 0.0)
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 

@@ -13,6 +13,7 @@ from typing import Literal
 
 import numpy as np
 from scipy import stats
+from scipy.special import expit, logit
 
 from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
 from lmshealth.errors import NotEnoughData
@@ -23,6 +24,7 @@ from lmshealth.tracking.change_detection import (
     N_CHECKPOINTS,
     Change,
     add_to_sums,
+    begun,
     suspect,
     threshold,
     unexplained_loop_changes,
@@ -314,7 +316,8 @@ class _Tracker:
 
     def _detect(self, k: int) -> None:
         """Weigh a suspected change, and raise the alarm of a drift."""
-        suspected = suspect(self.sums[: k + 2], self.first, self.loop_changes)
+        gate = constants.SUSPICION_GATE
+        suspected = suspect(self.sums[: k + 2], self.first, self.loop_changes, gate)
         if self.open is not None and suspected is not None:
             # A significant change keeps its place until it is settled.
             suspected = self.open.first
@@ -383,11 +386,15 @@ class _Tracker:
             # As likely an outlier as the first log after a step: publish the mixture of both.
             stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
             before = self.checkpoints[k - 1].padded(stepped.space.size)
-            other, other_cov = update(stepped, predict(stepped, before, k), k, outliers=False)[
-                0
-            ].collapse(self.size)
-            off = 0.5 * (other - mean)
-            mean, cov = mean + off, 0.5 * (cov + other_cov) + np.outer(off, off)
+            other = update(stepped, predict(stepped, before, k), k, outliers=False)[0]
+            mean, cov = _mixture(mean, cov, *other.collapse(self.size), 0.5)
+        else:
+            first = suspect(self.sums[: k + 2], self.first, [], constants.BEGUN_GATE)
+            if first is not None and first - 1 in self.checkpoints:
+                # No alarm yet, or an older rate: the rate may be another one since then.
+                other, evidence = begun(self.model, self.checkpoints, k, first)
+                chance = expit(evidence + logit(constants.BEGUN_PROBABILITY))
+                mean, cov = _mixture(mean, cov, *other.collapse(self.size), chance)
         self.mean[k], self.cov[k] = mean, cov
         self.noise_scale[k] = self.bank.weight @ self.bank.hyperparameters.scales
 
@@ -484,6 +491,15 @@ class _Tracker:
                 for i, mode in enumerate(self.history.modes)
             ]
         return events
+
+
+def _mixture(
+    mean: FloatArray, cov: FloatArray, other: FloatArray, other_cov: FloatArray, chance: float
+) -> tuple[FloatArray, FloatArray]:
+    """Return mean and covariance of a mixture of two states, the other with a probability."""
+    off = other - mean
+    between = chance * (1 - chance) * np.outer(off, off)
+    return mean + chance * off, (1 - chance) * cov + chance * other_cov + between
 
 
 def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:

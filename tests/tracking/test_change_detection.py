@@ -30,6 +30,8 @@ from tests.tracking.test_filter_bank import SETTINGS, one, run
 
 N_LOGS, PLACE = 40, 22
 
+GATE = 4.0
+
 
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
@@ -186,9 +188,9 @@ def test_windows_of_large_mean_innovations_are_suspected() -> None:
     """The suspected log is the first of the window with the largest mean."""
     innovations = 0.5 * np.array([1.0, -1.0]) * (-1.0) ** np.arange(20)[:, None]
     sums = sums_of(np.vstack([innovations, np.tile([0.0, 2.5], (4, 1))]))
-    assert [suspect(sums[: k + 2], 1, []) for k in range(20)] == [None] * 20
-    assert suspect(sums, 1, []) == 20
-    assert suspect(sums_of(np.vstack([innovations, np.zeros((4, 2))])), 1, []) is None
+    assert [suspect(sums[: k + 2], 1, [], GATE) for k in range(20)] == [None] * 20
+    assert suspect(sums, 1, [], GATE) == 20
+    assert suspect(sums_of(np.vstack([innovations, np.zeros((4, 2))])), 1, [], GATE) is None
 
 
 def test_leaps_of_the_loop_are_suspected() -> None:
@@ -202,8 +204,8 @@ def test_leaps_of_the_loop_are_suspected() -> None:
     lone[15] *= 1.5
     error[20:] *= 1.5
     leaps, sums = unexplained_loop_changes(error, ()), np.zeros((31, 2, 4))
-    assert suspect(sums[:22], 1, leaps) is None
-    assert suspect(sums[:23], 1, leaps) == 20
+    assert suspect(sums[:22], 1, leaps, GATE) is None
+    assert suspect(sums[:23], 1, leaps, GATE) == 20
     assert 15 not in unexplained_loop_changes(lone, ())
     assert 20 not in unexplained_loop_changes(error, (since("servo", 20, 30),))
 
@@ -211,9 +213,9 @@ def test_leaps_of_the_loop_are_suspected() -> None:
 def test_windows_do_not_reach_before_the_segment() -> None:
     """A step explains the innovations before it."""
     sums = sums_of(np.tile([4.0, 0.0], (6, 1)))
-    assert suspect(sums, 1, []) == 2
-    assert suspect(sums, 4, []) == 4
-    assert suspect(sums, 5, []) is None
+    assert suspect(sums, 1, [], GATE) == 2
+    assert suspect(sums, 4, [], GATE) == 4
+    assert suspect(sums, 5, [], GATE) is None
 
 
 def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
@@ -221,7 +223,7 @@ def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
     for moved, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
         innovations = np.zeros((12, 4))
         innovations[10:] = 2.2 * np.array(moved)
-        assert suspect(sums_of(innovations), 1, []) == suspected
+        assert suspect(sums_of(innovations), 1, [], GATE) == suspected
 
 
 def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:

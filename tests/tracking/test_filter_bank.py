@@ -32,6 +32,7 @@ SETTINGS = [
     Wander(1e-5, 0.0, 0.0, {"acc": 2.25, "delta_e": 0.5}),
     Wander(1e-2, 1.0, 3.0, {"acc": 0.5, "delta_e": 4.0}, 0.0, 2.0, 0.8),
     Wander(1e-4, 1.1, 0.0, {"acc": 1.0, "delta_e": 0.7}, 37.5, 0.7, 0.5),
+    Wander(1e-3, 0.03, 0.1, {"acc": 1.0, "delta_e": 1.5}, 0.0, 0.7, 0.5, 4e-3),
 ]
 ORACLES = {"filterpy": filterpy_loop, "textbook": kalman, "joint Gaussian": batch}
 
@@ -67,6 +68,7 @@ def one(wander: Wander, sources: tuple[str, ...]) -> Hyperparameters:
         np.array([wander.decay]),
         np.array([wander.size]),
         np.array([wander.keep]),
+        np.array([wander.settling]),
     )
 
 
@@ -148,6 +150,7 @@ def every() -> list[Wander]:
             float(own.rate_decay[0]),
             float(own.wander[0]),
             float(own.wander_keep[0]),
+            float(own.settling[0]),
         )
         for own in (grid[[g]] for g in range(grid.rate_std.size))
     ]

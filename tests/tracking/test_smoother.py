@@ -80,6 +80,7 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
             float(grid.rate_decay[g]),
             float(grid.wander[g]),
             float(grid.wander_keep[g]),
+            float(grid.settling[g]),
         )
         book = batch(history, wander, replace(ALONE, covariates=()), smoothed=True)
         books.append(book)

@@ -21,6 +21,7 @@ from lmshealth.tracking.change_detection import loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Event, Track, consistency, track
+from studies.off_model.run import of_world
 from tests.lives import (
     DAMPING,
     FREQUENCY,
@@ -64,6 +65,7 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
         monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, sources[:n]))
         monkeypatch.setattr(constants, "OUTLIER_GATE", inf)
         monkeypatch.setattr(constants, "SUSPICION_GATE", inf)
+        monkeypatch.setattr(constants, "BEGUN_GATE", inf)
 
     return choose
 
@@ -647,3 +649,20 @@ def test_nothing_to_judge_is_consistent() -> None:
     """A filter with a single log is neither consistent nor inconsistent."""
     found = consistency(np.zeros(1), np.zeros(1), np.full((1, 2), np.nan))
     assert (found.nis, found.p_value, found.holds) == (1.0, 1.0, True)
+
+
+@pytest.mark.slow
+def test_a_machine_that_runs_in_and_wears_out_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the first logs nor a rate of long ago make the last drift more certain than it is.
+
+    Without settling, and without a rate that is new, half of the drifts are beyond 90 % intervals.
+    """
+
+    def held() -> float:
+        return float(of_world("bathtub", 15, False)["drift_held"])
+
+    now = held()
+    monkeypatch.setattr(constants, "SETTLING", ((0.0, 1.0),))
+    monkeypatch.setattr(constants, "BEGUN_GATE", inf)
+    assert now > 0.7
+    assert held() < now - 0.2
