@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
@@ -104,11 +103,6 @@ class Health:
         """
         valid = bool(self.converged[-1]) and self.explained
         return np.asarray(valid & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
-
-    def informed_parameters(self) -> BoolArray:
-        """Return `publishable_parameters`; deprecated name."""
-        warnings.warn("use Health.publishable_parameters", DeprecationWarning, stacklevel=2)
-        return self.publishable_parameters()
 
     @property
     def explained(self) -> bool:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -142,12 +141,6 @@ class ScenarioPosterior:
         for name in _CHECKS:
             expect_shape(name, getattr(self, name), (n,))
         freeze(self)
-
-    @property
-    def informed(self) -> FloatArray:
-        """`interval_shrinkage`; deprecated name."""
-        warnings.warn("use interval_shrinkage", DeprecationWarning, stacklevel=2)
-        return self.interval_shrinkage
 
     @property
     def scenario(self) -> Scenario:

@@ -535,8 +535,6 @@ def test_unexplained_drifts_inform_no_parameter(tmp_path: Path) -> None:
     assert fine.fit[-1] > 0.01
     assert fine.explained
     assert fine.publishable_parameters().all()
-    with pytest.warns(DeprecationWarning, match="publishable"):
-        assert fine.informed_parameters().all()
     wrong = infer(epochs([right * [1, -1, 1]], cov), stage, 1)
     assert wrong.fit[-1] < 1e-6
     assert not wrong.explained
