@@ -1,7 +1,5 @@
 """Types of arrays, and checks of the arrays of frozen results."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any, Self
 

@@ -1,7 +1,5 @@
 """Ingest of an archive: every log is hashed, and identified once in the life of a store."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Commands that analyse single logs: modes, error, spectrum, frf."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """Inference of the health parameters at single epochs from the drifts of the modes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace

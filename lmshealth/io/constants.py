@@ -4,8 +4,6 @@ They are read as ``constants.NAME``. Lengths of text and counts that only bound 
 hostile files may claim were chosen far above every honest export.
 """
 
-from __future__ import annotations
-
 MAX_MEMORY = 2e9
 """Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS) may
 take: ten minutes of 20 kHz take 0.1 GB per channel. The option ``--max-memory``."""

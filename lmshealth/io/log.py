@@ -1,7 +1,5 @@
 """A log: the samples of one recording of one stage in SI units, its metadata, its refusals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal

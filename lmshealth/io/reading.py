@@ -1,7 +1,5 @@
 """Read one log: from a file of any format to a `Log` in SI units that keeps the log contract."""
 
-from __future__ import annotations
-
 import hashlib
 import stat
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """Accelerations at the modes of a log, and its spectral lines."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 

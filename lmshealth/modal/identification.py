@@ -5,8 +5,6 @@ likelihood holds all channels, fitted cluster by cluster (`fit_cluster`). The tw
 where the start values come from, how modes are named and what happens to modes that are too close.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -6,8 +6,6 @@ noise and of the other modes by the fit. Without other modes it is the first sin
 peak, as in frequency domain decomposition.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

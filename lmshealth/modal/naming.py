@@ -5,8 +5,6 @@ keeps the order of frequencies (`assign`). Frequency responses name only modes t
 or name competes for (`name_response`): tracking assigns the rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial

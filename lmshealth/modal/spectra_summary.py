@@ -1,7 +1,5 @@
 """Spectra of a log in bins, with what the fit of its modes expects there, for figures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Channels and modes that an identification uses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 

@@ -1,7 +1,5 @@
 """Remaining useful life: first passage of the limits, usage, and life curves."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

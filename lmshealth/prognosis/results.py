@@ -1,7 +1,5 @@
 """Result of the prognosis: remaining useful life with its uncertainty."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import datetime
 

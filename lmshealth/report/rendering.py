@@ -1,7 +1,5 @@
 """Rendering: templates to HTML pages (Jinja2, everything escaped), pages to PDF (WeasyPrint)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from datetime import datetime

@@ -1,7 +1,5 @@
 """Removal of strong sinusoids from the transforms of a segment (README.md, "Tone removal")."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

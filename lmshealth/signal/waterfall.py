@@ -1,7 +1,5 @@
 """Waterfall of a life: relative spectra of all logs in the band of the tracked modes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self

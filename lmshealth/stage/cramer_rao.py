@@ -1,7 +1,5 @@
 """Cramér-Rao bound of one mode identified from ambient accelerations in noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmshealth._arrays import FloatArray

@@ -1,7 +1,5 @@
 """Effects of temperature, payload and position on the modes, with the estimates that show them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Covariates of ln f (temperature, payload, position) as regressors of the state space."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime

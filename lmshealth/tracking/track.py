@@ -5,8 +5,6 @@ Declared steps are in the model from the start; a detected step is added, and th
 are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal

@@ -4,8 +4,6 @@ All of it is found from the first lines of the file, unless the column map state
 vendor (`text_layouts`) states it in a header of its own.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import re

@@ -9,8 +9,6 @@ Answers are JSON and bare numbers, never pickles: a damaged file may have writte
 their sender.
 """
 
-from __future__ import annotations
-
 import atexit
 import faulthandler
 import json

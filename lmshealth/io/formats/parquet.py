@@ -1,7 +1,5 @@
 """Parquet: columns, and the key/value metadata of the schema."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Identification of modes from a frequency response between two channels of a log."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

@@ -3,8 +3,6 @@
 Noise of the lines comes from the sensors and from forces that excite the same modes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
