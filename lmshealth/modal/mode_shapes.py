@@ -23,19 +23,12 @@ _LEAST_ORDINATES, _ROUNDS = 3, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeShapes:
-    """Complex shapes of the modes of a log, of accelerations (see `Modes.shapes`).
+    """Complex shapes of the modes of a log, of accelerations (see `Modes.shapes`)."""
 
-    Attributes
-    ----------
-    names, channels : tuple of str
-        Of the modes, and of the channels.
-    shapes : ndarray
-        Scaled so that the largest component is 1, shape ``(n_modes, n_channels)``; NaN in channels
-        that do not show the mode.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the modes
     channels: tuple[str, ...]
+    # Scaled so that the largest component is 1, shape ``(n_modes, n_channels)``; NaN in channels
+    # that do not show the mode.
     shapes: ComplexArray
 
     def __post_init__(self) -> None:

@@ -244,14 +244,9 @@ def first_passage(
     in m, shape ``(n,)``, is negative, by the law, if the limit has been passed, and infinite if it
     is never reached or, with deviation, not before the horizon.
 
-    Parameters
-    ----------
-    path, theta : DegradationPath, ndarray
-        Degradation of the parameter, with natural parameters of shape ``(n, k)``.
-    off, rate : ndarray
-        Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
-    now, limit, horizon : float
-        Travel in m since the baseline, limit as a fraction of it, and m from now to the horizon.
+    ``theta`` are natural parameters, ``(n, k)``; ``off`` and ``rate`` the deviation of ln health
+    from its law now and its variance per m, ``(n,)``; ``now`` the travel in m since the baseline,
+    ``limit`` a fraction of it, ``horizon`` in m from now.
     """
     left = path.passage(theta, limit * np.exp(-off)) - now
     # A law that gains may have been below the limit before, and is above it now.

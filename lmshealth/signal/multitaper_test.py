@@ -38,22 +38,12 @@ def detect_sinusoids(
 ) -> FloatArray:
     """Detect the sinusoids that several segments have in common [Thomson1982], [Riedel1995].
 
-    Parameters
-    ----------
-    lengths : sequence of int
-        Samples of each segment; those less than half as long as the longest are omitted.
-    read : callable
-        Returns the samples of a segment by its number, shape ``(n,)``.
-    sample_rate, band : float, (float, float)
-        In Hz; the first and last four ordinates cannot be tested.
-    false_alarm : float
-        Probability that segments without lines show any in the band, shared by all frequencies;
-        valid in white and coloured noise, and in resolved resonances of damping 0.2 % or more.
-
-    Returns
-    -------
-    ndarray
-        Frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
+    Lengths are the samples of each segment; those less than half as long as the longest are
+    omitted. ``read`` returns the samples of a segment by its number, shape ``(n,)``. Sample rate
+    and band are in Hz; the first and last four ordinates cannot be tested. ``false_alarm`` is the
+    probability that segments without lines show any in the band, shared by all frequencies; it is
+    valid in white and coloured noise, and in resolved resonances of damping 0.2 % or more. The
+    result is frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
     """
     low, high = band
     cuts = _octaves(max(low, high / 2**_MOST_OCTAVES), high)

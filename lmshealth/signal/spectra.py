@@ -232,16 +232,8 @@ def cross_spectra(
     Parts of one length and set velocity have the same expectation: their mean is a sufficient
     statistic. Short moves stay separate, so that a line is masked in each at its own frequency.
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-        Displacements or accelerations.
-    segments : sequence of Segment
-        Which samples.
-    sample_rate, top, ceiling : float
-        In Hz, as in `periodogram`.
-    resonances : sequence of ResonanceRange
-        Possible resonances: where a segment does not resolve them no sinusoid is removed.
+    Channels are displacements or accelerations; sample rate, top and ceiling are in Hz, as in
+    `periodogram`. Where a segment does not resolve possible resonances no sinusoid is removed.
     """
 
     def transformed(part: Segment) -> CrossSpectrum:
@@ -354,17 +346,8 @@ def periodogram(
     Mean and linear trend are removed. Of a displacement the second difference is transformed,
     over a lag that the top of the band permits, so that neither its large slow part nor its
     amplified fast noise leaks into the band. Ordinates reach from the first Fourier frequency to
-    below Nyquist, the ceiling, and for a displacement four times ``top``.
-
-    Parameters
-    ----------
-    channel, segment : Channel, Segment
-        Displacement or acceleration, and which samples of it.
-    sample_rate, ceiling : float
-        In Hz.
-    top : float
-        Highest frequency of interest in Hz, which sets the lag; by default Nyquist, at the price
-        of leakage.
+    below Nyquist, the ceiling, and for a displacement four times ``top``, all in Hz. ``top`` is the
+    highest frequency of interest, which sets the lag; by default Nyquist, at the price of leakage.
     """
     x, lag = as_acceleration(channel, segment, sample_rate, top)
     if lag:

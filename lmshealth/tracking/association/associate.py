@@ -147,19 +147,11 @@ def associate(
 ) -> Association:
     """Assign the estimates of all logs to modes; the labels of a log use it and earlier logs.
 
-    `BadTable` if an estimate is not finite or has no positive variance.
-
-    Parameters
-    ----------
-    epochs : sequence of Estimates
-        One per log, all with equally many channels of shapes.
-    clock : ndarray
-        Ascending odometer or time in any unit, shape ``(n_epochs,)``.
-    offsets, prior_std : ndarray
-        Covariates about their references, 0 where unknown, ``(n_epochs, n_covariates)``, and prior
-        standard deviations of d ln f per unit of each, ``(n_covariates,)``.
-    jumps : collection of int
-        Epochs at which frequencies may step, as after declared maintenance.
+    All epochs, one per log, have equally many channels of shapes. The clock is an ascending
+    odometer or time in any unit, ``(n_epochs,)``. Offsets are covariates about their references, 0
+    where unknown, ``(n_epochs, n_covariates)``, with prior standard deviations of d ln f per unit
+    of each, ``(n_covariates,)``. Jumps are epochs at which frequencies may step, as after declared
+    maintenance. `BadTable` if an estimate is not finite or has no positive variance.
     """
     start = state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()
