@@ -83,12 +83,7 @@ class _Task:
 
 
 def ingest(
-    folder: Path,
-    stages: Sequence[Stage],
-    resources: Resources,
-    *,
-    out: Path,
-    reading: Reading,
+    folder: Path, stages: Sequence[Stage], resources: Resources, *, out: Path, reading: Reading
 ) -> Ingested:
     """Identify every log of a folder whose outcome is not in the store yet.
 

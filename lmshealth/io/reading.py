@@ -19,14 +19,7 @@ from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
-from lmshealth.io.time_axis import (
-    IntArray,
-    TimeAxis,
-    pieces,
-    resampled,
-    set_velocity,
-    time_axis,
-)
+from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")

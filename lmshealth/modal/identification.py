@@ -193,10 +193,7 @@ def read_ambient(
 
 
 def _with_undescribed(
-    log: Log,
-    described: AmbientReading,
-    known: Sequence[Target],
-    targets: tuple[Target, ...],
+    log: Log, described: AmbientReading, known: Sequence[Target], targets: tuple[Target, ...]
 ) -> AmbientReading:
     """Search for all resonances near described modes, and name them together."""
     bands = [(*target.band(BAND_HALF_WIDTH), target.search) for target in targets]

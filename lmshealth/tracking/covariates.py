@@ -23,9 +23,7 @@ class Regressor:
 
 
 def regressors(
-    covariates: Mapping[str, FloatArray],
-    stage: Stage | None,
-    recorded_at: Sequence[datetime] = (),
+    covariates: Mapping[str, FloatArray], stage: Stage | None, recorded_at: Sequence[datetime] = ()
 ) -> tuple[Regressor, ...]:
     """Return the regressors of the described covariates that at least one log has.
 

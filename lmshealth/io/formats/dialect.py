@@ -272,10 +272,7 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
         (layout.delimiter is None and found.delimiter != ",", f"{marks} between fields"),
         (layout.decimal is None and found.decimal != ".", "decimal commas"),
         (where is not None and where != begin, f"names in line {(where or 0) + 1}"),
-        (
-            where is None and layout.header is None,
-            _UNNAMED,
-        ),
+        (where is None and layout.header is None, _UNNAMED),
     ]
     return tuple(text for differs, text in listed if differs)
 

@@ -260,11 +260,7 @@ def _check_coherence(name: str, frf: Frf) -> None:
 
 
 def _modes(
-    log: str,
-    frf: Frf,
-    fit: ResponseFit,
-    before: tuple[Refusal, ...],
-    lines: tuple[Line, ...],
+    log: str, frf: Frf, fit: ResponseFit, before: tuple[Refusal, ...], lines: tuple[Line, ...]
 ) -> Modes:
     """Return the credible modes; the others are refused."""
     m = fit.estimate.size // 2
