@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 
@@ -71,14 +71,14 @@ class Health:
 
     def __post_init__(self) -> None:
         n, p = len(self.recorded_at), len(self.parameters)
-        expect_shape("chains", self.chains, (n, *self.chains.shape[1:3], p))
-        for name in ("informed", "at_edge", "identifiable", *CHECKS):
-            expect_shape(name, getattr(self, name), (n, p))
-        expect_shape("correlation", self.correlation, (n, p, p))
-        expect_shape("prior_width", self.prior_width, (p,))
-        for name in ("travel", "converged", "fit"):
-            expect_shape(name, getattr(self, name), (n,))
-        freeze(self)
+        freeze(
+            self,
+            ("chains", n, *self.chains.shape[1:3], p),
+            (" ".join(["informed at_edge identifiable", *CHECKS]), n, p),
+            ("correlation", n, p, p),
+            ("prior_width", p),
+            ("travel converged fit", n),
+        )
 
     def relative_to(self, baselines: FloatArray) -> Health:
         """Return the posterior of the parameters divided by their baseline values."""

@@ -94,8 +94,6 @@ LONGEST_ATTRIBUTE = 1 << 16
 """Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
 MOST_COLUMNS = 1000
 """Columns of signals of a file, and those of a MAT matrix that are signals."""
-MOST_KEYS = 10_000
-"""Lines of metadata of a CSV file."""
 MOST_CELLS = 200
 """Columns of a table next to logs, which has a dozen. Each row takes time for all of them."""
 MOST_ROWS = 1_000_000

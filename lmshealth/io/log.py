@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import expect_shape, freeze
+from lmshealth._arrays import freeze
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
@@ -72,8 +72,7 @@ class Channel:
 
     def __post_init__(self) -> None:
         if isinstance(self.values, np.ndarray):
-            expect_shape("values", self.values, (self.values.size,))
-        freeze(self)
+            freeze(self, ("values", self.values.size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from lmshealth._arrays import ComplexArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.modes import Modes
@@ -32,8 +32,7 @@ class ModeShapes:
     shapes: ComplexArray
 
     def __post_init__(self) -> None:
-        expect_shape("shapes", self.shapes, (len(self.names), len(self.channels)))
-        freeze(self)
+        freeze(self, ("shapes", len(self.names), len(self.channels)))
 
     @property
     def complexity(self) -> FloatArray:

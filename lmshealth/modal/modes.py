@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.io.log import Refusal
 from lmshealth.signal.spectral_lines import Line
 
@@ -67,11 +67,8 @@ class Modes:
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")
-        for name in _ARRAYS:
-            expect_shape(name, getattr(self, name), (n,))
-        expect_shape("cov", self.cov, (2 * n, 2 * n))
-        expect_shape("shapes", self.shapes, (n, len(self.shape_channels)))
-        freeze(self)
+        shapes = "shapes", n, len(self.shape_channels)
+        freeze(self, (" ".join(_ARRAYS), n), ("cov", 2 * n, 2 * n), shapes)
 
     @property
     def estimate(self) -> FloatArray:

@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.modes import Modes
@@ -88,18 +88,14 @@ class History:
 
     def __post_init__(self) -> None:
         n, r = len(self.logs), len(self.series)
-        for name in ("travel", "loop_error"):
-            expect_shape(name, getattr(self, name), (n,))
-        for name in ("ln_frequency", "ln_damping"):
-            expect_shape(name, getattr(self, name), (n, r))
-        expect_shape("cov", self.cov, (n, 2 * r, 2 * r))
+        columns = "ln_frequency ln_damping", n, r
+        freeze(self, ("travel loop_error", n), columns, ("cov", n, 2 * r, 2 * r))
         if not self.baselines or not all(0 <= first < max(n, 1) for first in self.baselines):
             raise ValueError(f"baselines are logs {self.baselines} of {n}")
         if {one.mode for one in self.series} - set(self.modes):
             raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
         self._expect_order()
         self._expect_errors()
-        freeze(self)
 
     def _expect_order(self) -> None:
         """Require moments, and the odometer where there is one, that never decrease."""

@@ -45,10 +45,6 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     return Content(read, metadata, tuple(schema.names))
 
 
-def _sniff(head: bytes) -> bool:
-    return head.startswith(_MAGIC)
-
-
 PARQUET = Format(
     "Parquet", (".parquet",), lambda head: head.startswith(_MAGIC), _load, library="pyarrow.parquet"
 )

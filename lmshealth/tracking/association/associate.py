@@ -15,7 +15,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
@@ -50,13 +50,10 @@ class Estimates:
         n = len(self.names)
         if len(self.sources) != n:
             raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
-        expect_shape("ln_frequency", self.ln_frequency, (n,))
-        expect_shape("ln_damping", self.ln_damping, (n,))
-        expect_shape("cov", self.cov, (2 * n, 2 * n))
         if self.shapes.ndim != 2:
             raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
-        expect_shape("shapes", self.shapes, (n, self.shapes.shape[1]))
-        freeze(self)
+        shapes = "shapes", n, self.shapes.shape[1]
+        freeze(self, ("ln_frequency ln_damping", n), ("cov", 2 * n, 2 * n), shapes)
 
 
 @dataclass(frozen=True, slots=True)
