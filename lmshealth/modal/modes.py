@@ -3,12 +3,10 @@
 Arrays are read-only; NaN marks a missing value. Units are SI.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -105,7 +103,7 @@ class Modes:
         index = np.arange(n)
         return np.asarray(self.cov[index, index + n] / (std[:n] * std[n:]))
 
-    def select(self, index: Sequence[int]) -> Modes:
+    def select(self, index: Sequence[int]) -> Self:
         """Return some modes, in the order of ``index``; the others are marginalised."""
         both = paired(index, len(self.names))
         rows = both[: len(index)]

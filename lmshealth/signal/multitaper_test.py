@@ -1,11 +1,10 @@
 """Thomson's multitaper test for sinusoids in noise and resonances (README.md, "Line test")."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 from scipy import fft
@@ -251,7 +250,7 @@ class _LineFit:
     ratio: FloatArray
 
     @classmethod
-    def fit(cls, window: ComplexArray, ordinate: float) -> _LineFit:
+    def fit(cls, window: ComplexArray, ordinate: float) -> Self:
         """Fit the sine of a frequency in ordinates."""
         carrier = np.exp(-2j * np.pi * ordinate * np.arange(_WINDOW) / _WINDOW)
         weight = _tapers().sum(axis=1)

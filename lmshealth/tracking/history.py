@@ -1,13 +1,11 @@
 """History: the modal estimates of one machine in order of time, each assigned to its mode."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -61,7 +59,7 @@ class Step(ReadOnly):
         return self.kind in ("step", "regreasing", "reset")
 
     @classmethod
-    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Step:
+    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Self:
         """Make a detected step, which applies to all logs from the first on."""
         return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
 
@@ -140,7 +138,7 @@ class History:
             ticks = np.array([moment.timestamp() for moment in self.recorded_at])
         return np.asarray(ticks - ticks[self.baseline])
 
-    def first_logs(self, n: int) -> History:
+    def first_logs(self, n: int) -> Self:
         """Return the history as it was after its first n logs."""
         steps = (replace(one, there=one.there[:n]) for one in self.steps if one.first < n)
         return replace(

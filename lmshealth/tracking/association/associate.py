@@ -5,13 +5,11 @@ the estimates of a log, and returns the next state and a label per estimate. No 
 logs, and an estimate gets a mode only if that mode has nearly all of the posterior probability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
@@ -127,7 +125,7 @@ class State:
     clock: float | None = None  # to which the filters are predicted
 
     @classmethod
-    def start(cls, prior_std: FloatArray, n_channels: int) -> State:
+    def start(cls, prior_std: FloatArray, n_channels: int) -> Self:
         """Return the state before the first log."""
         sizes = (prior_std.size, n_channels)
         none = np.empty(0, dtype=int)
