@@ -24,7 +24,7 @@ from importlib import import_module
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, NamedTuple
+from typing import IO, Annotated, Any, NamedTuple
 
 import msgspec
 import numpy as np
@@ -64,7 +64,7 @@ class _Samples(msgspec.Struct, tag=True):
 
     column: int  # its number
     dtype: str
-    size: int
+    size: Annotated[int, msgspec.Meta(ge=0)]
     expected: int  # of the whole column
 
 
