@@ -4,7 +4,6 @@ Estimates guide preload, mount stiffness and remaining life, with uncertainty pr
 raw samples to the service date. All quantities are in SI units.
 """
 
-import warnings
 from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING
@@ -56,22 +55,12 @@ _HOMES = {
     "track": "tracking.track",
 }
 
-# Former names of public names, for one release.
-_FORMER = {"Reading": "LogEstimates"}
-
 __all__ = [*_HOMES]
 
 if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 
     def __getattr__(name: str) -> object:
         """Import a public name on first use."""
-        if name in _FORMER:
-            warnings.warn(
-                f"lmshealth.{name} is deprecated: use lmshealth.{_FORMER[name]}",
-                DeprecationWarning,
-                stacklevel=2,
-            )
-            return getattr(import_module(__name__), _FORMER[name])
         if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

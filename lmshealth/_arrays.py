@@ -1,7 +1,5 @@
 """Types of arrays, and checks of the arrays of frozen results."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from typing import Any, Self
 
@@ -13,8 +11,17 @@ BoolArray = NDArray[np.bool_]
 ComplexArray = NDArray[np.complex128]
 
 
-def freeze(result: Any) -> None:
-    """Make every array field of a frozen dataclass read-only."""
+def freeze(result: Any, *shapes: tuple[str, *tuple[int, ...]]) -> None:
+    """Make every array field of a frozen dataclass read-only, and require the shapes of some.
+
+    These are names separated by blanks, then the lengths of the axes. `ValueError` names the field,
+    its shape and the one needed.
+    """
+    for names, *shape in shapes:
+        for name in names.split():
+            found = getattr(result, name).shape
+            if found != tuple(shape):
+                raise ValueError(f"{name} has shape {found}, needed {tuple(shape)}")
     for item in fields(result):
         value = getattr(result, item.name)
         if isinstance(value, np.ndarray):
@@ -45,9 +52,3 @@ class Rows:
 def stack(values: ComplexArray) -> FloatArray:
     """Stack real above imaginary parts."""
     return np.concatenate([values.real, values.imag])
-
-
-def expect_shape(name: str, array: np.ndarray[Any, Any], shape: tuple[int, ...]) -> None:
-    """Require the shape of a field; `ValueError` names the field, its shape and the one needed."""
-    if array.shape != shape:
-        raise ValueError(f"{name} has shape {array.shape}, needed {shape}")

@@ -4,8 +4,6 @@ The bytes name no type and are never executed. Floats keep all their bits, NaN a
 dates keep their offset from UTC.
 """
 
-from __future__ import annotations
-
 import hashlib
 import zlib
 from importlib.metadata import version

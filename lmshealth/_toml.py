@@ -1,7 +1,5 @@
 """Decode TOML into structs; every error names the key."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Errors of lmshealth: each names what was found, what is needed and what to do next."""
 
-from __future__ import annotations
-
 
 class LmshealthError(Exception):
     """Base of every error that lmshealth raises on purpose.
@@ -30,7 +28,7 @@ class BadLog(LmshealthError):
         self.reason = reason
         self.detail = detail
 
-    def __reduce__(self) -> tuple[type[BadLog], tuple[str, str, str]]:
+    def __reduce__(self) -> tuple["type[BadLog]", tuple[str, str, str]]:
         """Pickle by the arguments, which differ from the message."""
         return type(self), (self.log, self.reason, self.detail)
 

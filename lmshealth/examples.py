@@ -4,8 +4,6 @@
 preload is left and 87 % of the mount stiffness; the preload reaches its limit of 60 % at 2,457 km.
 """
 
-from __future__ import annotations
-
 from importlib import resources
 from pathlib import Path
 

@@ -75,12 +75,6 @@ def test_names_are_few_and_at_home() -> None:
         assert getattr(home, name) is found
 
 
-def test_a_former_name_is_deprecated() -> None:
-    """A former name is the new one, with a warning that names it."""
-    with pytest.warns(DeprecationWarning, match="use lmshealth.LogEstimates"):
-        assert getattr(lmshealth, "Reading") is lmshealth.LogEstimates  # noqa: B009
-
-
 def test_no_other_name_is_found() -> None:
     """A name that is not there is an error, as in any module."""
     with pytest.raises(AttributeError, match="no attribute 'prognosis_of'"):

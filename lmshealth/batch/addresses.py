@@ -1,7 +1,5 @@
 """Addresses of stores and schedulers in messages, without their secrets."""
 
-from __future__ import annotations
-
 import re
 from urllib.parse import parse_qsl, unquote
 

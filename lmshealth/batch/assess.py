@@ -300,9 +300,7 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
 
 
 def _assess_packed(
-    job: _Job,
-    executor: Executor | None = None,
-    crashes: tuple[type[Exception], ...] = (),
+    job: _Job, executor: Executor | None = None, crashes: tuple[type[Exception], ...] = ()
 ) -> PackedAssessment | str:
     """Assess a machine; return why it fails, but raise what workers fail of."""
     machine, logs, known = job

@@ -1,7 +1,5 @@
 """Ingest of an archive: every log is hashed, and identified once in the life of a store."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -85,12 +83,7 @@ class _Task:
 
 
 def ingest(
-    folder: Path,
-    stages: Sequence[Stage],
-    resources: Resources,
-    *,
-    out: Path,
-    reading: Reading,
+    folder: Path, stages: Sequence[Stage], resources: Resources, *, out: Path, reading: Reading
 ) -> Ingested:
     """Identify every log of a folder whose outcome is not in the store yet.
 

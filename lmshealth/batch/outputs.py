@@ -3,8 +3,6 @@
 Memory holds the packed rows of all machines, and besides them only the machines in progress.
 """
 
-from __future__ import annotations
-
 import csv
 import threading
 from collections.abc import Iterable, Iterator, Mapping, Sequence

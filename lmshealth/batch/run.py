@@ -1,7 +1,5 @@
 """Run over an archive: from a folder of logs to tables and a report."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace

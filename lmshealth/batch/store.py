@@ -6,8 +6,6 @@ decode counts as absent. Every write may be repeated, and may be made by two run
 be killed, and may share a store.
 """
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import re
@@ -15,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, Self, cast
 from urllib.parse import quote
 
 import sqlalchemy as sql
@@ -94,7 +92,7 @@ class Identified:
     asked: str | None = None
     lasting: bool = True
 
-    def renamed(self, log: str) -> Identified:
+    def renamed(self, log: str) -> Self:
         """Replace the name of the log, which may have been moved since."""
         if not isinstance(self.outcome, LogEstimates):
             return replace(self, outcome=_renamed(self.outcome, log))

@@ -5,8 +5,6 @@ module imports little, because the processes import it before the batch begins; 
 with the tasks.
 """
 
-from __future__ import annotations
-
 import logging
 import multiprocessing
 import os

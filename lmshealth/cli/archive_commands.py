@@ -1,7 +1,5 @@
 """Commands on archives and stores: run, report."""
 
-from __future__ import annotations
-
 from contextlib import closing
 from pathlib import Path
 from typing import Any

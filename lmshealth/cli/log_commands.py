@@ -1,7 +1,5 @@
 """Commands that analyse single logs: modes, error, spectrum, frf."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -165,8 +163,7 @@ def _save(path: Path, found: LogEstimates) -> None:
 
 
 @options.command(
-    "error velocities/*.h5",
-    "error log.h5 --count 20 --floor-nm 50 --part settling --format json",
+    "error velocities/*.h5", "error log.h5 --count 20 --floor-nm 50 --part settling --format json"
 )
 @options.LOGS
 @click.option("--count", type=click.IntRange(1), default=100, help="Number of strongest harmonics.")
@@ -198,8 +195,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
 
 
 @options.command(
-    "spectrum velocities/*.h5 --stage lms-y",
-    "spectrum velocities/*.h5 --band 10 400 --format csv",
+    "spectrum velocities/*.h5 --stage lms-y", "spectrum velocities/*.h5 --band 10 400 --format csv"
 )
 @options.LOGS
 @options.stage_option()

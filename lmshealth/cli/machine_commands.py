@@ -1,7 +1,5 @@
 """Commands that continue from tables of estimates: track, infer, prognose."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial

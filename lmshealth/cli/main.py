@@ -1,7 +1,5 @@
 """Command line: the group of all commands, and its exit status."""
 
-from __future__ import annotations
-
 import os
 
 # Matrices are small: threads of the linear algebra library only slow down the worker processes.

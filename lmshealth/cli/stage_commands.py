@@ -1,7 +1,5 @@
 """Commands on stage descriptions: stage, plan."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import click

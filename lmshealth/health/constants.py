@@ -3,8 +3,6 @@
 A parameter is informed above `lmshealth.stage.constants.INFORMED`, which planning shares.
 """
 
-from __future__ import annotations
-
 MAX_EPOCHS = 40
 """Epochs that `infer` takes by default: a trend shows no more detail."""
 

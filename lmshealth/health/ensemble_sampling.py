@@ -37,12 +37,9 @@ class Sample(ReadOnly):
     # Of every ensemble after burn-in, step after step and in a step walker after walker,
     # shape ``(n_ensembles, n_draws, n_dim)``.
     draws: FloatArray
-    # ess_bulk, ess_tail, r_hat, autocorrelation_time: as in `Health`, and steps, the longest
-    # of the ensembles, shape ``(n_dim,)``.
-    ess_bulk: FloatArray
+    ess_bulk: FloatArray  # ess_bulk, ess_tail, r_hat: as in `Health`, shape ``(n_dim,)``
     ess_tail: FloatArray
     r_hat: FloatArray
-    autocorrelation_time: FloatArray
 
     @property
     def flat(self) -> FloatArray:
@@ -125,7 +122,7 @@ def sample_by_importance(
     if not (r_hat < constants.MAX_R_HAT).all():
         raise NotConverged(f"R-hat of importance samplers is {r_hat.max():.3f}", draws)
     sizes = np.full(draws.shape[2], ess)
-    return Sample(draws, sizes, sizes, r_hat, np.full(draws.shape[2], np.nan))
+    return Sample(draws, sizes, sizes, r_hat)
 
 
 def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
@@ -164,7 +161,7 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
     walkers = np.swapaxes(kept, 1, 2)
     ess_bulk = _diagnose("ess", walkers, method="bulk")
     ess_tail = _diagnose("ess", walkers, method="tail", prob=(0.05, 0.95))
-    return Sample(flattened(kept), ess_bulk, ess_tail, r_hat, tau)
+    return Sample(flattened(kept), ess_bulk, ess_tail, r_hat)
 
 
 def flattened(chains: FloatArray) -> FloatArray:

@@ -3,9 +3,8 @@
 README.md has the model. Machines that share a part have one posterior of all parameters.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from scipy.special import chdtrc
@@ -62,9 +61,7 @@ class EpochPosterior:
     machines: tuple[MachineDrifts, ...]
 
     @classmethod
-    def of(
-        cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray
-    ) -> EpochPosterior:
+    def of(cls, stage: Stage, modes: tuple[str, ...], drift: FloatArray, cov: FloatArray) -> Self:
         """Make the posterior of a single machine; see `MachineDrifts`."""
         columns = tuple(range(len(stage.parameters)))
         return cls(stage.prior, (MachineDrifts(stage, modes, drift, cov, columns),))

@@ -1,7 +1,5 @@
 """Adaptive importance sampling of a posterior of few dimensions, with its evidence."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Inference of the health parameters at single epochs from the drifts of the modes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
@@ -255,15 +253,7 @@ class Epoch(ReadOnly):
     converged: bool
     fit: float
     at_edge: BoolArray
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    r_hat: FloatArray
-    laplace_shift: FloatArray
-    laplace_ratio: FloatArray
-    prior_shift: FloatArray
-    prior_ratio: FloatArray
-    judge_shift: FloatArray
-    judge_ratio: FloatArray
+    checks: FloatArray  # in the order of `CHECKS`, ``(n_checks, n_parameters)``
 
 
 def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
@@ -325,7 +315,7 @@ def _infer_epoch(
                 found |= _change("judge", drawn, np.quantile(other, _LEVELS, axis=0))
     converged = bool(np.isfinite(found["r_hat"]).all())
     fit, edge = posterior.fit(x[:: max(x.shape[0] // _N_FIT, 1)]), posterior.at_edge(x)
-    return Epoch(draws=draws, converged=converged, fit=fit, at_edge=edge, **found)
+    return Epoch(draws, converged, fit, edge, np.stack([found[name] for name in CHECKS]))
 
 
 def _change(name: str, drawn: Sample, quantiles: FloatArray) -> dict[str, FloatArray]:
@@ -374,6 +364,7 @@ def _infer_all(
         found: list[Epoch] = list(mapper(_infer_epoch, *columns))  # type: ignore[call-overload]
     stacked = {one.name: np.stack([getattr(e, one.name) for e in found]) for one in fields(Epoch)}
     x, prior = stacked.pop("draws"), tasks[0].prior
+    stacked |= dict(zip(CHECKS, np.swapaxes(stacked.pop("checks"), 0, 1), strict=True))
     variance = prior.variance
     low, high = prior.quantile(np.array([[0.05], [0.95]]))
     flat = x.reshape(len(found), -1, x.shape[-1])

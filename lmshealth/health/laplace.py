@@ -1,7 +1,5 @@
 """Laplace's approximation of a posterior: the sampler's start and an independent check."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 
@@ -72,14 +71,14 @@ class Health:
 
     def __post_init__(self) -> None:
         n, p = len(self.recorded_at), len(self.parameters)
-        expect_shape("chains", self.chains, (n, *self.chains.shape[1:3], p))
-        for name in ("informed", "at_edge", "identifiable", *CHECKS):
-            expect_shape(name, getattr(self, name), (n, p))
-        expect_shape("correlation", self.correlation, (n, p, p))
-        expect_shape("prior_width", self.prior_width, (p,))
-        for name in ("travel", "converged", "fit"):
-            expect_shape(name, getattr(self, name), (n,))
-        freeze(self)
+        freeze(
+            self,
+            ("chains", n, *self.chains.shape[1:3], p),
+            (" ".join(["informed at_edge identifiable", *CHECKS]), n, p),
+            ("correlation", n, p, p),
+            ("prior_width", p),
+            ("travel converged fit", n),
+        )
 
     def relative_to(self, baselines: FloatArray) -> Health:
         """Return the posterior of the parameters divided by their baseline values."""
@@ -104,11 +103,6 @@ class Health:
         """
         valid = bool(self.converged[-1]) and self.explained
         return np.asarray(valid & self.identifiable[-1] & (self.informed[-1] >= INFORMED))
-
-    def informed_parameters(self) -> BoolArray:
-        """Return `publishable_parameters`; deprecated name."""
-        warnings.warn("use Health.publishable_parameters", DeprecationWarning, stacklevel=2)
-        return self.publishable_parameters()
 
     @property
     def explained(self) -> bool:

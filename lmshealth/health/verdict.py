@@ -1,7 +1,5 @@
 """Verdict on a stage: its most probable state at the last epoch."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """Samples of a column: in memory up to a minute of a log, beyond it in a temporary file."""
 
-from __future__ import annotations
-
 import tempfile
 import weakref
 from collections.abc import Callable, Iterator
@@ -63,7 +61,7 @@ class Spool:
     ``send`` is set, in the process that reads for others, blocks go there and are not kept.
     """
 
-    send: ClassVar[Callable[[Spool, np.ndarray], None] | None] = None
+    send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
 
     def __init__(self, expected: int = 0) -> None:
         # Of a column in memory: its first samples, and what is more than expected.

@@ -1,7 +1,5 @@
 """Checks of channels: missing samples, constant value, clipping, linear dependence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 
 import numpy as np

@@ -3,8 +3,6 @@
 A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
 """
 
-from __future__ import annotations
-
 import codecs
 import math
 import re

@@ -4,8 +4,6 @@ They are read as ``constants.NAME``. Lengths of text and counts that only bound 
 hostile files may claim were chosen far above every honest export.
 """
 
-from __future__ import annotations
-
 MAX_MEMORY = 2e9
 """Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS) may
 take: ten minutes of 20 kHz take 0.1 GB per channel. The option ``--max-memory``."""
@@ -96,8 +94,6 @@ LONGEST_ATTRIBUTE = 1 << 16
 """Bytes of a text attribute of HDF5, which stores no larger one in an object header."""
 MOST_COLUMNS = 1000
 """Columns of signals of a file, and those of a MAT matrix that are signals."""
-MOST_KEYS = 10_000
-"""Lines of metadata of a CSV file."""
 MOST_CELLS = 200
 """Columns of a table next to logs, which has a dozen. Each row takes time for all of them."""
 MOST_ROWS = 1_000_000

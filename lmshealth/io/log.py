@@ -1,14 +1,12 @@
 """A log: the samples of one recording of one stage in SI units, its metadata, its refusals."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from datetime import datetime
 from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import expect_shape, freeze
+from lmshealth._arrays import freeze
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
@@ -74,8 +72,7 @@ class Channel:
 
     def __post_init__(self) -> None:
         if isinstance(self.values, np.ndarray):
-            expect_shape("values", self.values, (self.values.size,))
-        freeze(self)
+            freeze(self, ("values", self.values.size))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,7 +1,5 @@
 """Folders of logs: which files are logs, and the rows of their manifests."""
 
-from __future__ import annotations
-
 import os
 import stat
 from collections.abc import Callable, Iterator

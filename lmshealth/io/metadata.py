@@ -1,7 +1,5 @@
 """Metadata of a log: text of the file, the column map and the manifest, converted and checked."""
 
-from __future__ import annotations
-
 import math
 import unicodedata
 from collections.abc import Mapping

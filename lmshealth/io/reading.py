@@ -1,7 +1,5 @@
 """Read one log: from a file of any format to a `Log` in SI units that keeps the log contract."""
 
-from __future__ import annotations
-
 import hashlib
 import stat
 from collections.abc import Mapping, Sequence
@@ -21,14 +19,7 @@ from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
-from lmshealth.io.time_axis import (
-    IntArray,
-    TimeAxis,
-    pieces,
-    resampled,
-    set_velocity,
-    time_axis,
-)
+from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")

@@ -1,7 +1,5 @@
 """Refusals: why a file cannot be used, and text of files made safe to print."""
 
-from __future__ import annotations
-
 import os
 from collections import Counter
 from collections.abc import Iterable

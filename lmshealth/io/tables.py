@@ -4,8 +4,6 @@ A bad row of a table next to logs is refused alone; a bad cell of a table of est
 refuses the table. Both are named by their line.
 """
 
-from __future__ import annotations
-
 import csv
 import io
 from collections.abc import Iterable, Iterator, Sequence
@@ -107,7 +105,7 @@ def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
     return [f"no column stage: all rows are taken for one machine, {path.stem}"]
 
 
-def lines(table: pd.DataFrame, wrong: pd.Series[bool]) -> str:
+def lines(table: pd.DataFrame, wrong: "pd.Series[bool]") -> str:
     """Name the lines of the file that are marked, at most three of them."""
     found = [str(int(i) + 2) for i in table.index[wrong]]
     more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""

@@ -3,8 +3,6 @@
 Samples are never sorted, and never interpolated across a gap (README.md, "Time").
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Accelerations at the modes of a log, and its spectral lines."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import dataclass
 
@@ -31,11 +29,7 @@ def survey(
     """Read accelerations and spectral lines of the accelerometers of a part of a log.
 
     Without a stage a grid of bands is read; ``band`` in Hz restricts modes, grid and lines.
-
-    Raises
-    ------
-    BadLog
-        As `read_magnitudes` does.
+    `BadLog` as `read_magnitudes` does.
     """
     accelerometers = [c for c in log.channels if c.kind == "acceleration"]
     identified: dict[str, float] | None = None

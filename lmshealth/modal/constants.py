@@ -4,8 +4,6 @@ Probabilities of false alarms, margins of evidence, limits of uncertainty and bo
 Numerical tolerances, step sizes and iteration counts are next to the code that uses them.
 """
 
-from __future__ import annotations
-
 # Every method
 
 # Usable share of the sample rate: anti-alias filters reach below the Nyquist frequency.

@@ -5,8 +5,6 @@ likelihood holds all channels, fitted cluster by cluster (`fit_cluster`). The tw
 where the start values come from, how modes are named and what happens to modes that are too close.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -195,10 +193,7 @@ def read_ambient(
 
 
 def _with_undescribed(
-    log: Log,
-    described: AmbientReading,
-    known: Sequence[Target],
-    targets: tuple[Target, ...],
+    log: Log, described: AmbientReading, known: Sequence[Target], targets: tuple[Target, ...]
 ) -> AmbientReading:
     """Search for all resonances near described modes, and name them together."""
     bands = [(*target.band(BAND_HALF_WIDTH), target.search) for target in targets]

@@ -6,15 +6,13 @@ noise and of the other modes by the fit. Without other modes it is the first sin
 peak, as in frequency domain decomposition.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import eigh
 
-from lmshealth._arrays import ComplexArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.modes import Modes
@@ -25,24 +23,16 @@ _LEAST_ORDINATES, _ROUNDS = 3, 2
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ModeShapes:
-    """Complex shapes of the modes of a log, of accelerations (see `Modes.shapes`).
+    """Complex shapes of the modes of a log, of accelerations (see `Modes.shapes`)."""
 
-    Attributes
-    ----------
-    names, channels : tuple of str
-        Of the modes, and of the channels.
-    shapes : ndarray
-        Scaled so that the largest component is 1, shape ``(n_modes, n_channels)``; NaN in channels
-        that do not show the mode.
-    """
-
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the modes
     channels: tuple[str, ...]
+    # Scaled so that the largest component is 1, shape ``(n_modes, n_channels)``; NaN in channels
+    # that do not show the mode.
     shapes: ComplexArray
 
     def __post_init__(self) -> None:
-        expect_shape("shapes", self.shapes, (len(self.names), len(self.channels)))
-        freeze(self)
+        freeze(self, ("shapes", len(self.names), len(self.channels)))
 
     @property
     def complexity(self) -> FloatArray:

@@ -3,17 +3,15 @@
 Arrays are read-only; NaN marks a missing value. Units are SI.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.io.log import Refusal
 from lmshealth.signal.spectral_lines import Line
 
@@ -32,61 +30,32 @@ class Rejection(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Modes:
-    """Modal estimates of one log with their joint covariance.
+    """Modal estimates of one log with their joint covariance; arrays of shape ``(n_modes,)``."""
 
-    Attributes
-    ----------
-    names : tuple of str
-        Mode names, unique per source; empty where there is none.
-    sources : tuple of str
-        ``acc``, ``delta_e``, ``frf`` or ``joint`` per mode.
-    channels : tuple of str
-        Channel that shows each mode most clearly.
-    ln_frequency : ndarray
-        Natural logarithm of the natural frequency in Hz, shape ``(n_modes,)``.
-    ln_damping : ndarray
-        Natural logarithm of the damping ratio, shape ``(n_modes,)``.
-    cov : ndarray
-        Covariance of ``[ln_frequency, ln_damping]``, shape ``(2 n_modes, 2 n_modes)``.
-    snr : ndarray
-        Modal signal-to-noise ratio S / (4 ζ² S_e), shape ``(n_modes,)``.
-    dispersion : ndarray
-        Variance of the residual near each mode over that of noise: about one where the model
-        fits; NaN where it was not measured. Shape ``(n_modes,)``.
-    flags : tuple of str
-        Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
-        half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
-        ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes),
-        ``unsteady`` (the intensity of its excitation varies), ``doubtful-name`` (may be another
-        mode).
-    shape_channels : tuple of str
-        Channels of the shapes; empty where shapes were not identified.
-    shapes : ndarray
-        Acceleration of each channel in each mode (of a following error its second derivative),
-        shape ``(n_modes, n_shape_channels)``; unit Euclidean norm, largest component positive,
-        NaN in channels that do not show the mode.
-    lines : tuple of Line
-        Spectral lines excluded from the likelihood.
-    refused : tuple of Refusal
-        Modes that were sought and are not published, with the reason.
-    excitation : ndarray
-        Root mean square acceleration of the mode in m/s², over time, as a norm over the channels;
-        NaN (the default) where it was not measured. Shape ``(n_modes,)``.
-    """
-
-    names: tuple[str, ...]
-    sources: tuple[str, ...]
-    channels: tuple[str, ...]
-    ln_frequency: FloatArray
-    ln_damping: FloatArray
-    cov: FloatArray
-    snr: FloatArray
+    names: tuple[str, ...]  # unique per source; empty where there is none
+    sources: tuple[str, ...]  # ``acc``, ``delta_e``, ``frf`` or ``joint`` per mode
+    channels: tuple[str, ...]  # that show each mode most clearly
+    ln_frequency: FloatArray  # natural logarithm of the natural frequency in Hz
+    ln_damping: FloatArray  # natural logarithm of the damping ratio
+    cov: FloatArray  # of ``[ln_frequency, ln_damping]``, ``(2 n_modes, 2 n_modes)``
+    snr: FloatArray  # modal signal-to-noise ratio S / (4 ζ² S_e)
+    # Variance of the residual near each mode over that of noise: about one where the model fits;
+    # NaN where it was not measured.
     dispersion: FloatArray
+    # Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
+    # half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
+    # ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes), ``unsteady``
+    # (the intensity of its excitation varies), ``doubtful-name`` (may be another mode).
     flags: tuple[str, ...]
-    shape_channels: tuple[str, ...]
+    shape_channels: tuple[str, ...]  # of the shapes; empty where shapes were not identified
+    # Acceleration of each channel in each mode (of a following error its second derivative),
+    # ``(n_modes, n_shape_channels)``; unit Euclidean norm, largest component positive, NaN in
+    # channels that do not show the mode.
     shapes: FloatArray
-    lines: tuple[Line, ...]
-    refused: tuple[Refusal, ...]
+    lines: tuple[Line, ...]  # excluded from the likelihood
+    refused: tuple[Refusal, ...]  # modes that were sought and are not published, with the reason
+    # Root mean square acceleration of the mode in m/s², over time, as a norm over the channels;
+    # NaN (the default) where it was not measured.
     excitation: FloatArray = None  # type: ignore[assignment]
 
     def __post_init__(self) -> None:
@@ -96,11 +65,8 @@ class Modes:
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")
-        for name in _ARRAYS:
-            expect_shape(name, getattr(self, name), (n,))
-        expect_shape("cov", self.cov, (2 * n, 2 * n))
-        expect_shape("shapes", self.shapes, (n, len(self.shape_channels)))
-        freeze(self)
+        shapes = "shapes", n, len(self.shape_channels)
+        freeze(self, (" ".join(_ARRAYS), n), ("cov", 2 * n, 2 * n), shapes)
 
     @property
     def estimate(self) -> FloatArray:
@@ -137,7 +103,7 @@ class Modes:
         index = np.arange(n)
         return np.asarray(self.cov[index, index + n] / (std[:n] * std[n:]))
 
-    def select(self, index: Sequence[int]) -> Modes:
+    def select(self, index: Sequence[int]) -> Self:
         """Return some modes, in the order of ``index``; the others are marginalised."""
         both = paired(index, len(self.names))
         rows = both[: len(index)]

@@ -5,8 +5,6 @@ keeps the order of frequencies (`assign`). Frequency responses name only modes t
 or name competes for (`name_response`): tracking assigns the rest.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -150,18 +148,9 @@ def name_together(
     Estimates of described modes remain where nothing more was found in their band; the others are
     biased by what their fit lacks, and replaced by those of the search.
 
-    Parameters
-    ----------
-    found : Modes
-        By a search without a description.
-    described : Modes
-        By the fit of described modes only; returned if the search found no more.
-    known : sequence of Target
-        The resonances of that fit, published or not.
-    targets : sequence of Target
-        The described modes, ascending in frequency.
-    log : str
-        Name of the log.
+    ``found`` is of a search without a description, ``described`` of the fit of described modes
+    only, which is returned if the search found no more; ``known`` are the resonances of that fit,
+    published or not, ``targets`` the described modes, ascending in frequency.
     """
     near = [any(is_near(target, f) for target in targets) for f in found.frequency.tolist()]
     found = found.select(np.flatnonzero(near).tolist())

@@ -1,7 +1,5 @@
 """Spectra of a log in bins, with what the fit of its modes expects there, for figures."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -9,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from lmshealth._arrays import ComplexArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.modes import Modes
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum
@@ -44,10 +42,7 @@ class SpectraSummary:
 
     def __post_init__(self) -> None:
         n, bins = len(self.channels), self.count.size
-        expect_shape("level", self.level, (n, bins))
-        expect_shape("fitted", self.fitted, (n, bins))
-        expect_shape("singular", self.singular, (len(self.singular), bins))
-        freeze(self)
+        freeze(self, ("level fitted", n, bins), ("singular", len(self.singular), bins))
 
     @property
     def edges(self) -> FloatArray:

@@ -1,7 +1,5 @@
 """Channels and modes that an identification uses."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -39,12 +37,8 @@ class Target:
 def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Channel, ...]:
     """Return the displacement and acceleration channels, by default all, sorted by name.
 
-    The order of the channels in a log has no effect on results, not even on rounding.
-
-    Raises
-    ------
-    BadLog
-        If a name is no such channel, or none is left.
+    The order of the channels in a log has no effect on results, not even on rounding. `BadLog` if
+    a name is no such channel, or none is left.
     """
     usable = tuple(c for c in log.channels if c.kind in ("displacement", "acceleration"))
     if names is not None:
@@ -76,13 +70,7 @@ def limit_channels(log: Log, names: Sequence[str] | None = None) -> Log:
 
 
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
-    """Return the modes of a description in a band in Hz, ascending in frequency.
-
-    Raises
-    ------
-    BadStage
-        If no mode is left.
-    """
+    """Return the modes of a description in a band in Hz, ascending; `BadStage` if none is left."""
     low, high = band or (0.0, np.inf)
     targets = tuple(
         Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search, shape=mode.shape)

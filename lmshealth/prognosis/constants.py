@@ -1,7 +1,5 @@
 """Constants that decide which remaining life and which service date are published."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmshealth.stage.priors import Lognormal, Normal

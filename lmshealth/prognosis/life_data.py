@@ -1,9 +1,8 @@
 """Data of a life: ln frequencies of the informative modes since the baseline, condensed."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
+from typing import Self
 
 import numpy as np
 
@@ -36,7 +35,7 @@ class LifeData(ReadOnly):
     y: FloatArray
 
     @classmethod
-    def select(cls, history: History, stage: Stage) -> LifeData:
+    def select(cls, history: History, stage: Stage) -> Self:
         """Select the data of a life; raise `NotEnoughData` as `fit_life` describes it."""
         history = condense(history, constants.MAX_LOGS)
         if not history.has_odometer:

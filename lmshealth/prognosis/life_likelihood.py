@@ -5,10 +5,9 @@ README.md has the model. Four values follow one from the other: `LifeData` (sele
 logs), and `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
+from typing import Self
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
@@ -45,7 +44,7 @@ class LifeCovariance(ReadOnly):
     deviation: FloatArray
 
     @classmethod
-    def of(cls, data: LifeData) -> LifeCovariance:
+    def of(cls, data: LifeData) -> Self:
         """Compute the parts from data."""
         history, clock = data.history, data.clock
         n_logs, n_series = clock.size, len(data.columns)
@@ -104,7 +103,7 @@ class NodeBasis(ReadOnly):
     moments: FloatArray
 
     @classmethod
-    def of(cls, data: LifeData) -> NodeBasis:
+    def of(cls, data: LifeData) -> Self:
         """Choose the nodes by a pivoted QR decomposition of the drifts of lives of the prior."""
         rng, examples, n_logs = np.random.default_rng(0), [], data.clock.size
         for scenario in data.scenarios:
@@ -146,7 +145,7 @@ class Grid(Rows):
     log_weight: FloatArray
 
     @classmethod
-    def of(cls, data: LifeData, covariance: LifeCovariance, basis: NodeBasis) -> Grid:
+    def of(cls, data: LifeData, covariance: LifeCovariance, basis: NodeBasis) -> Self:
         """Whiten data at all points of the grid."""
         points, prior = [], scatter_prior(data.stage)
         for (walk, p), (scale, q), (deviation, r) in product(
@@ -179,7 +178,7 @@ class LifeLikelihood:
     grid: Grid
 
     @classmethod
-    def of(cls, history: History, stage: Stage) -> LifeLikelihood:
+    def of(cls, history: History, stage: Stage) -> Self:
         """Make the likelihood of a history; raises what `LifeData.select` raises."""
         data = LifeData.select(history, stage)
         covariance, basis = LifeCovariance.of(data), NodeBasis.of(data)

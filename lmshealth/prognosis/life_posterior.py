@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
@@ -12,7 +11,7 @@ import pandas as pd
 from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import FloatArray, ReadOnly, expect_shape, freeze
+from lmshealth._arrays import FloatArray, ReadOnly, freeze
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin
 from lmshealth.health.importance_sampling import (
@@ -138,16 +137,7 @@ class ScenarioPosterior:
 
     def __post_init__(self) -> None:
         n = self.scenario.n_dim
-        expect_shape("coordinates", self.coordinates, (*self.coordinates.shape[:2], n))
-        for name in _CHECKS:
-            expect_shape(name, getattr(self, name), (n,))
-        freeze(self)
-
-    @property
-    def informed(self) -> FloatArray:
-        """`interval_shrinkage`; deprecated name."""
-        warnings.warn("use interval_shrinkage", DeprecationWarning, stacklevel=2)
-        return self.interval_shrinkage
+        freeze(self, ("coordinates", *self.coordinates.shape[:2], n), (" ".join(_CHECKS), n))
 
     @property
     def scenario(self) -> Scenario:
@@ -208,11 +198,9 @@ class LifePosterior:
 
     def __post_init__(self) -> None:
         shape, p = self.health.shape, len(self.parameters)
-        for name in ("health", "off", "rate"):
-            expect_shape(name, getattr(self, name), (*shape[:2], p))
+        freeze(self, ("health off rate", *shape[:2], p))
         if sum(one.n_mixture_draws for one in self.scenarios) != shape[1]:
             raise ValueError("the draws of the scenarios do not add up to those of health")
-        freeze(self)
 
     def by_scenario(self) -> Iterator[tuple[ScenarioPosterior, FloatArray, FloatArray]]:
         """Yield each scenario with `off` and `rate` of its draws, ``(n, n_parameters)``."""
@@ -494,7 +482,7 @@ def _sampled_scenarios(
         else:
             y = weighted.resampled(np.random.default_rng(seeds[k]), _N_ENSEMBLES * n_kept)
             ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
-            draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown, unknown)
+            draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown)
         coordinates = thin(draws.draws, n_kept)
         one = ScenarioPosterior(
             density=density,

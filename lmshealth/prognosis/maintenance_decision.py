@@ -1,7 +1,5 @@
 """Service date: last day of an accepted risk, or the day of least long-run costs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import date, datetime, time, timedelta
 from typing import Literal

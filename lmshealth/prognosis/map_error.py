@@ -1,7 +1,5 @@
 """Errors of the modal map that a life shows: modes that disagree with the others."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

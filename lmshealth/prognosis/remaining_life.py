@@ -1,7 +1,5 @@
 """Remaining useful life: first passage of the limits, usage, and life curves."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -97,7 +95,7 @@ def prognose_with_posterior(
     horizon = stage.description.usage.horizon_km * _KM
     since = float(history.travel[-1] - history.travel[history.baseline])
     of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds[:3])
-    remaining, half = _passages(life, limited, of_passage, now=since, horizon=horizon)
+    remaining, half = passages(life, limited, of_passage, now=since, horizon=horizon)
     usage = _usage(history, stage, of_usage, remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
     columns = [j for j, _ in limited]
@@ -134,23 +132,7 @@ def prognose_with_posterior(
     return found, life
 
 
-def remaining_travel(
-    life: LifePosterior,
-    limited: Sequence[tuple[int, ParameterSpec]],
-    rng: np.random.Generator,
-    *,
-    now: float,
-    horizon: float,
-) -> FloatArray:
-    """Draw the travel in m left to each limit, and to the first of them.
-
-    For parameters with a limit, and their indices; `now` is the travel in m since the baseline, and
-    the horizon is in m from now. Shape ``(n_draws, n_limits + 1)``, in the order of the draws.
-    """
-    return _passages(life, limited, rng, now=now, horizon=horizon)[0]
-
-
-def _passages(
+def passages(
     life: LifePosterior,
     limited: Sequence[tuple[int, ParameterSpec]],
     rng: np.random.Generator,
@@ -158,7 +140,12 @@ def _passages(
     now: float,
     horizon: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the result of `remaining_travel`, and `half` of `Prognosis`."""
+    """Draw the travel in m left to each limit, and to the first of them; and `half` of `Prognosis`.
+
+    For parameters with a limit, and their indices; `now` is the travel in m since the baseline, and
+    the horizon is in m from now. Shapes ``(n_draws, n_limits + 1)`` and ``(n_draws,)``, in the
+    order of the draws.
+    """
     parts = []
     for one, off, rate in life.by_scenario():
         theta = one.scenario.split(one.scenario.natural(one.mixture_draws))
@@ -246,14 +233,9 @@ def first_passage(
     in m, shape ``(n,)``, is negative, by the law, if the limit has been passed, and infinite if it
     is never reached or, with deviation, not before the horizon.
 
-    Parameters
-    ----------
-    path, theta : DegradationPath, ndarray
-        Degradation of the parameter, with natural parameters of shape ``(n, k)``.
-    off, rate : ndarray
-        Deviation of ln health from its law now, and its variance per m, shape ``(n,)``.
-    now, limit, horizon : float
-        Travel in m since the baseline, limit as a fraction of it, and m from now to the horizon.
+    ``theta`` are natural parameters, ``(n, k)``; ``off`` and ``rate`` the deviation of ln health
+    from its law now and its variance per m, ``(n,)``; ``now`` the travel in m since the baseline,
+    ``limit`` a fraction of it, ``horizon`` in m from now.
     """
     left = path.passage(theta, limit * np.exp(-off)) - now
     # A law that gains may have been below the limit before, and is above it now.

@@ -1,13 +1,11 @@
 """Result of the prognosis: remaining useful life with its uncertainty."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,14 +73,15 @@ class Prognosis:
     modes_off: tuple[ModeError, ...] = ()
 
     def __post_init__(self) -> None:
-        n = len(self.parameters)
-        expect_shape("limits", self.limits, (n,))
-        expect_shape("remaining", self.remaining, (self.remaining.shape[0], n))
-        for name in ("usage", "half"):
-            expect_shape(name, getattr(self, name), (self.remaining.shape[0],))
-        expect_shape("health", self.health, (self.health.shape[0], n - 1))
-        expect_shape("curve_quantiles", self.curve_quantiles, (5, self.curve_travel.size, n - 1))
-        freeze(self)
+        n, n_draws = len(self.parameters), self.remaining.shape[0]
+        freeze(
+            self,
+            ("limits", n),
+            ("remaining", n_draws, n),
+            ("usage half", n_draws),
+            ("health", self.health.shape[0], n - 1),
+            ("curve_quantiles", 5, self.curve_travel.size, n - 1),
+        )
 
     def censored(self) -> FloatArray:
         """Return `remaining` with infinity beyond the horizon."""

@@ -1,7 +1,5 @@
 """Results of one machine (`Assessment`), and their summary in a few numbers (`Summary`)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from datetime import date, datetime

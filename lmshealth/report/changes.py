@@ -1,7 +1,5 @@
 """Changes of a machine from one report to the next."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from datetime import date
 

@@ -1,7 +1,5 @@
 """Constants that decide what pages, tables and terminals publish."""
 
-from __future__ import annotations
-
 # --- Quantile levels ---
 # Levels of a published interval: 90 % credible interval and median.
 LEVELS = (0.05, 0.5, 0.95)

@@ -1,7 +1,5 @@
 """Fleet page ``index.html``: all machines, most urgent first, from their summaries."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 from base64 import b64encode

@@ -229,13 +229,7 @@ def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
 
 
 def settling_spectra(log: Log, channels: Sequence[str] | None) -> LogSpectra:
-    """Return the spectra of the free decays after moves, as `identify_decays` uses them.
-
-    Raises
-    ------
-    BadLog
-        If there is none.
-    """
+    """Return the spectra of free decays, as `identify_decays` uses them; `BadLog` without any."""
     used = choose_channels(log, channels)
     segments = select_segments(log, "settling")
     if not segments:

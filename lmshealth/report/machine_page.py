@@ -3,8 +3,6 @@
 This module collects results and figures; wording and markup are in ``templates/``.
 """
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence

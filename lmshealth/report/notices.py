@@ -1,7 +1,5 @@
 """Notices: what was noticed about a machine that its reader must take into account."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Rendering: templates to HTML pages (Jinja2, everything escaped), pages to PDF (WeasyPrint)."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from datetime import datetime
@@ -57,12 +55,8 @@ class PdfError(LmshealthError):
 def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     """Write a PDF next to each page, under the same name.
 
-    The bytes are reproducible, and nothing is loaded from the network or other files.
-
-    Raises
-    ------
-    PdfError
-        If WeasyPrint is missing or cannot lay out a page.
+    The bytes are reproducible, and nothing is loaded from the network or other files. `PdfError` if
+    WeasyPrint is missing or cannot lay out a page.
     """
     html, fetcher = _library()
     templates = resources.files("lmshealth") / "report" / "templates"

@@ -1,7 +1,5 @@
 """Tables of a run and of single logs, with the columns of the public contract (units in names)."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, astuple
 from datetime import date, datetime

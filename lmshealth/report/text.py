@@ -1,7 +1,5 @@
 """Formats of numbers and names; pages, terminals and figures share them."""
 
-from __future__ import annotations
-
 from datetime import datetime
 from typing import Any, get_args
 

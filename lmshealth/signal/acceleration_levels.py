@@ -1,7 +1,5 @@
 """Acceleration levels of bands, and their growth with velocity (README.md, "Levels")."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

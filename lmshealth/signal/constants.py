@@ -1,7 +1,5 @@
 """Constants that decide which samples, lines and levels are used and published."""
 
-from __future__ import annotations
-
 # --- Segments -----------------------------------------------------------------------------------
 # Change of the set velocity over 1 ms, as a share of its maximum, up to which it is constant.
 VELOCITY_TOLERANCE = 1e-3

@@ -1,7 +1,5 @@
 """Following error: statistics and harmonics, and its RMS in the band of the control loop."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Harmonics of a record: calibrated amplitudes and phases (README.md, "Harmonics")."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

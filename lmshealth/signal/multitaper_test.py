@@ -1,11 +1,10 @@
 """Thomson's multitaper test for sinusoids in noise and resonances (README.md, "Line test")."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import pairwise
+from typing import Self
 
 import numpy as np
 from scipy import fft
@@ -38,22 +37,12 @@ def detect_sinusoids(
 ) -> FloatArray:
     """Detect the sinusoids that several segments have in common [Thomson1982], [Riedel1995].
 
-    Parameters
-    ----------
-    lengths : sequence of int
-        Samples of each segment; those less than half as long as the longest are omitted.
-    read : callable
-        Returns the samples of a segment by its number, shape ``(n,)``.
-    sample_rate, band : float, (float, float)
-        In Hz; the first and last four ordinates cannot be tested.
-    false_alarm : float
-        Probability that segments without lines show any in the band, shared by all frequencies;
-        valid in white and coloured noise, and in resolved resonances of damping 0.2 % or more.
-
-    Returns
-    -------
-    ndarray
-        Frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
+    Lengths are the samples of each segment; those less than half as long as the longest are
+    omitted. ``read`` returns the samples of a segment by its number, shape ``(n,)``. Sample rate
+    and band are in Hz; the first and last four ordinates cannot be tested. ``false_alarm`` is the
+    probability that segments without lines show any in the band, shared by all frequencies; it is
+    valid in white and coloured noise, and in resolved resonances of damping 0.2 % or more. The
+    result is frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
     """
     low, high = band
     cuts = _octaves(max(low, high / 2**_MOST_OCTAVES), high)
@@ -261,7 +250,7 @@ class _LineFit:
     ratio: FloatArray
 
     @classmethod
-    def fit(cls, window: ComplexArray, ordinate: float) -> _LineFit:
+    def fit(cls, window: ComplexArray, ordinate: float) -> Self:
         """Fit the sine of a frequency in ordinates."""
         carrier = np.exp(-2j * np.pi * ordinate * np.arange(_WINDOW) / _WINDOW)
         weight = _tapers().sum(axis=1)

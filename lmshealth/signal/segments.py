@@ -1,7 +1,5 @@
 """Segments of a log: gap-free parts of one motion phase (README.md, "Segments")."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise

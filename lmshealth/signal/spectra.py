@@ -1,10 +1,8 @@
 """Periodograms and cross spectra of segments, as acceleration (README.md, "Spectra")."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from scipy import fft
@@ -49,7 +47,7 @@ class Spectrum:
         """Total duration of its segments in s."""
         return self.count * self.duration
 
-    def band(self, low: float, high: float) -> Spectrum:
+    def band(self, low: float, high: float) -> Self:
         """Return the ordinates from low to high Hz."""
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
@@ -110,7 +108,7 @@ class CrossSpectrum:
         """Total duration of its segments in s."""
         return self.count * self.duration
 
-    def band(self, low: float, high: float) -> CrossSpectrum:
+    def band(self, low: float, high: float) -> Self:
         """Return the ordinates from low to high Hz."""
         first, last = np.searchsorted(self.frequency, [low, high])
         cut = slice(int(first), int(last))
@@ -124,11 +122,11 @@ class CrossSpectrum:
             transforms=None if self.transforms is None else self.transforms[:, cut],
         )
 
-    def without(self, lines: Sequence[float]) -> CrossSpectrum:
+    def without(self, lines: Sequence[float]) -> Self:
         """Mask the ordinates of lines at these frequencies in Hz."""
         return replace(self, free=self.free & self.channel(0).clear_of(lines))
 
-    def with_foreign(self, added: ComplexArray) -> CrossSpectrum:
+    def with_foreign(self, added: ComplexArray) -> Self:
         """Add an expectation that is of the shape of ``matrix``."""
         return replace(self, foreign=added if self.foreign is None else self.foreign + added)
 
@@ -164,12 +162,12 @@ class LogSpectra:
         """Channel, frequency in Hz and amplitude in m/s² of lines subtracted from the samples."""
         return [(self.channels[c], f, a) for s in self.spectra for c, f, a in s.lines]
 
-    def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> LogSpectra:
+    def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> Self:
         """Add an expectation that is a function of the frequency in Hz."""
         spectra = tuple(s.with_foreign(expected(s.frequency)) for s in self.spectra)
         return replace(self, spectra=spectra)
 
-    def select(self, kept: Sequence[int]) -> LogSpectra:
+    def select(self, kept: Sequence[int]) -> Self:
         """Return some of the channels."""
         rows, columns = np.ix_(kept, kept)
         spectra = tuple(
@@ -182,16 +180,16 @@ class LogSpectra:
             )
             for s in self.spectra
         )
-        channels = tuple(self.channels[c] for c in kept)
-        return LogSpectra(channels, tuple(self.sources[c] for c in kept), spectra)
+        channels, sources = (tuple(x[c] for c in kept) for x in (self.channels, self.sources))
+        return replace(self, channels=channels, sources=sources, spectra=spectra)
 
-    def without_band(self, low: float, high: float) -> LogSpectra:
+    def without_band(self, low: float, high: float) -> Self:
         """Exclude the ordinates from low to high Hz."""
         outside = [(s.frequency < low) | (s.frequency > high) for s in self.spectra]
         pairs = zip(self.spectra, outside, strict=True)
         return replace(self, spectra=tuple(replace(s, free=s.free & own) for s, own in pairs))
 
-    def without(self, frequencies: Sequence[float]) -> LogSpectra:
+    def without(self, frequencies: Sequence[float]) -> Self:
         """Exclude the ordinates that lines at these frequencies in Hz may reach."""
         return replace(self, spectra=tuple(s.without(frequencies) for s in self.spectra))
 
@@ -232,16 +230,8 @@ def cross_spectra(
     Parts of one length and set velocity have the same expectation: their mean is a sufficient
     statistic. Short moves stay separate, so that a line is masked in each at its own frequency.
 
-    Parameters
-    ----------
-    channels : sequence of Channel
-        Displacements or accelerations.
-    segments : sequence of Segment
-        Which samples.
-    sample_rate, top, ceiling : float
-        In Hz, as in `periodogram`.
-    resonances : sequence of ResonanceRange
-        Possible resonances: where a segment does not resolve them no sinusoid is removed.
+    Channels are displacements or accelerations; sample rate, top and ceiling are in Hz, as in
+    `periodogram`. Where a segment does not resolve possible resonances no sinusoid is removed.
     """
 
     def transformed(part: Segment) -> CrossSpectrum:
@@ -354,17 +344,8 @@ def periodogram(
     Mean and linear trend are removed. Of a displacement the second difference is transformed,
     over a lag that the top of the band permits, so that neither its large slow part nor its
     amplified fast noise leaks into the band. Ordinates reach from the first Fourier frequency to
-    below Nyquist, the ceiling, and for a displacement four times ``top``.
-
-    Parameters
-    ----------
-    channel, segment : Channel, Segment
-        Displacement or acceleration, and which samples of it.
-    sample_rate, ceiling : float
-        In Hz.
-    top : float
-        Highest frequency of interest in Hz, which sets the lag; by default Nyquist, at the price
-        of leakage.
+    below Nyquist, the ceiling, and for a displacement four times ``top``, all in Hz. ``top`` is the
+    highest frequency of interest, which sets the lag; by default Nyquist, at the price of leakage.
     """
     x, lag = as_acceleration(channel, segment, sample_rate, top)
     if lag:

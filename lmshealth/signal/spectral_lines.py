@@ -1,7 +1,5 @@
 """Spectral lines: detection, and naming by their sources (README.md, "Lines")."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Removal of strong sinusoids from the transforms of a segment (README.md, "Tone removal")."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np
@@ -42,20 +40,11 @@ def remove_sinusoids(
 ) -> tuple[ComplexArray, BoolArray, tuple[Sinusoid, ...]]:
     """Remove the strong sinusoids of a segment from its transforms.
 
-    Parameters
-    ----------
-    transforms : ndarray
-        Of all channels at consecutive Fourier frequencies, shape ``(n_ordinates, n_channels)``.
-    duration : float
-        Of the segment in s.
-    protected : ndarray of bool
-        Ordinates of possible resonances as narrow as a sinusoid, shape ``(n_ordinates,)``.
-
-    Returns
-    -------
-    rest, free, sinusoids : ndarray, ndarray of bool, tuple of Sinusoid
-        Transforms without them (at their ordinates noise is removed as well), and the ordinates
-        without a sinusoid, shape ``(n_ordinates,)``.
+    Transforms are of all channels at consecutive Fourier frequencies, ``(n_ordinates,
+    n_channels)``; the duration of the segment is in s; ``protected`` are ordinates of possible
+    resonances as narrow as a sinusoid, ``(n_ordinates,)``. The result is the transforms without
+    sinusoids (at their ordinates noise is removed as well), the ordinates without a sinusoid,
+    ``(n_ordinates,)``, and the sinusoids.
     """
     free = np.ones(len(transforms), dtype=bool)
     if len(transforms) < 3 * _FAR:

@@ -1,7 +1,5 @@
 """Waterfall of a life: relative spectra of all logs in the band of the tracked modes."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Self
@@ -9,7 +7,7 @@ from typing import Self
 import numpy as np
 from scipy import fft
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.io.log import Log
 from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment, find_segments
@@ -34,8 +32,7 @@ class RelativeSpectrum:
     level: FloatArray
 
     def __post_init__(self) -> None:
-        expect_shape("level", self.level, (self.level.size,))
-        freeze(self)
+        freeze(self, ("level", self.level.size))
 
     @property
     def edges(self) -> FloatArray:
@@ -56,8 +53,7 @@ class Waterfall:
     lines: tuple[tuple[Line, ...], ...]
 
     def __post_init__(self) -> None:
-        expect_shape("level", self.level, (len(self.lines), self.edges.size - 1))
-        freeze(self)
+        freeze(self, ("level", len(self.lines), self.edges.size - 1))
 
     @classmethod
     def stack(cls, logs: Sequence[tuple[RelativeSpectrum | None, Sequence[Line]]]) -> Self | None:

@@ -3,8 +3,6 @@
 `check_stage` computes the numbers, `diagnose` states what they mean (README.md, "Check").
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations

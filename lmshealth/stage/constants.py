@@ -1,7 +1,5 @@
 """Constants that decide what is accepted and published of a stage description."""
 
-from __future__ import annotations
-
 # --- Health parameters -------------------------------------------------------------------------
 # Least share of the prior variance of a ln parameter that the data must remove before its value is
 # published: from a half on the data contribute more than the prior.

@@ -1,7 +1,5 @@
 """Cramér-Rao bound of one mode identified from ambient accelerations in noise."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lmshealth._arrays import FloatArray
@@ -26,15 +24,9 @@ def ambient_bound(
     further channels inform about the noise, and about the mode only by the sum of their SNR. See
     [Au2014].
 
-    Parameters
-    ----------
-    frequency, damping_ratio, snr : float
-        Natural frequency in Hz, damping ratio, and modal signal-to-noise ratio S / (4 ζ² S_e),
-        summed over the channels.
-    duration : float
-        Of the record in s. For n records of one length divide the result by n.
-    band, n_channels : (float, float), int
-        Band in Hz in which the noise is white with an unknown level, and channels with that noise.
+    The natural frequency is in Hz, the modal signal-to-noise ratio S / (4 ζ² S_e) summed over the
+    channels, the duration of the record in s: for n records of one length divide the result by n.
+    In the band (Hz) the noise is white, with one unknown level in all channels.
     """
     f = fourier_frequencies(duration, band)
     beta2 = (frequency / f) ** 2

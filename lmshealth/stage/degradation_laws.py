@@ -1,7 +1,5 @@
 """Laws by which a health parameter degrades with travel (README.md, "Degradation laws")."""
 
-from __future__ import annotations
-
 from typing import Annotated, ClassVar
 
 import msgspec

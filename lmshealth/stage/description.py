@@ -1,7 +1,5 @@
 """Stage descriptions: schema, loading and checks of the TOML file (README.md is its reference)."""
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from dataclasses import dataclass

@@ -1,10 +1,9 @@
 """Identifiability of health parameters by the tracked modes (README.md, "Identifiability")."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 
@@ -49,7 +48,7 @@ class Identifiability:
         """Bound the variance of the drifts by unlimited logs, shape ``(n_modes,)``."""
         return self.drift_variance(constants.LONGEST_LOG, constants.MOST_LOGS, constants.MOST_LOGS)
 
-    def restricted_to(self, modes: Sequence[str]) -> Identifiability:
+    def restricted_to(self, modes: Sequence[str]) -> Self:
         """Return the identifiability by some of the modes only."""
         rows = [k for k, mode in enumerate(self.modes) if mode.name in modes]
         kept = tuple(self.modes[k] for k in rows)

@@ -1,7 +1,5 @@
 """Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import reduce
 from io import BytesIO

@@ -1,7 +1,5 @@
 """Duration and number of logs that detect a loss of health (README.md, "Planning")."""
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass

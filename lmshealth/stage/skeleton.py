@@ -1,7 +1,5 @@
 """Skeleton of a stage description, from modes that were identified without one."""
 
-from __future__ import annotations
-
 import glob
 import json
 from collections.abc import Sequence

@@ -5,8 +5,6 @@ by their log Bayes factors, as the README of this folder describes; changes that
 only reduce the probability of a false alarm.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache

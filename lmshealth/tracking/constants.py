@@ -4,8 +4,6 @@ Frequencies enter as ln f and damping ratios as ln ζ; a "life" is the horizon o
 description, or the length of the history without one. Rates and random walks are per life.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 # --- Alarms and change detection ----------------------------------------------------------------

@@ -1,13 +1,11 @@
 """Effects of temperature, payload and position on the modes, with the estimates that show them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.covariates import Regressor, regressors
 from lmshealth.tracking.history import History
@@ -30,9 +28,7 @@ class CovariateEffect:
     measured: FloatArray
 
     def __post_init__(self) -> None:
-        for name in ("values", "measured"):
-            expect_shape(name, getattr(self, name), self.epochs.shape)
-        freeze(self)
+        freeze(self, ("values measured", *self.epochs.shape))
 
     def explained(self, values: FloatArray) -> FloatArray:
         """Return the change of ln f at values of the covariate, shape of ``values``."""

@@ -1,7 +1,5 @@
 """Covariates of ln f (temperature, payload, position) as regressors of the state space."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
@@ -25,9 +23,7 @@ class Regressor:
 
 
 def regressors(
-    covariates: Mapping[str, FloatArray],
-    stage: Stage | None,
-    recorded_at: Sequence[datetime] = (),
+    covariates: Mapping[str, FloatArray], stage: Stage | None, recorded_at: Sequence[datetime] = ()
 ) -> tuple[Regressor, ...]:
     """Return the regressors of the described covariates that at least one log has.
 

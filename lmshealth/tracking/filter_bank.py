@@ -5,13 +5,12 @@ weighted by its evidence. The sets form two groups: a healthy machine has no rat
 walk, a changing one has a rate. States are immutable: `predict` and `update` return a new bank.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from copy import copy
 from dataclasses import dataclass, replace
 from itertools import product
 from math import prod
+from typing import Self
 
 import numpy as np
 
@@ -98,7 +97,7 @@ class FilterBank(Rows):
     mean: FloatArray  # states, ``(n, size)``
     cov: FloatArray  # their covariances, ``(n, size, size)``
 
-    def padded(self, size: int) -> FilterBank:
+    def padded(self, size: int) -> Self:
         """Return a bank with a longer state, whose new entries are exactly 0."""
         more = size - self.mean.shape[1]
         mean = np.pad(self.mean, ((0, 0), (0, more)))
@@ -124,7 +123,7 @@ class FilterBank(Rows):
         odds = changing - np.logaddexp.reduce(self.log_weight[healthy])
         return float(odds + (np.log(chance) - np.log1p(-chance)))
 
-    def pruned(self) -> FilterBank:
+    def pruned(self) -> Self:
         """Remove filters with a negligible share of their group; both groups stay."""
         group = self.hyperparameters.healthy.astype(int)
         best = np.full(2, -np.inf)
@@ -178,7 +177,7 @@ class FilterModel:
         self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
 
-    def with_step(self, step: Step) -> FilterModel:
+    def with_step(self, step: Step) -> Self:
         """Return the model with one more step."""
         changed = copy(self)
         changed.space = self.space.with_step(step)

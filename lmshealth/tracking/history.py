@@ -1,17 +1,15 @@
 """History: the modal estimates of one machine in order of time, each assigned to its mode."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.modes import Modes
@@ -63,7 +61,7 @@ class Step(ReadOnly):
         return self.kind in ("step", "regreasing", "reset")
 
     @classmethod
-    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Step:
+    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Self:
         """Make a detected step, which applies to all logs from the first on."""
         return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
 
@@ -90,18 +88,14 @@ class History:
 
     def __post_init__(self) -> None:
         n, r = len(self.logs), len(self.series)
-        for name in ("travel", "loop_error"):
-            expect_shape(name, getattr(self, name), (n,))
-        for name in ("ln_frequency", "ln_damping"):
-            expect_shape(name, getattr(self, name), (n, r))
-        expect_shape("cov", self.cov, (n, 2 * r, 2 * r))
+        columns = "ln_frequency ln_damping", n, r
+        freeze(self, ("travel loop_error", n), columns, ("cov", n, 2 * r, 2 * r))
         if not self.baselines or not all(0 <= first < max(n, 1) for first in self.baselines):
             raise ValueError(f"baselines are logs {self.baselines} of {n}")
         if {one.mode for one in self.series} - set(self.modes):
             raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
         self._expect_order()
         self._expect_errors()
-        freeze(self)
 
     def _expect_order(self) -> None:
         """Require moments, and the odometer where there is one, that never decrease."""
@@ -146,7 +140,7 @@ class History:
             ticks = np.array([moment.timestamp() for moment in self.recorded_at])
         return np.asarray(ticks - ticks[self.baseline])
 
-    def first_logs(self, n: int) -> History:
+    def first_logs(self, n: int) -> Self:
         """Return the history as it was after its first n logs."""
         steps = (replace(one, there=one.there[:n]) for one in self.steps if one.first < n)
         return replace(

@@ -1,11 +1,10 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from typing import Self
 
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal
@@ -46,12 +45,11 @@ class Maintenance:
     actions: tuple[Action, ...] = ()  # in the order of time
     unread: tuple[UnreadableRow, ...] = ()  # possible further actions
 
-    def of(self, machine: str) -> Maintenance:
+    def of(self, machine: str) -> Self:
         """Return the part that concerns one machine; rows without a machine concern all."""
-        return Maintenance(
-            tuple(action for action in self.actions if action.stage == machine),
-            tuple(one for one in self.unread if one.stage in (machine, "", None)),
-        )
+        actions = tuple(action for action in self.actions if action.stage == machine)
+        unread = tuple(one for one in self.unread if one.stage in (machine, "", None))
+        return replace(self, actions=actions, unread=unread)
 
 
 NO_MAINTENANCE = Maintenance()

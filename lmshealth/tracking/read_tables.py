@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.metadata import COVARIATES
@@ -51,10 +51,7 @@ class Drifts:
 
     def __post_init__(self) -> None:
         n, m = len(self.recorded_at), len(self.modes)
-        expect_shape("travel", self.travel, (n,))
-        expect_shape("drift", self.drift, (n, m))
-        expect_shape("drift_cov", self.drift_cov, (n, m, m))
-        freeze(self)
+        freeze(self, ("travel", n), ("drift", n, m), ("drift_cov", n, m, m))
 
 
 def read_estimates(

@@ -1,7 +1,5 @@
 """Smoother: the states of all epochs given all logs."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -4,9 +4,8 @@ The state is ``[ℓ, ℓ̇, ln ζ, ℓ₀, w | covariates | biases | steps]``, a
 describes. All but the biases are in blocks of the modes, biases and steps have ln f and ln ζ.
 """
 
-from __future__ import annotations
-
 from copy import copy
+from typing import Self
 
 import numpy as np
 
@@ -52,7 +51,7 @@ class StateSpace:
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
-    def with_step(self, step: Step) -> StateSpace:
+    def with_step(self, step: Step) -> Self:
         """Return the state space with one more step at the end of the state."""
         longer = copy(self)
         longer.steps = (*self.steps, step)

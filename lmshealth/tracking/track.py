@@ -5,8 +5,6 @@ Declared steps are in the model from the start; a detected step is added, and th
 are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
@@ -15,7 +13,7 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
-from lmshealth._arrays import BoolArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
@@ -140,14 +138,14 @@ class Track:
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
-        for name in ("ln_frequency", "ln_frequency_std", "ln_damping", "ln_damping_std", "drift"):
-            expect_shape(name, getattr(self, name), (n, m))
-        expect_shape("drift_cov", self.drift_cov, (n, m, m))
-        expect_shape("noise_scale", self.noise_scale, (n, len(self.sources)))
-        expect_shape("innovations", self.innovations, (n, self.innovations.shape[1]))
-        for name in ("travel", "nis", "nis_dof", "widening"):
-            expect_shape(name, getattr(self, name), (n,))
-        freeze(self)
+        freeze(
+            self,
+            ("ln_frequency ln_frequency_std ln_damping ln_damping_std drift", n, m),
+            ("drift_cov", n, m, m),
+            ("noise_scale", n, len(self.sources)),
+            ("innovations", n, self.innovations.shape[1]),
+            ("travel nis nis_dof widening", n),
+        )
 
     @property
     def alarms(self) -> tuple[Event, ...]:

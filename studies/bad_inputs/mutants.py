@@ -194,8 +194,8 @@ def bad(found: str) -> bool:
 
 def _memory_of_reader() -> int:
     """Return the peak memory in bytes of the process that reads files, if it runs."""
-    process = isolation._reader._process
-    return 0 if process is None else memory_bytes(process=process.popen.pid)
+    process = isolation._reader.process
+    return 0 if process is None else memory_bytes(process=process.pid)
 
 
 _STAGE = logfiles.DESCRIPTION.encode()

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray, expect_shape
+from lmshealth._arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     TransientLikelihood,
@@ -67,8 +67,7 @@ class Vibration:
 
     def __post_init__(self) -> None:
         n_modes = self.frequency.size
-        expect_shape("damping_ratio", self.damping_ratio, (n_modes,))
-        expect_shape("shapes", self.shapes, (len(self.shapes), n_modes))
+        freeze(self, ("damping_ratio", n_modes), ("shapes", len(self.shapes), n_modes))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

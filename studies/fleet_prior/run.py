@@ -41,7 +41,7 @@ from lmshealth.prognosis.fleet_prior import (
     needs_fleet_prior,
 )
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import remaining_travel
+from lmshealth.prognosis.remaining_life import passages
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
@@ -200,7 +200,7 @@ def left(life: LifePosterior, now: float) -> Array:
     """Draw the remaining life, in m."""
     part = [(0, described().parameters[0])]
     rng = np.random.default_rng(SEED)
-    return remaining_travel(life, part, rng, now=now, horizon=horizon())[:, 0]
+    return passages(life, part, rng, now=now, horizon=horizon())[0][:, 0]
 
 
 def scored(draws: Array, truth: float, known: Array, rng: np.random.Generator) -> Row:

@@ -17,7 +17,7 @@ from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_posterior import fit_life
-from lmshealth.prognosis.remaining_life import parameters_with_limit, remaining_travel
+from lmshealth.prognosis.remaining_life import parameters_with_limit, passages
 from lmshealth.prognosis.scenarios import list_scenarios
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
@@ -309,7 +309,7 @@ def life_draws(
     with _noise_as_stated() if noise_known else nullcontext():
         found = fit_life(history, stage, int(rng.integers(2**32)), chains=chains, n_draws=_N_DRAWS)
     now, horizon = history.clock()[-1], 1000 * stage.description.usage.horizon_km
-    left = remaining_travel(found, parameters_with_limit(stage), rng, now=now, horizon=horizon)
+    left, _ = passages(found, parameters_with_limit(stage), rng, now=now, horizon=horizon)
     return found.health.reshape(-1, found.health.shape[-1]), claimed(left, stage)
 
 

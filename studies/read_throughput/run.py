@@ -111,10 +111,10 @@ def timed(name: str, seconds: int, rounds: int) -> Row:
 
 def both_s(work: Callable[[], object]) -> float:
     """Return the processor time of one call in s, with that of the process that reads for it."""
-    process = isolation._reader._process
+    process = isolation._reader.process
     if process is None:
         return cpu_s(work)
-    status = Path(f"/proc/{process.popen.pid}/schedstat")
+    status = Path(f"/proc/{process.pid}/schedstat")
     before = int(status.read_text().split()[0])
     spent = cpu_s(work)
     return spent + 1e-9 * (int(status.read_text().split()[0]) - before)

@@ -14,7 +14,7 @@ from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import (
     identifiable_limits,
     parameters_with_limit,
-    remaining_travel,
+    passages,
 )
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -67,7 +67,7 @@ def futures(life: LifePosterior, history: History, stage: Stage, seed: list[int]
     limits, rng = identifiable_limits(stage, life.modes), np.random.default_rng(seed)
     horizon = stage.description.usage.horizon_km * _KM
     now = _since_baseline(history)
-    return remaining_travel(life, limits, rng, now=now, horizon=horizon)[:, -1]
+    return passages(life, limits, rng, now=now, horizon=horizon)[0][:, -1]
 
 
 def _since_baseline(history: History) -> float:

@@ -1,7 +1,7 @@
 """Are posteriors of whole lives calibrated, over everything that is not known of them?
 
 Method
-    Simulation-based calibration of `fit_life` and `remaining_travel`. The law of each parameter, or
+    Simulation-based calibration of `fit_life` and `passages`. The law of each parameter, or
     none, its parameters, the deviation and its path are drawn from the priors of the description,
     the odometer of now independently of the life (lognormal about 2,000 km); lives that leave the
     map are drawn again. In 15 % of lives every parameter jumps once, and a law may begin anew
@@ -36,7 +36,7 @@ import numpy as np
 
 from lmshealth.errors import NotConverged
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import remaining_travel
+from lmshealth.prognosis.remaining_life import passages
 from lmshealth.stage.description import Stage, load_stage
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
 from studies.harness.claims import Claim, Older, ranked
@@ -131,7 +131,7 @@ def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Ar
     """Return what a posterior states of the same, ``(n_draws, n)``."""
     horizon = 1000 * machine().description.usage.horizon_km
     told = [(j, p) for j, p in enumerate(machine().parameters) if p.limit is not None]
-    left = remaining_travel(found, told, rng, now=now, horizon=horizon)
+    left, _ = passages(found, told, rng, now=now, horizon=horizon)
     left[left > horizon] = np.inf
     n = found.rate.shape[0]
     paths = [

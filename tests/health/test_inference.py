@@ -110,7 +110,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     def fake(_: object, __: object, seed: np.random.SeedSequence) -> Sample:
         draws = 0.1 * np.random.default_rng(seed).standard_normal((4, 1000, 2))
         full = np.full(2, 4000.0)
-        return Sample(draws, full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
+        return Sample(draws, full, full, r_hat=np.ones(2))
 
     monkeypatch.setattr(inference, "sample", fake)
 
@@ -253,9 +253,7 @@ def test_importance_sampling_that_fails_gives_way_to_chains(
     monkeypatch.setattr("lmshealth.health.constants.MAX_PARETO_K", -9.0)
     chains = 0.01 * np.random.default_rng(3).standard_normal((4, 500, 2))
     full = np.full(2, 2000.0)
-    monkeypatch.setattr(
-        inference, "sample", lambda *_: Sample(chains, full, full, np.ones(2), np.ones(2))
-    )
+    monkeypatch.setattr(inference, "sample", lambda *_: Sample(chains, full, full, np.ones(2)))
     found = infer(worn, stage, 5, epochs=[2])
     assert found.converged.all()
     assert np.isnan(found.judge_shift).all()
@@ -399,7 +397,7 @@ def test_the_wider_posterior_may_have_draws_of_its_own(
 
     def fake(*_: object) -> Sample:
         full = np.full(2, 2000.0)
-        return Sample(next(own), full, full, r_hat=np.ones(2), autocorrelation_time=np.ones(2))
+        return Sample(next(own), full, full, r_hat=np.ones(2))
 
     def no_judge(*_: object) -> Sample:
         raise NotConverged("stuck", np.zeros((4, 50, 32, 2)))
@@ -535,8 +533,6 @@ def test_unexplained_drifts_inform_no_parameter(tmp_path: Path) -> None:
     assert fine.fit[-1] > 0.01
     assert fine.explained
     assert fine.publishable_parameters().all()
-    with pytest.warns(DeprecationWarning, match="publishable"):
-        assert fine.informed_parameters().all()
     wrong = infer(epochs([right * [1, -1, 1]], cov), stage, 1)
     assert wrong.fit[-1] < 1e-6
     assert not wrong.explained

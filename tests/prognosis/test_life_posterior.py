@@ -484,8 +484,6 @@ def test_a_life_is_a_table(found: LifePosterior) -> None:
     assert list(table["way"]) == [0, 0, 1, 1, 1, 1]
     assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
     shrinkage = found.scenarios[0].interval_shrinkage
-    with pytest.warns(DeprecationWarning, match="interval_shrinkage"):
-        np.testing.assert_array_equal(found.scenarios[0].informed, shrinkage)
     assert table.loc["guide_preload.hertz-wear.life_m", "interval_shrinkage"] == shrinkage[0]
     assert (table["q05"] < table["q95"]).all()
 

@@ -17,7 +17,7 @@ from lmshealth.prognosis import constants
 from lmshealth.prognosis.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.prognosis.life_likelihood import LifeLikelihood
 from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
-from lmshealth.prognosis.remaining_life import _usage, remaining_travel
+from lmshealth.prognosis.remaining_life import _usage, passages
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.common.histories import map_std
@@ -203,7 +203,7 @@ def test_young_machines_are_told_right_by_their_fleet(
         else:
             continue
         told = posterior(young, prior.apply_to(described()), number)
-        left = remaining_travel(
+        left, _ = passages(
             told, [(0, described().parameters[0])], rng, now=young.now, horizon=horizon()
         )
         draws = np.minimum(left, horizon())

@@ -1,7 +1,5 @@
 """What every format returns: columns as they are in the file, and metadata as text."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ pandas reads the rows from a stream that checks the text before pandas does: pan
 that are cut off, and allocates without bound for lines and quotes that do not end.
 """
 
-from __future__ import annotations
-
 import codecs
 import gzip
 import re

@@ -4,8 +4,6 @@ All of it is found from the first lines of the file, unless the column map state
 vendor (`text_layouts`) states it in a header of its own.
 """
 
-from __future__ import annotations
-
 import codecs
 import csv
 import re
@@ -274,10 +272,7 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
         (layout.delimiter is None and found.delimiter != ",", f"{marks} between fields"),
         (layout.decimal is None and found.decimal != ".", "decimal commas"),
         (where is not None and where != begin, f"names in line {(where or 0) + 1}"),
-        (
-            where is None and layout.header is None,
-            _UNNAMED,
-        ),
+        (where is None and layout.header is None, _UNNAMED),
     ]
     return tuple(text for differs, text in listed if differs)
 

@@ -6,8 +6,6 @@ library ends its process by a signal on damaged filters, loops on a damaged heap
 process of its own.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -6,8 +6,6 @@ single flipped bits in the first 64 bytes of an uncompressed variable; scipy 1.1
 what text and cells claim before it finds that they are not there. One variable is held in memory.
 """
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib

@@ -1,7 +1,5 @@
 """Parquet: columns, and the key/value metadata of the schema."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -45,10 +43,6 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
                 spool.append(batch.column(name).to_numpy(zero_copy_only=False))
     read = {name: spool.samples() for name, spool in taken.items()}
     return Content(read, metadata, tuple(schema.names))
-
-
-def _sniff(head: bytes) -> bool:
-    return head.startswith(_MAGIC)
 
 
 PARQUET = Format(

@@ -1,7 +1,5 @@
 """The registry of file formats: a new one is a module with a `Format`, and its name here."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from lmshealth.io import constants

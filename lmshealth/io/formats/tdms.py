@@ -4,8 +4,6 @@ npTDMS reads the samples chunk by chunk. It accepts files that are cut off, foll
 instead of the log, and loops over damaged counts of scales: these are checked here before.
 """
 
-from __future__ import annotations
-
 import logging
 import re
 import struct

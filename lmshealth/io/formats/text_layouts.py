@@ -4,8 +4,6 @@ A layout returns the `Dialect` that the first lines of a file state, or None for
 layouts were taken from public readers and samples; see the README of `io`.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from datetime import UTC, datetime, timedelta

@@ -4,8 +4,6 @@ pyuff reads the data sets 58 from a copy that holds no others: it drops a data s
 and pairs tags wrongly where a line of another data set ends like one.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path

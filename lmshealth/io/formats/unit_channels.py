@@ -1,7 +1,5 @@
 """Channels with their unit in a field of the file (TDMS, UFF58): which are read, and as what."""
 
-from __future__ import annotations
-
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence

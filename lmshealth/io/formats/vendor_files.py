@@ -3,8 +3,6 @@
 Neither states units: a column map names the channels. The layouts were taken from public readers.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path

@@ -4,8 +4,6 @@ Poles are added by an information criterion (`fit_decays`); the ambient response
 few ordinates constrain, is averaged over (`estimate`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 

@@ -4,8 +4,6 @@ The decays of a log share frequencies, dampings and noise; sizes and phases diff
 The noise comes from the sensors and from forces that still excite the same modes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

@@ -8,8 +8,6 @@ leakage, no correction for short records. Sizes are marginalised in the restrict
 does not depend on their parametrisation and keeps the degrees of freedom that they take.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -129,6 +127,15 @@ def unit_level(f: float, zeta: float, duration: float, *, displacement: bool = F
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class BlockFit:
+    """Least-squares fit of a whitened block; ``n_rows`` is ``2 n_ordinates n_channels``."""
+
+    residual: FloatArray  # white with variance one half, (n_rows, n_segments)
+    sizes: FloatArray  # of each column, the base first, (n_channels, n_columns, n_segments)
+    removed: FloatArray  # orthonormal basis of the fitted columns, (n_rows, n_removed)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class Evaluation:
     """Restricted likelihood at one point."""
 
@@ -137,15 +144,6 @@ class Evaluation:
     gradient: FloatArray  # of value, (n_parameters,)
     fisher: FloatArray  # information at the best sizes, (n_parameters, n_parameters)
     fits: tuple[BlockFit, ...]  # one per block
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class BlockFit:
-    """Least-squares fit of a whitened block; ``n_rows`` is ``2 n_ordinates n_channels``."""
-
-    residual: FloatArray  # white with variance one half, (n_rows, n_segments)
-    sizes: FloatArray  # of each column, the base first, (n_channels, n_columns, n_segments)
-    removed: FloatArray  # orthonormal basis of the fitted columns, (n_rows, n_removed)
 
 
 @dataclass(frozen=True, eq=False)

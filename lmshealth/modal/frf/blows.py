@@ -1,7 +1,5 @@
 """Impact tests: blows of a hammer, found in the force, and the response averaged over them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import NamedTuple
 

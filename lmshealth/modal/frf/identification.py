@@ -1,7 +1,5 @@
 """Identification of modes from a frequency response between two channels of a log."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -262,11 +260,7 @@ def _check_coherence(name: str, frf: Frf) -> None:
 
 
 def _modes(
-    log: str,
-    frf: Frf,
-    fit: ResponseFit,
-    before: tuple[Refusal, ...],
-    lines: tuple[Line, ...],
+    log: str, frf: Frf, fit: ResponseFit, before: tuple[Refusal, ...], lines: tuple[Line, ...]
 ) -> Modes:
     """Return the credible modes; the others are refused."""
     m = fit.estimate.size // 2

@@ -3,8 +3,6 @@
 The README of the folder lists the columns of a table.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path

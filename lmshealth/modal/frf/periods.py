@@ -1,7 +1,5 @@
 """Periodic excitation: estimation of the period, and spectra of whole periods."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

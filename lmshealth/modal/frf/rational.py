@@ -4,10 +4,9 @@ The model is that of the README of the folder. Residues and powers are linear an
 ln f and ln ζ are searched (variable projection).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Self
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -54,7 +53,7 @@ class Ordinates(ReadOnly):
         """Distance of neighbouring lines in Hz."""
         return float(np.median(np.diff(self.frequency)))
 
-    def only(self, keep: BoolArray) -> Ordinates:
+    def only(self, keep: BoolArray) -> Self:
         """Keep some of the lines."""
         lines = ("frequency", "given", "answer", "noise")
         return replace(self, **{name: getattr(self, name)[keep] for name in lines})
@@ -84,12 +83,12 @@ class Order:
         each, powers = (6, len(_TRANSIENT_POWERS)) if transient else (4, 0)
         return each * self.n_modes + self.high - self.low + 1 + powers
 
-    def with_mode(self, f: float, zeta: float) -> Order:
+    def with_mode(self, f: float, zeta: float) -> Self:
         """Add a mode at a frequency in Hz."""
         n = self.n_modes
         return replace(self, theta=np.insert(self.theta, [n, 2 * n], np.log([f, zeta])))
 
-    def without_mode(self, i: int) -> Order:
+    def without_mode(self, i: int) -> Self:
         """Remove a mode."""
         return replace(self, theta=np.delete(self.theta, [i, i + self.n_modes]))
 

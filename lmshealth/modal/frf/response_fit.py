@@ -1,7 +1,5 @@
 """Fit of a frequency response: number of modes, noise and distortion, covariance."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

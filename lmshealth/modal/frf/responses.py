@@ -3,8 +3,6 @@
 Noise of the lines comes from the sensors and from forces that excite the same modes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import combinations_with_replacement
 
@@ -14,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.stats import f as fisher
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, expect_shape, freeze
+from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal import constants
@@ -98,9 +96,7 @@ class Frf:
     note: str = ""  # what the reader must take into account
 
     def __post_init__(self) -> None:
-        for name in ("response", "std", "h1", "h2", "hv", "coherence"):
-            expect_shape(name, getattr(self, name), self.frequency.shape)
-        freeze(self)
+        freeze(self, ("response std h1 h2 hv coherence", *self.frequency.shape))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -5,17 +5,15 @@ the estimates of a log, and returns the next state and a label per estimate. No 
 logs, and an estimate gets a mode only if that mode has nearly all of the posterior probability.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, expect_shape, freeze
+from lmshealth._arrays import FloatArray, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
@@ -50,13 +48,10 @@ class Estimates:
         n = len(self.names)
         if len(self.sources) != n:
             raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
-        expect_shape("ln_frequency", self.ln_frequency, (n,))
-        expect_shape("ln_damping", self.ln_damping, (n,))
-        expect_shape("cov", self.cov, (2 * n, 2 * n))
         if self.shapes.ndim != 2:
             raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
-        expect_shape("shapes", self.shapes, (n, self.shapes.shape[1]))
-        freeze(self)
+        shapes = "shapes", n, self.shapes.shape[1]
+        freeze(self, ("ln_frequency ln_damping", n), ("cov", 2 * n, 2 * n), shapes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,7 +125,7 @@ class State:
     clock: float | None = None  # to which the filters are predicted
 
     @classmethod
-    def start(cls, prior_std: FloatArray, n_channels: int) -> State:
+    def start(cls, prior_std: FloatArray, n_channels: int) -> Self:
         """Return the state before the first log."""
         sizes = (prior_std.size, n_channels)
         none = np.empty(0, dtype=int)
@@ -147,19 +142,11 @@ def associate(
 ) -> Association:
     """Assign the estimates of all logs to modes; the labels of a log use it and earlier logs.
 
-    `BadTable` if an estimate is not finite or has no positive variance.
-
-    Parameters
-    ----------
-    epochs : sequence of Estimates
-        One per log, all with equally many channels of shapes.
-    clock : ndarray
-        Ascending odometer or time in any unit, shape ``(n_epochs,)``.
-    offsets, prior_std : ndarray
-        Covariates about their references, 0 where unknown, ``(n_epochs, n_covariates)``, and prior
-        standard deviations of d ln f per unit of each, ``(n_covariates,)``.
-    jumps : collection of int
-        Epochs at which frequencies may step, as after declared maintenance.
+    All epochs, one per log, have equally many channels of shapes. The clock is an ascending
+    odometer or time in any unit, ``(n_epochs,)``. Offsets are covariates about their references, 0
+    where unknown, ``(n_epochs, n_covariates)``, with prior standard deviations of d ln f per unit
+    of each, ``(n_covariates,)``. Jumps are epochs at which frequencies may step, as after declared
+    maintenance. `BadTable` if an estimate is not finite or has no positive variance.
     """
     start = state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()

@@ -6,11 +6,10 @@ all of them and permanently, so that the naming rule is one unknown of a life an
 estimate.
 """
 
-from __future__ import annotations
-
 import heapq
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -36,7 +35,7 @@ class Scan:
     measurements: Measurements
     row: FloatArray  # observation row ``[1, 0, covariates]``, ``(d,)``
 
-    def pick(self, chosen: IntArray) -> Scan:
+    def pick(self, chosen: IntArray) -> Self:
         """Return some of the estimates."""
         rows, names = self.rows[chosen], self.names[chosen]
         return replace(self, rows=rows, names=names, measurements=self.measurements[chosen])
@@ -51,7 +50,7 @@ class Hypotheses:
     labels: IntArray  # mode of each estimate of the present scan, ``(h, n)``; -1 for none
 
     @classmethod
-    def empty(cls, n_covariates: int, n_channels: int) -> Hypotheses:
+    def empty(cls, n_covariates: int, n_channels: int) -> Self:
         """Return one hypothesis without modes."""
         filters = ModeFilters.empty(n_covariates, n_channels)
         return cls(filters, normalised(np.zeros((1, 2))), np.empty((1, 0), dtype=int))

@@ -5,8 +5,6 @@ likelihoods of association need the scatter itself, before it is known which mod
 two estimates of successive logs that are each other's nearest are nearly always of one mode.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -4,10 +4,9 @@ A candidate has a filter of its own. Its odds of being a mode grow with every lo
 where the filter predicts it, and shrink with every log that does not.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -29,7 +28,7 @@ class Candidates:
     last: IntArray  # the last of them
 
     @classmethod
-    def empty(cls, n_covariates: int, n_channels: int) -> Candidates:
+    def empty(cls, n_covariates: int, n_channels: int) -> Self:
         """Return no candidates."""
         none = np.empty(0, dtype=int)
         return cls(ModeFilters.empty(n_covariates, n_channels), none, np.empty(0), none, none)

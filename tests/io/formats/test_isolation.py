@@ -141,7 +141,7 @@ def test_interrupt(file):
     timer.start()
     with pytest.raises(KeyboardInterrupt):
         attempt(hang, file)
-    assert isolation._reader._process is None
+    assert isolation._reader.process is None
     assert attempt(print_much, file).columns == {}
 
 
@@ -182,7 +182,7 @@ def test_process_ends_with_the_session(make, end):
     code = (
         "import os, sys; from lmshealth import read_log\n"
         "from lmshealth.io.formats import isolation\n"
-        "read_log(sys.argv[1]); print(isolation._reader._process.popen.pid, flush=True)\n" + end
+        "read_log(sys.argv[1]); print(isolation._reader.process.pid, flush=True)\n" + end
     )
     command = [sys.executable, "-W", "error", "-c", code, str(make("log.h5"))]
     done = subprocess.run(command, capture_output=True, text=True, check=False)
