@@ -22,6 +22,8 @@ MAX_PARETO_K = 0.7
 practice, and chains are run."""
 JUDGED_EVERY = 16
 """Of so many epochs one, and the last, is sampled by chains too; the difference is published."""
+JUDGE_ENSEMBLES = 2
+"""Ensembles of such chains: as many as R-hat needs, since their draws are not published."""
 
 MIN_FIT = 1e-4
 """Drifts whose probability under the best state of the parameters is lower are unexplained.

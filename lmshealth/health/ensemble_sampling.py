@@ -64,7 +64,12 @@ def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
     return seed, int(digest[:12], 16)
 
 
-def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSequence) -> Sample:
+def sample(
+    log_probability: LogProbability,
+    start: Start,
+    seed: np.random.SeedSequence,
+    n_ensembles: int = constants.N_ENSEMBLES,
+) -> Sample:
     """Sample a posterior by independent ensembles [ForemanMackey2013], [Vehtari2021].
 
     Its log density is -inf outside its support. Every ensemble has its own start and random stream:
@@ -74,7 +79,7 @@ def sample(log_probability: LogProbability, start: Start, seed: np.random.SeedSe
     """
     import emcee  # late: it imports scipy.stats
 
-    streams = seed.spawn(2 * constants.N_ENSEMBLES)
+    streams = seed.spawn(2 * n_ensembles)
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
         points = start(np.random.default_rng(start_seed))

@@ -256,14 +256,18 @@ class Epoch(ReadOnly):
     checks: FloatArray  # in the order of `CHECKS`, ``(n_checks, n_parameters)``
 
 
-def draw(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sample, Laplace | None]:
+def draw(
+    posterior: EpochPosterior,
+    seed: np.random.SeedSequence,
+    n_ensembles: int = constants.N_ENSEMBLES,
+) -> tuple[Sample, Laplace | None]:
     """Draw ln parameters of an epoch by emcee; return Laplace's approximation, its start, too."""
     normal = laplace(posterior)
     if normal is None:
         start = start_from_prior(posterior.log_probability, posterior.prior.draw)
     else:
         start = start_near(normal.mode, normal.cov, posterior.log_probability)
-    return sample(posterior.log_probability, start, seed), normal
+    return sample(posterior.log_probability, start, seed, n_ensembles), normal
 
 
 def laplace(posterior: EpochPosterior) -> Laplace | None:
@@ -311,7 +315,7 @@ def _infer_epoch(
             found |= _change("prior", drawn, wider)
         if judged and weighted:
             with suppress(NotConverged):  # only the judge is missing
-                other = draw(posterior, judge_seed)[0].flat
+                other = draw(posterior, judge_seed, constants.JUDGE_ENSEMBLES)[0].flat
                 found |= _change("judge", drawn, np.quantile(other, _LEVELS, axis=0))
     converged = bool(np.isfinite(found["r_hat"]).all())
     fit, edge = posterior.fit(x[:: max(x.shape[0] // _N_FIT, 1)]), posterior.at_edge(x)

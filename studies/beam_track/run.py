@@ -109,6 +109,7 @@ def follow(history: History, stage: Stage, rows: list[Row]) -> Row:
         "drift_back_std": float(std[back]),
         "off_in_std_not_widened": float(drift[back] / std[back] * found.widening[back]),
         "widening": float(found.widening[-1]),
+        "scatter_over_std": float(np.sqrt(np.nansum(found.nis) / found.nis_dof.sum())),
         "consistent": judged.holds,
         "outliers": [k for k, _ in found.outliers],
     }
@@ -142,6 +143,13 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"{len(repeats)} repeats, with and without the roller position",
         f"2 required; excursion {span(far)} in ln f",
         all(fine for name, fine in passed.items() if name != DISAGREES),
+    )
+    scatter = span(row["told"]["scatter_over_std"] for row in repeats)
+    yield Claim(
+        "scatter of its estimates about the track over what is stated, roller position known",
+        scatter,
+        "outliers left out; root of NIS over its degrees of freedom",
+        "without the position " + span(row["blind"]["scatter_over_std"] for row in repeats),
     )
     disagrees = sum(not row["blind"]["consistent"] for row in repeats)
     yield counted(

@@ -107,7 +107,7 @@ def test_map_error_widens_the_posterior(tmp_path: Path, worn: Track, health: Hea
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put draws of the seed alone in the place of the sampler, to see which seeds it is given."""
 
-    def fake(_: object, __: object, seed: np.random.SeedSequence) -> Sample:
+    def fake(_: object, __: object, seed: np.random.SeedSequence, ___: int) -> Sample:
         draws = 0.1 * np.random.default_rng(seed).standard_normal((4, 1000, 2))
         full = np.full(2, 4000.0)
         return Sample(draws, full, full, r_hat=np.ones(2))
