@@ -92,9 +92,9 @@ def average_colours(
 
     ``p`` is the posterior mode of white forces, ``white`` its marginal. Ordinates of forces of an
     unsteadiness ``ratio`` are correlated, and count as so many fewer. Where the search for a
-    posterior mode of coloured forces fails, the covariance is increased by what it moved.
+    posterior mode of coloured forces fails, the posterior remains, with a probability of one.
     """
-    flat = white
+    flat, n = white, white.mean.size // 2
     if ratio > 1:
         blocks = tuple(replace(b, count=b.count / ratio) for b in likelihood.blocks)
         likelihood = replace(likelihood, blocks=blocks)
@@ -107,15 +107,18 @@ def average_colours(
     found = [flat]
     for std in constants.WIDTHS_COLOUR:
         coloured = likelihood.coloured(bumps, std)
-        q = coloured.minimise(q, _NEAR)
-        one = marginalise(coloured, q)
-        if one.decrement < constants.WORST_DECREMENT:
+        moved = coloured.minimise(q, _NEAR)
+        one = marginalise(coloured, moved)
+        # Another resonance than that of the white force is no estimate of it.
+        most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
+        same = (np.abs(one.mean - white.mean) < most).all()
+        if one.decrement < constants.WORST_DECREMENT and same:
+            q = moved
             found.append(one)
             if one.log_evidence - flat.log_evidence < _UNLIKELY:
                 break
     if len(found) == 1:
-        apart = q[: white.mean.size] - white.mean
-        return Colour(white.mean, white.cov + np.outer(apart, apart), 1.0)
+        return Colour(white.mean, white.cov, 1.0)
     weight = softmax([one.log_evidence for one in found])
     mean = weight @ [one.mean for one in found]
     apart = np.array([one.mean for one in found]) - mean

@@ -347,7 +347,8 @@ class _Point:
     def _modal(self) -> ComplexArray:
         """D, shape ``(components, components, n)``."""
         h = self._h[0]
-        return self._gain * self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+        modal = self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+        return modal * self._gain if self._layout.n_bumps else modal
 
     @cached_property
     def expected(self) -> ComplexArray:
@@ -405,11 +406,10 @@ class _Point:
         driven, _ = _columns(lay.force)
         by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
         pairs = self._block.smear(h[0][:, None] * h[0].conj())
-        w = [
-            self._gain[pole] * self._block.smear(by_pole),
-            self._gain[driven] * self._change[..., None] * pairs[driven],
-        ]
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
         row = [pole, driven]
+        if lay.n_bumps:
+            w = [part * self._gain[i] for part, i in zip(w, row, strict=True)]
         if lay.shape:
             channel, mode = _columns(lay.shape)
             row.append(lay.n_modes + channel)
@@ -430,7 +430,8 @@ class _Point:
         lay = self._layout
         curvature = np.zeros((lay.bumps.start, lay.bumps.start))
         pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (components, channels, n)
-        b = self._gain * b
+        if lay.n_bumps:
+            b = b * self._gain
         if self._block.kernel is not None:
             b = self._block.kernel.spread(b)
         turned = b.swapaxes(0, 1)
