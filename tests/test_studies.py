@@ -321,9 +321,9 @@ def test_frf_lines(root: Path) -> None:
 
 
 def test_single_logs(root: Path) -> None:
-    """A few steady logs have no flag, most of an unsteady force have one."""
+    """A few plain logs have no flag, most of an unsteady or coloured force have one."""
     answer = json.loads(run_study(root, "single_logs"))
-    flagged = ("bursts", "log-normal", "ramp")
+    flagged = ("bursts", "log-normal", "ramp", "hump")
     assert answer["passed"]["no flag where the model holds"]
     assert all(answer["passed"][f"most modes have the flag, {world}"] for world in flagged)
 

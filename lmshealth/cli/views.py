@@ -42,6 +42,7 @@ _FLAGS = {
     "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
     "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
     "unsteady": "its excitation varies over time, which the standard deviations include.",
+    "coloured": "its excitation has no flat spectrum, which the standard deviations include.",
     "cluster": "one estimate for two modes that the data do not separate.",
     "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }

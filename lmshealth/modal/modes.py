@@ -45,7 +45,8 @@ class Modes:
     # Of each mode, separated by blanks: ``resolution-limited`` (few Fourier frequencies in the
     # half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
     # ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes), ``unsteady``
-    # (the intensity of its excitation varies), ``doubtful-name`` (may be another mode).
+    # (the intensity of its excitation varies), ``coloured`` (the spectrum of its excitation is not
+    # flat), ``doubtful-name`` (may be another mode).
     flags: tuple[str, ...]
     shape_channels: tuple[str, ...]  # of the shapes; empty where shapes were not identified
     # Acceleration of each channel in each mode (of a following error its second derivative),

@@ -22,7 +22,7 @@ from lmshealth.modal.ambient.cluster_modes import (
     FittedSpectrum,
     LineEstimate,
 )
-from lmshealth.modal.ambient.excitation import unsteadiness
+from lmshealth.modal.ambient.excitation import Colour, average_colours, unsteadiness
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
 from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
 from lmshealth.modal.modes import Modes, Rejection, paired
@@ -587,7 +587,8 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     """Marginalise the posterior, and publish the modes whose estimates are credible."""
     targets, likelihood, p = optimum.targets, optimum.likelihood, optimum.p
     names = tuple(target.name for target in targets)
-    estimate, cov, decrement = marginalise(likelihood, p)
+    white = marginalise(likelihood, p)
+    estimate, cov, decrement, _ = white
     if not decrement < constants.WORST_DECREMENT:
         detail = f"the fit did not converge (Newton decrement {decrement:.2g}); record longer"
         return ClusterFit(
@@ -637,8 +638,33 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     lines = tuple(read_line(data, first, last) for first, last in ordinates)
     longest = data.longest
     fitted = FittedSpectrum(channels, data.unit, data.spectra.spectra[longest], expected[longest])
+    fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
+    colour = average_colours(likelihood, p, white, fewer)
+    modes = _averaged(modes, colour, wider, targets, residual.duration)
     found = ClusterModes(modes, np.array(_losses(optimum)), lines, residual, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
+
+
+def _averaged(
+    modes: Modes, colour: Colour, wider: FloatArray, targets: tuple[Target, ...], duration: float
+) -> Modes:
+    """Replace estimates for a white force by those averaged over its spectra."""
+    white = np.concatenate([modes.ln_frequency, modes.ln_damping])
+
+    def with_mean(mean: FloatArray, cov: FloatArray) -> Modes:
+        ln_f, ln_zeta = np.split(mean, 2)
+        return replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov)
+
+    cov = colour.cov * np.outer(wider, wider)
+    averaged = with_mean(colour.mean, cov)
+    # Which modes are found does not depend on the average: where it is not credible the estimate
+    # for a white force remains, and covers both.
+    lost = [_incredible(averaged, i, one, duration) is not None for i, one in enumerate(targets)]
+    back = np.where(lost * 2, white - colour.mean, 0.0)
+    averaged = with_mean(colour.mean + back, cov + np.outer(back, back))
+    if colour.probability <= constants.COLOURED:
+        return averaged
+    return replace(averaged, flags=tuple(f"{flag} coloured".strip() for flag in modes.flags))
 
 
 def _unit_shapes(shapes: FloatArray) -> FloatArray:

@@ -1,21 +1,29 @@
-"""How steady the excitation of a mode is over time (README.md of this folder, "Unsteady force")."""
+"""How steady the force of a mode is over time, and how flat over frequency (README.md here)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.special import softmax
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.whittle import response
+from lmshealth.modal.ambient.whittle import Likelihood, Marginal, marginalise, response
 from lmshealth.signal.spectra import CrossSpectrum
 
 # Half width of the band whose envelope is read, in damping ratios. The products of its ordinates
 # then count over the same lags as those of the scores of ln f and ln ζ, whose correlation falls to
 # one half at a lag of the half-power bandwidth.
 _BAND = 3.4
+# Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
+# distance of two in widths.
+_BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
+# Log evidence over that of a white force below which a coloured one is not fitted, and decrement at
+# which its fit ends.
+_UNLIKELY, _NEAR = -4.0, 0.03
 
 
 class Unsteadiness(NamedTuple):
@@ -67,3 +75,64 @@ def unsteadiness(
         total += spectrum.observed
         n += spectrum.count * place.size
     return Unsteadiness(total * fourth / (2 * square**2) if n else 1.0, n)
+
+
+class Colour(NamedTuple):
+    """Posterior of ``[ln f, ln ζ]`` averaged over white and coloured forces."""
+
+    mean: FloatArray
+    cov: FloatArray
+    probability: float  # of a coloured force
+
+
+def average_colours(
+    likelihood: Likelihood, p: FloatArray, white: Marginal, ratio: float = 1.0
+) -> Colour:
+    """Average a posterior over white forces and forces of a smooth spectrum, by their evidence.
+
+    ``p`` is the posterior mode of white forces, ``white`` its marginal. Ordinates of forces of an
+    unsteadiness ``ratio`` are correlated, and count as so many fewer. Where the search for a
+    posterior mode of coloured forces fails, the posterior remains, with a probability of one.
+    """
+    flat, n = white, white.mean.size // 2
+    if ratio > 1:
+        blocks = tuple(replace(b, count=b.count / ratio) for b in likelihood.blocks)
+        likelihood = replace(likelihood, blocks=blocks)
+        flat = marginalise(likelihood, p)
+    bumps = place_bumps(*np.exp(white.mean).reshape(2, -1))
+    q = np.append(p, np.zeros(bumps.shape[1]))
+    guess = marginalise(likelihood.coloured(bumps, constants.WIDTHS_COLOUR[0]), q)
+    if np.isfinite(guess.decrement) and guess.log_evidence - flat.log_evidence < _UNLIKELY:
+        return Colour(white.mean, white.cov, 0.0)
+    found = [flat]
+    for std in constants.WIDTHS_COLOUR:
+        coloured = likelihood.coloured(bumps, std)
+        moved = coloured.minimise(q, _NEAR)
+        one = marginalise(coloured, moved)
+        # Another resonance than that of the white force is no estimate of it.
+        most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
+        same = (np.abs(one.mean - white.mean) < most).all()
+        if one.decrement < constants.WORST_DECREMENT and same:
+            q = moved
+            found.append(one)
+            if one.log_evidence - flat.log_evidence < _UNLIKELY:
+                break
+    if len(found) == 1:
+        return Colour(white.mean, white.cov, 1.0)
+    weight = softmax([one.log_evidence for one in found])
+    mean = weight @ [one.mean for one in found]
+    apart = np.array([one.mean for one in found]) - mean
+    cov = np.tensordot(weight, [one.cov for one in found], axes=1)
+    cov = cov + (weight[:, None] * apart).T @ apart
+    return Colour(white.mean + mean - flat.mean, cov / ratio, 1.0 - float(weight[0]))
+
+
+def place_bumps(f: FloatArray, zeta: FloatArray) -> FloatArray:
+    """Return centres and widths in Hz of bumps around modes, ``(2, n_bumps)``."""
+    width = _WIDTH * 2 * zeta * f
+    bumps: list[tuple[float, float]] = []
+    for k in sorted(range(-_BUMPS, _BUMPS + 1), key=abs):
+        for place, own in zip((f + k * width).tolist(), width.tolist(), strict=True):
+            if all(abs(place - other) > _APART * max(own, wide) for other, wide in bumps):
+                bumps.append((place, own))
+    return np.array(bumps).T

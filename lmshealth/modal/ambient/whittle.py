@@ -9,22 +9,24 @@ over modes and noise floors. Means W of n ordinates suffice where E is constant 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
 Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each floor, L row by row up to its
-diagonal (which is one for the floors), and the shapes but for the reference channel of each mode.
+diagonal (which is one for the floors), the shapes but for the reference channel of each mode, and
+the heights of bumps of the log spectrum of the modal forces, of which there are none at first.
 README.md of this folder derives the model; `marginalise` integrates the nuisance parameters.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import OptimizeResult, minimize
-from scipy.special import softmax
+from scipy.special import logsumexp, softmax
 
 from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
@@ -40,6 +42,7 @@ class Layout:
     force: tuple[tuple[int, int], ...]  # row and column of each unknown of L
     shape: tuple[tuple[int, int], ...]  # channel and mode of each unknown of the shapes
     has_static: bool = False  # third unknown of each mode: its static response
+    n_bumps: int = 0  # of the log spectrum of the modal forces; their heights are the last unknowns
 
     @property
     def _of_modes(self) -> tuple[int, ...]:
@@ -88,12 +91,24 @@ class Layout:
     @property
     def shapes(self) -> slice:
         """Unknowns of the shapes."""
-        return slice(self.forces.stop, self.size)
+        return slice(self.forces.stop, self.forces.stop + len(self.shape))
+
+    @property
+    def bumps(self) -> slice:
+        """Heights of the bumps."""
+        return slice(self.shapes.stop, self.size)
+
+    @property
+    def coloured(self) -> FloatArray:
+        """Powers of the gain of forces in the change of E by each unknown but the heights."""
+        m = self.n_modes
+        rows = [i for i, *_ in (*self.pole, *self.force)]
+        return np.array([*((i < m) / 2 for i in rows), *(0.5 for _ in self.shape)])
 
     @property
     def size(self) -> int:
         """Number of unknowns."""
-        return self.n_poles + len(self.force) + len(self.shape)
+        return self.n_poles + len(self.force) + len(self.shape) + self.n_bumps
 
 
 def lay_out(reference: Sequence[int], n_channels: int, *, has_static: bool = False) -> Layout:
@@ -161,6 +176,8 @@ class Likelihood:
     scale: FloatArray  # unit of the rows of L, one for floors, (n_components,)
     centre: float  # geometric, of the band in Hz
     spread: float  # half width of the band in ln f
+    bumps: FloatArray = field(default_factory=lambda: np.empty((2, 0)))  # centres, widths in Hz
+    bump_std: float = 1.0  # standard deviation of the prior of their heights
 
     @property
     def prior_std(self) -> FloatArray:
@@ -176,8 +193,15 @@ class Likelihood:
                 np.tile(constants.PRIOR_FLOOR, lay.n_channels),
                 forces,
                 np.full(len(lay.shape), constants.PRIOR_SHAPE),
+                np.full(lay.n_bumps, self.bump_std),
             ]
         )
+
+    def coloured(self, bumps: FloatArray, std: float) -> Likelihood:
+        """Return the likelihood with bumps, ``(2, n_bumps)``, and the prior std of heights."""
+        n = bumps.shape[1]
+        layout, start = replace(self.layout, n_bumps=n), np.append(self.start, np.zeros(n))
+        return replace(self, layout=layout, start=start, bumps=bumps, bump_std=std)
 
     def value(self, p: FloatArray, points: list[_Point] | None = None) -> float:
         """Negative log posterior up to a constant; ``points`` are the models at p."""
@@ -234,8 +258,11 @@ class Likelihood:
         at = MeanOrdinates(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
         return _Point(self, p, at)
 
-    def minimise(self, start: FloatArray) -> FloatArray:
-        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""
+    def minimise(self, start: FloatArray, arrived: float = _ARRIVED) -> FloatArray:
+        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
+
+        The search ends below the decrement ``arrived``.
+        """
         # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
         # the point before where a step was too long.
         points = lru_cache(maxsize=1)(lambda raw: self._at(np.frombuffer(raw)))
@@ -252,8 +279,8 @@ class Likelihood:
 
         steps = iter(range(1, 1000))
 
-        def arrived(intermediate_result: OptimizeResult) -> None:
-            near = _ARRIVED if next(steps) < _MANY_STEPS else _NEARLY
+        def check(intermediate_result: OptimizeResult) -> None:
+            near = arrived if next(steps) < _MANY_STEPS else _NEARLY
             slope, curvature = both(intermediate_result.x.tobytes())
             try:
                 decrement = float(slope @ cho_solve(cho_factor(curvature), slope))
@@ -268,7 +295,7 @@ class Likelihood:
             jac=gradient,
             hess=hessian,
             method="trust-exact",
-            callback=arrived,
+            callback=check,
             options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
         )
         return np.asarray(found.x)
@@ -296,6 +323,12 @@ class _Point:
         u = np.log(block.grid / likelihood.centre) / likelihood.spread
         # Responses h of all components and their derivatives, (10, components, grid).
         self._h = np.concatenate([modes, floors(tilts, u)], axis=1)
+        # The forces change little over a resolution: the gain follows the kernel.
+        place, width = likelihood.bumps[..., None]
+        self._bump = np.exp(-0.5 * ((block.frequency - place) / width) ** 2)
+        gain = np.ones((n, block.frequency.size))
+        gain[:m] = np.exp(0.5 * p[lay.bumps] @ self._bump)
+        self._gain = gain[:, None] * gain
 
     @property
     def strength(self) -> FloatArray:
@@ -314,7 +347,8 @@ class _Point:
     def _modal(self) -> ComplexArray:
         """D, shape ``(components, components, n)``."""
         h = self._h[0]
-        return self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+        modal = self._block.smear(self._s[..., None] * h[:, None] * h[None].conj())
+        return modal * self._gain if self._layout.n_bumps else modal
 
     @cached_property
     def expected(self) -> ComplexArray:
@@ -340,12 +374,28 @@ class _Point:
         basis = _frequency_last(whiten @ self._phi)
         half = basis[:, row][:, None] * _combined(basis, w.conj().swapaxes(0, 1))[None].conj()
         slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, n)
-        gradient = _inner(slopes, (_frequency_last(excess) * count)[:, :, None])
-        hessian = _inner(slopes, _combined(_frequency_last(eye - 2 * excess) * count, slopes))
+        size = self._layout.bumps.start
+        slopes, by_gain = slopes[:, :, :size], slopes[:, :, size:].sum(axis=2)
+        excess_last = _frequency_last(excess) * count
+        turned = _combined(_frequency_last(eye - 2 * excess) * count, slopes)
         g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
-        return gradient[:, 0], hessian + self._curvature(w, g)
+        b = _congruent(self._phi, g)  # Φᵀ G Φ, (components, components, n)
+        gradient = _inner(slopes, excess_last[:, :, None])[:, 0]
+        hessian = _inner(slopes, turned) + self._curvature(w[:size], g, b)
+        if not self._layout.n_bumps:
+            return gradient, hessian
+        # Heights change E as the gain of the forces does, times their bump.
+        along = np.sum((by_gain[:, :, None] * turned.conj()).real, axis=(0, 1))
+        along += self._with_gain(row[:size], w[:size], b)
+        across = _combined(_frequency_last(eye - 2 * excess) * count, by_gain[:, :, None])
+        own = np.sum((by_gain * across[:, :, 0].conj()).real, axis=(0, 1)) + self._gains(b)
+        heights = np.sum((by_gain * excess_last.conj()).real, axis=(0, 1)) @ self._bump.T
+        mixed = along @ self._bump.T
+        return np.append(gradient, heights), np.block(
+            [[hessian, mixed], [mixed.T, (self._bump * own) @ self._bump.T]]
+        )
 
-    def _slopes(self) -> tuple[np.ndarray, ComplexArray]:
+    def _slopes(self) -> tuple[NDArray[np.intp], ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
 
         Returns the index of b in the basis and the row w of each unknown, E_a = b (Φ w)ᵀ + adjoint,
@@ -358,10 +408,15 @@ class _Point:
         pairs = self._block.smear(h[0][:, None] * h[0].conj())
         w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
         row = [pole, driven]
+        if lay.n_bumps:
+            w = [part * self._gain[i] for part, i in zip(w, row, strict=True)]
         if lay.shape:
             channel, mode = _columns(lay.shape)
             row.append(lay.n_modes + channel)
             w.append(self._modal[mode])
+        if lay.n_bumps:
+            row.append(np.arange(lay.n_modes))
+            w.append(self._modal[: lay.n_modes] / 2)
         return np.concatenate(row), np.concatenate(w)
 
     @cached_property
@@ -370,12 +425,13 @@ class _Point:
         driven, force = _columns(self._layout.force)
         return np.asarray(self._scale[driven, None] * self._root.T[force])
 
-    def _curvature(self, w: ComplexArray, g: ComplexArray) -> FloatArray:
-        """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
+    def _curvature(self, w: ComplexArray, g: ComplexArray, b: ComplexArray) -> FloatArray:
+        """Σ tr G E_ab over all pairs of unknowns but the heights, the counts in G; b = Φᵀ G Φ."""
         lay = self._layout
-        curvature = np.zeros((lay.size, lay.size))
+        curvature = np.zeros((lay.bumps.start, lay.bumps.start))
         pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (components, channels, n)
-        b = _congruent(self._phi, g)  # (components, components, n)
+        if lay.n_bumps:
+            b = b * self._gain
         if self._block.kernel is not None:
             b = self._block.kernel.spread(b)
         turned = b.swapaxes(0, 1)
@@ -433,6 +489,21 @@ class _Point:
         curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
         curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
 
+    def _with_gain(self, row: NDArray[np.intp], w: ComplexArray, b: ComplexArray) -> FloatArray:
+        """Compute tr G E_ab of the unknowns and the log gain of the forces, ``(unknowns, n)``."""
+        power = self._power[:, None] + self._layout.coloured[:, None, None]
+        return np.asarray(2 * np.sum((w * b.swapaxes(0, 1)[row]).real * power, axis=1))
+
+    def _gains(self, b: ComplexArray) -> FloatArray:
+        """Compute tr G E_aa of the log gain of the forces, ``(n,)``."""
+        power = (self._power[:, None] + self._power) ** 2
+        return np.asarray(np.einsum("ijk,jik,ij->k", self._modal, b, power).real)
+
+    @property
+    def _power(self) -> FloatArray:
+        """Power of the gain of the forces in the response of each component."""
+        return (np.arange(self._layout.n_components) < self._layout.n_modes) / 2
+
 
 def _columns(pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
     return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
@@ -461,34 +532,47 @@ def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
     return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
 
 
-def marginalise(likelihood: Likelihood, p: FloatArray) -> tuple[FloatArray, FloatArray, float]:
+class Marginal(NamedTuple):
+    """Posterior of ``[ln f, ln ζ]``, all other unknowns marginalised."""
+
+    mean: FloatArray
+    cov: FloatArray
+    decrement: float  # Newton decrement g H⁻¹ g; infinite where there is no maximum
+    log_evidence: float = -np.inf  # up to a constant of the data
+
+
+def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     """Return mean and covariance of ``[ln f, ln ζ]`` by Laplace's approximation.
 
     The posterior is averaged over the widths of the priors of coherence and bends of floors,
-    weighted by their evidence (README.md). ``p`` is near the posterior mode; returned last is the
-    Newton decrement g H⁻¹ g there, infinite where there is no maximum.
+    weighted by their evidence (README.md). ``p`` is near the posterior mode.
     """
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
-    gradient, hessian = likelihood.derivatives(p)
+    points = likelihood._at(p)
+    gradient, hessian = likelihood.derivatives(p, points)
     try:
-        np.linalg.cholesky(hessian)  # exists at a maximum only
+        root = np.linalg.cholesky(hessian)  # exists at a maximum only
     except np.linalg.LinAlgError:
-        return p[:n], np.full((n, n), np.nan), np.inf
+        return Marginal(p[:n], np.full((n, n), np.nan), np.inf)
     cov = np.linalg.inv(hessian)
     # The search ends at a small gradient: one Newton step to the centre of the normal.
     step = cov @ gradient
-    p, decrement = p - step, float(gradient @ step)
+    decrement = float(gradient @ step)
+    evidence = 0.5 * decrement - likelihood.value(p, points) - np.log(np.diag(root)).sum()
+    p = p - step
     groups = (layout.shared, layout.common, layout.bends)
     index = np.array([unknown for group in groups for unknown in group], dtype=int)
     precision = np.linalg.inv(cov[np.ix_(index, index)])
     follow = cov[:n, index] @ precision  # regression of ln f and ln ζ on these unknowns
-    weight, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])
+    gain, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])
+    weight = softmax(gain)
     moved = (mean - p[index]) @ follow.T
     estimate = p[:n] + weight @ moved
     apart = p[:n] + moved - estimate
     less = cov[np.ix_(index, index)] - np.tensordot(weight, narrowed, axes=1)
     cov = cov[:n, :n] - follow @ less @ follow.T + (weight[:, None] * apart).T @ apart
-    return estimate, np.asarray(cov, dtype=np.float64), decrement
+    evidence += logsumexp(gain) - layout.n_bumps * np.log(likelihood.bump_std)
+    return Marginal(estimate, np.asarray(cov, dtype=np.float64), decrement, float(evidence))
 
 
 def _narrow(
@@ -496,7 +580,7 @@ def _narrow(
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Evaluate narrower priors of groups of unknowns, whose posterior is normal under the widest.
 
-    Returns the normalised evidence of each choice of widths, shape ``(n_choices,)``, and means and
+    Returns the log evidence of each choice over the widest, shape ``(n_choices,)``, and means and
     covariances of the unknowns, ``(n_choices, n)`` and ``(n_choices, n, n)``.
     """
     choices = (constants.WIDTHS_SHARED, constants.WIDTHS_COMMON, constants.WIDTHS_BEND)
@@ -510,5 +594,5 @@ def _narrow(
     shift = mean - x
     cost = np.einsum("ki,ij,kj->k", shift, precision, shift) + np.sum(extra * mean**2, axis=1)
     log_det = np.linalg.slogdet(narrower)[1]
-    weight = softmax(-0.5 * (cost + log_det) - np.log(widths) @ sizes)
-    return np.asarray(weight), mean, cov
+    gain = -0.5 * (cost + log_det) - np.log(widths) @ sizes
+    return np.asarray(gain - gain[-1]), mean, cov

@@ -134,7 +134,23 @@ def test_signal_to_noise_is_that_of_the_modes_in_each_channel() -> None:
         assert found[c, i] == pytest.approx(mode.snr(NOISE) * mode.shape[c] ** 2, rel=1e-10)
 
 
+def test_heights_multiply_the_forces_of_modes_and_not_the_floors() -> None:
+    """A bump as wide as all frequencies is a factor of the forces, shared with floors or not."""
+    target = noisy(2, 3, 8.0)
+    p, height = other_point(target), 0.7
+    wide = target.coloured(np.array([[120.0], [1e6]]), 0.5)
+    stronger = p.copy()
+    own = [target.layout.forces.start + a for a, (i, _) in enumerate(target.layout.force) if i < 2]
+    stronger[own] *= np.exp(height / 2)
+    np.testing.assert_allclose(
+        wide.expected(np.append(p, height)), target.expected(stronger), rtol=1e-8
+    )
+
+
 # Derivatives
+
+
+BUMPS = np.array([[95.0, 104.0, 118.0], [5.0, 5.0, 9.0]])
 
 
 @pytest.mark.slow
@@ -142,6 +158,18 @@ def test_signal_to_noise_is_that_of_the_modes_in_each_channel() -> None:
 @pytest.mark.parametrize(("m", "n"), LAYOUTS)
 def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> None:
     """Gradient and Hessian agree with central differences, with the kernel and without."""
+    check_derivatives(m, n, duration, BUMPS[:, :0])
+
+
+@pytest.mark.parametrize("duration", [1.0, 20.0])
+@pytest.mark.parametrize(("m", "n"), [(1, 1), (2, 3)])
+def test_derivatives_by_heights_are_those_of_the_value(m: int, n: int, duration: float) -> None:
+    """The same with a coloured force."""
+    check_derivatives(m, n, duration, BUMPS)
+
+
+def check_derivatives(m: int, n: int, duration: float, bumps: np.ndarray) -> None:
+    """Compare with central differences."""
     target = noisy(m, n, duration, count=3)
     (block,) = target.blocks
     assert (block.kernel is not None) == (duration < 5)
@@ -149,6 +177,7 @@ def test_derivatives_are_those_of_the_value(m: int, n: int, duration: float) -> 
         cut = slice(200, 1400, 13)
         block = MeanOrdinates(block.frequency[cut], block.matrix[cut], 1.0 + block.count[cut], None)
         target = replace(target, blocks=(block,))
+    target = target.coloured(bumps, 0.5)
     p = other_point(target, m + 1)
     gradient, hessian = target.derivatives(p)
     # In units in which all unknowns weigh alike, along some directions that mix them all.
@@ -398,7 +427,7 @@ def test_it_lies_between_nothing_shared_and_anything_shared(m: int, n: int) -> N
     """Deviations are at least those with the shared parts known, at most those with wide priors."""
     target = noisy(m, n, 7.0)
     p = fitted(target)
-    mean, cov, decrement = marginalise(target, p)
+    mean, cov, decrement, _ = marginalise(target, p)
     assert decrement < 1e-2
     hessian = target.derivatives(p)[1]
     layout = target.layout
@@ -417,7 +446,7 @@ def test_it_lies_between_nothing_shared_and_anything_shared(m: int, n: int) -> N
 def test_without_anything_shared_the_narrow_priors_win() -> None:
     """Without shared forces the truth is the mean, and half the information at most is lost."""
     target = scatter_free(MODES[:1], 2, 30.0)
-    mean, cov, _ = marginalise(target, fitted(target))
+    mean, cov, *_ = marginalise(target, fitted(target))
     std = np.sqrt(np.diag(cov))
     assert np.abs((mean - target.start[:2]) / std).max() < 0.1
     known = np.linalg.inv(target.derivatives(target.start)[1][:2, :2])
@@ -433,7 +462,7 @@ def test_floors_that_share_much_pull_the_wide_priors_in() -> None:
     block = block_of([spectrum_of(x[:, :, None] * x[:, None].conj(), 30.0)])
     target = replace(truth, blocks=(block,))
     optimum = fitted(target)
-    mean, cov, _ = marginalise(target, optimum)
+    mean, cov, *_ = marginalise(target, optimum)
     std = np.sqrt(np.diag(cov))
     assert np.abs((mean - optimum[:2]) / std).max() < 0.3
     assert np.abs((mean - truth.start[:2]) / std).max() < 4
@@ -448,6 +477,27 @@ def test_where_there_is_no_maximum_it_says_so() -> None:
     assert marginalise(target, off)[2] > 1
     saddle = p.copy()
     saddle[0] += 0.15
-    _, cov, decrement = marginalise(target, saddle)
+    _, cov, decrement, evidence = marginalise(target, saddle)
     assert decrement == np.inf
     assert np.isnan(cov).all()
+    assert evidence == -np.inf
+
+
+def test_evidence_is_the_integral_over_a_height() -> None:
+    """Of one height, all else at its conditional maximum and Laplace's normal about it."""
+    target = noisy(1, 1, 7.0)
+    coloured = target.coloured(np.array([[107.0], [6.0]]), 0.2)
+    p = coloured.minimise(coloured.start)
+    found = marginalise(coloured, p)
+    heights = np.linspace(-0.8, 0.8, 17)
+    logs = []
+    for height in heights:
+        # A prior as narrow as this holds the height.
+        held = target.coloured(coloured.bumps, 1e-4)
+        held = replace(held, start=np.append(held.start[:-1], height))
+        q = held.minimise(np.append(p[:-1], height))
+        logs.append(marginalise(held, q).log_evidence - 0.5 * (height / 0.2) ** 2)
+    grid = np.exp(np.array(logs) - max(logs)).sum() * (heights[1] - heights[0])
+    # Of a normal that is as narrow, the integral is one.
+    integral = max(logs) + np.log(grid / (0.2 * np.sqrt(2 * np.pi)))
+    assert found.log_evidence == pytest.approx(integral, abs=0.1)
