@@ -13,7 +13,6 @@ import atexit
 import faulthandler
 import json
 import os
-import pickle
 import signal
 import subprocess
 import sys
@@ -50,9 +49,9 @@ class _Request(NamedTuple):
     """Arguments of `load_by`, and what the process may take: seconds, and bytes of memory."""
 
     form: str
-    load: Load
-    path: Path
-    columns: ColumnMap
+    load: str  # module and name of the function
+    path: str
+    columns: dict[str, Any]  # of a `ColumnMap`
     max_memory: float
     seconds: float
     memory: float
@@ -101,7 +100,8 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
     stored = path.stat().st_size
     memory = max(3 * constants.SMALL_ENOUGH, min(max_memory, 4 * stored))
     seconds = _max_seconds() + stored / constants.SLOWEST_READING
-    arguments = form.name, form.load, path.absolute(), columns, max_memory
+    load = f"{form.load.__module__}:{form.load.__qualname__}"
+    arguments = form.name, load, str(path.absolute()), msgspec.to_builtins(columns), max_memory
     request = _Request(*arguments, seconds, memory, form.library)
     try:
         return _reader.read(request)
@@ -170,7 +170,7 @@ class _Reader:
     def _exchange(self, request: _Request) -> Content:
         """Send a request and receive samples and content, or raise the refusal."""
         requests, answers = self.process.stdin, self.process.stdout
-        pickle.dump(request, requests)
+        requests.write(json.dumps(request).encode() + b"\n")
         requests.flush()
         spools: dict[int, Spool] = {}
         while True:
@@ -252,17 +252,16 @@ def serve(file: str) -> None:
     window = np.asarray(np.memmap(file, np.uint8, "r+", shape=_WINDOW))
     answers.write(b"\n")
     answers.flush()
-    with suppress(EOFError):
-        while True:
-            request = pickle.load(sys.stdin.buffer)
-            with suppress(ImportError):  # the function of the format refuses the file
-                import_module(request.library)
-            _limit_memory(request.memory)
-            # A thread that no library can hold ends the process.
-            with open(os.devnull, "w") as nowhere:
-                faulthandler.dump_traceback_later(request.seconds, exit=True, file=nowhere)
-                _respond(request, answers, window)
-                faulthandler.cancel_dump_traceback_later()
+    while line := sys.stdin.buffer.readline():
+        request = _Request(*json.loads(line))
+        with suppress(ImportError):  # the function of the format refuses the file
+            import_module(request.library)
+        _limit_memory(request.memory)
+        # A thread that no library can hold ends the process.
+        with open(os.devnull, "w") as nowhere:
+            faulthandler.dump_traceback_later(request.seconds, exit=True, file=nowhere)
+            _respond(request, answers, window)
+            faulthandler.cancel_dump_traceback_later()
 
 
 def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
@@ -285,12 +284,16 @@ def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
 
     Spool.send = send
     try:
-        content = load_by(*request[:5])
-        columns = {
+        module, name = request.load.split(":")
+        load: Load = getattr(import_module(module), name)
+        columns = msgspec.convert(request.columns, ColumnMap)
+        path, most = Path(request.path), request.max_memory
+        content = load_by(request.form, load, path, columns, most)
+        own = {
             name: numbers.setdefault(spool, len(numbers)) for name, spool in content.columns.items()
         }
         parts = content.metadata, content.present, content.refused, content.guessed
-        write(_Content(columns, *parts))
+        write(_Content(own, *parts))
     except Unusable as error:
         write(_Refused(error.reason, error.detail))
     answers.flush()
