@@ -35,10 +35,14 @@ from lmshealth import identify
 from studies.blind_modes.worlds import FAMILIES, World, log_of
 from studies.common.cost import one_thread
 from studies.common.metrics import clopper_pearson
-from studies.harness.claims import Claim, span
+from studies.harness.claims import Claim, Older, span
 from studies.harness.study import Study, judge_scores, spawn_pool
 
 STEP = "identify"
+
+OLDER = {
+    "result": Older("8a9ca918cc0a", "modes were averaged over coloured forces"),
+}
 # Records of each family, and those on which peers run, too.
 SEEDS = {"four modes": 64, "varied": 64, "eight modes": 40, "turbine": 16}
 PEER_SEEDS = {"four modes": 16, "varied": 16, "eight modes": 6, "turbine": 2}

@@ -33,10 +33,14 @@ from numpy.typing import NDArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, associate
 from studies.crossings.lives import KINDS, Life, judge, make_life, nearest, recovered
-from studies.harness.claims import Claim, counted, percents
+from studies.harness.claims import Claim, Older, counted, percents
 from studies.harness.study import Row, Study, share_row
 
 STEP = "track"
+
+OLDER = {
+    "result": Older("5933b8d07b82", "machines could run in before they wear"),
+}
 
 SEED = 20261124
 N_LIVES = 200

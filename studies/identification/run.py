@@ -30,12 +30,16 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
-from studies.harness.claims import Claim, covered, number, percents, span
+from studies.harness.claims import Claim, Older, covered, number, percents, span
 from studies.harness.study import Row, Study, judge_coverage, judge_scores
 from studies.identification.cases import CASES, HEADLINE, Case
 from studies.identification.records import Array, describe
 
 STEP = "identify"
+
+OLDER = {
+    "result": Older("c7655c6e007c", "modes were averaged over coloured forces"),
+}
 
 FACTOR = 1.5
 CHUNK = 50

@@ -34,12 +34,16 @@ from importlib.util import find_spec
 import numpy as np
 
 from studies.common.cost import in_own_process, one_thread
-from studies.harness.claims import Claim, span
+from studies.harness.claims import Claim, Older, span
 from studies.harness.study import NOMINAL, Row, Study, judge_coverage, judge_scores, spawn_pool
 from studies.identification.cases import CASES, Case
 from studies.identification.records import Array
 
 STEP = "identify"
+
+OLDER = {
+    "result": Older("327fbb0e8da8", "modes were averaged over coloured forces"),
+}
 OURS = "lmshealth"
 
 PACKAGES = {"pyoma2": "pyOMA-2", "pyOMA": "pyoma-toolbox"}

@@ -37,11 +37,15 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from studies.harness.claims import Claim, counted, number
+from studies.harness.claims import Claim, Older, counted, number
 from studies.harness.study import Row, Study, real_data
 from studies.new_machine.cut import APART_H, SLOWER
 
 STEP = "infer"
+
+OLDER = {
+    "result": Older("9841f4ed50d5", "modes were averaged over coloured forces"),
+}
 
 HERE = Path(__file__).parent
 ROOT = HERE.parent.parent
