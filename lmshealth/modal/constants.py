@@ -71,9 +71,9 @@ LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30
 # Mean square of the intensity of a mode's excitation over the square of its mean, flagged as
 # unsteady: intervals are wider by a tenth; and standard deviations of steady noise above one.
 UNSTEADY, UNSTEADY_SIGMAS = 1.2, 5.0
-# Standard deviations of the heights of the log spectrum of coloured forces, and probability of one
-# from which on modes are flagged.
-WIDTHS_COLOUR, COLOURED = (0.2, 0.5), 0.99
+# Standard deviations of the heights of the log spectrum of coloured forces, prior probability of
+# them, and probability of one from which on modes are flagged.
+WIDTHS_COLOUR, COLOURED_PROBABILITY, COLOURED = (0.2, 0.5), 0.2, 0.99
 # Fourier frequencies in the half-power bandwidth below which a mode is flagged resolution-limited.
 RESOLVED = 4.0
 # Share of the search, or of the span of dampings, beyond which a mode is flagged at-bound.

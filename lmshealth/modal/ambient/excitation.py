@@ -119,7 +119,9 @@ def average_colours(
                 break
     if len(found) == 1:
         return Colour(white.mean, white.cov, 1.0)
-    weight = softmax([one.log_evidence for one in found])
+    chance, n_widths = constants.COLOURED_PROBABILITY, len(constants.WIDTHS_COLOUR)
+    prior = np.array([1 - chance] + [chance / n_widths] * (len(found) - 1))
+    weight = softmax([one.log_evidence for one in found] + np.log(prior))
     mean = weight @ [one.mean for one in found]
     apart = np.array([one.mean for one in found]) - mean
     cov = np.tensordot(weight, [one.cov for one in found], axes=1)
