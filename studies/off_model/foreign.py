@@ -39,11 +39,15 @@ from lmshealth.tracking.association import associate
 from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.track import track
 from studies.common.histories import START
-from studies.harness.claims import Claim, counted
+from studies.harness.claims import Claim, Older, counted
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import Array
 
 STEP = "track"
+
+OLDER = {
+    "foreign": Older("11a4092d6a3a", "machines could run in before they wear"),
+}
 
 SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50
 FACTORS = (0.25, 1.0, 4.0, 8.0, 15.0)

@@ -34,11 +34,15 @@ from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.track import Track, track
-from studies.harness.claims import Claim, counted, number
+from studies.harness.claims import Claim, Older, counted, number
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import COURSES, DISTURBANCES, MODES, Array, life_of
 
 STEP = "track"
+
+OLDER = {
+    "result": Older("e20a80285bb3", "machines could run in before they wear"),
+}
 LIVES, QUICK_LIVES = 100, 2
 LOSING = ", losing 5 %"
 # Worlds that lose 5 % of preload: what detection costs, and whether drifts are held.

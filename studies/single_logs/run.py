@@ -10,10 +10,9 @@ Method
     Controls on the same logs: the likelihood with a force that is steady and white, and
     frequencies that soften without the covariate.
 Answer
-    Where the force is not steady or not white, and where frequencies soften, intervals hold as
-    often as where the model is right, and the controls do not. Most of the modes concerned have a
-    flag. A hump of the force may look like a further resonance, beside which a name is doubtful or
-    refused.
+    Not recorded yet. Of 60 logs with a hump of the force 93 % of the intervals of f held in
+    development (57 % for a white force), at 1.05 times the width in steady records. A hump may look
+    like a further resonance, beside which a name is doubtful or refused.
 Run time
     Five minutes on one processor.
 """
