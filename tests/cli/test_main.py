@@ -239,13 +239,14 @@ def test_saved_modes_are_a_description_that_finds_them_again(folder: Path, tmp_p
     found = strict(result.stdout)["modes"]
     again = strict(call("modes", log, "--stage", path, *style).stdout)["modes"]
     assert [mode["mode"] for mode in again] == [mode["mode"] for mode in found] != []
-    # The band of the fit is another one, and so is what is known of the force.
+    # The band of the fit is another one, and so is what it tells of the force: damping ratios of
+    # one record of 20 s differ by about a standard deviation.
     for one, other in zip(again, found, strict=True):
         for key, std in (
             ("frequency_hz", "frequency_std_hz"),
             ("damping_ratio", "damping_ratio_std"),
         ):
-            assert abs(one[key] - other[key]) < max(one[std], other[std])
+            assert abs(one[key] - other[key]) < 2 * max(one[std], other[std])
     written = path.read_text()
     for more in ((log, "--save", path), (log, log, "--save", tmp_path / "b.toml"),
                  (log, "--save", tmp_path / "b.txt"),
