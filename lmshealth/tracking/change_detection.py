@@ -154,23 +154,26 @@ def _gains(
     gains["drift", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
-        begun = restart(model, before[before.hyperparameters.healthy])
-        begun = begun[~begun.hyperparameters.healthy]
-        changed = advance(model, begun, j, now).log_evidence - begun.log_evidence
-        unchanged = checkpoints[now].log_evidence - before.log_evidence
-        gains["drift", "", j] = changed - unchanged + place
+        healthy = before[before.hyperparameters.healthy]
+        gains["drift", "", j] = begun(model, checkpoints, now, j, healthy)[1] + place
     return gains
 
 
 def begun(
-    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, first: int
+    model: FilterModel,
+    checkpoints: Mapping[int, FilterBank],
+    now: int,
+    first: int,
+    before: FilterBank,
 ) -> tuple[FilterBank, float]:
-    """Return the filters of a machine that changes anew since a log, and their log Bayes factor."""
-    before = checkpoints[first - 1]
+    """Return the filters of a machine that changes anew since a log, and their log Bayes factor.
+
+    ``before`` are those filters of the checkpoint before it that are followed by the change.
+    """
     anew = restart(model, before)
     anew = anew[~anew.hyperparameters.healthy]
     after = advance(model, anew, first, now)
-    unchanged = checkpoints[now].log_evidence - before.log_evidence
+    unchanged = checkpoints[now].log_evidence - checkpoints[first - 1].log_evidence
     return after, after.log_evidence - anew.log_evidence - unchanged
 
 

@@ -134,7 +134,7 @@ class FilterBank(Rows):
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of the mixture, of the first `size` entries of the state."""
         part = slice(size)
-        return _mixture(self.weight, self.mean[:, part], self.cov[:, part, part])
+        return mixture(self.weight, self.mean[:, part], self.cov[:, part, part])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -279,7 +279,7 @@ def update(
     total = matrix @ crossed + errors
     _diagonal(total, slice(0, value.size))[:] += model.extra[k, rows]
     off = value - bank.mean @ matrix.T
-    centre, cov = _mixture(bank.weight, off, total)
+    centre, cov = mixture(bank.weight, off, total)
     standardised = centre / np.sqrt(cov.diagonal())
     found = [_condition(bank, crossed, off, total)]
     mode, own = model.mode_of[rows], errors.diagonal(axis1=1, axis2=2)
@@ -391,9 +391,7 @@ def restart(model: FilterModel, bank: FilterBank, *, anew: bool = False) -> Filt
     return FilterBank(grid, log_weight, mean, cov)
 
 
-def _mixture(
-    weight: FloatArray, mean: FloatArray, cov: FloatArray
-) -> tuple[FloatArray, FloatArray]:
+def mixture(weight: FloatArray, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return mean and covariance of a mixture of ``(n, size)`` means and their covariances."""
     centre = weight @ mean
     off = mean - centre

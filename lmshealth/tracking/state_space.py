@@ -43,10 +43,10 @@ class StateSpace:
         clock = np.maximum.accumulate(clock)
         logs = (np.cumsum(self.seen) - 1) / np.where(clock > 0, clock, 1.0)
         self.ticks = np.diff(clock, prepend=0.0) * logs / constants.LOGS_PER_LIFE
-        logs = np.cumsum(self.ticks) * constants.LOGS_PER_LIFE
+        since = np.cumsum(self.ticks) * constants.LOGS_PER_LIFE / constants.SETTLING_LOGS
         for first in history.baselines:  # a machine settles anew after work on it
-            logs[first:] -= logs[first]
-        left = np.exp(-logs / constants.SETTLING_LOGS)
+            since[first:] -= since[first]
+        left = np.exp(-since)
         self.settling = np.maximum(-np.diff(left, prepend=1.0), 0.0)
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]

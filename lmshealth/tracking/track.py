@@ -32,6 +32,7 @@ from lmshealth.tracking.filter_bank import (
     FilterBank,
     FilterModel,
     initial,
+    mixture,
     predict,
     restart,
     update,
@@ -385,16 +386,21 @@ class _Tracker:
             stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
             before = self.checkpoints[k - 1].padded(stepped.space.size)
             other = update(stepped, predict(stepped, before, k), k, outliers=False)[0]
-            mean, cov = _mixture(mean, cov, *other.collapse(self.size), 0.5)
+            mean, cov = self._mixed(other, 0.5)
         else:
             first = suspect(self.sums[: k + 2], self.first, [], constants.BEGUN_GATE)
             if first is not None and first - 1 in self.checkpoints:
                 # No alarm yet, or an older rate: the rate may be another one since then.
-                other, evidence = begun(self.model, self.checkpoints, k, first)
-                chance = expit(evidence + logit(constants.BEGUN_PROBABILITY))
-                mean, cov = _mixture(mean, cov, *other.collapse(self.size), chance)
+                before = self.checkpoints[first - 1]
+                other, evidence = begun(self.model, self.checkpoints, k, first, before)
+                mean, cov = self._mixed(other, expit(evidence + logit(constants.BEGUN_PROBABILITY)))
         self.mean[k], self.cov[k] = mean, cov
         self.noise_scale[k] = self.bank.weight @ self.bank.hyperparameters.scales
+
+    def _mixed(self, other: FilterBank, chance: float) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the bank and another one, which has this probability."""
+        means, covs = zip(*(one.collapse(self.size) for one in (self.bank, other)), strict=True)
+        return mixture(np.array([1 - chance, chance]), np.stack(means), np.stack(covs))
 
     def _dof(self) -> FloatArray:
         """Count the innovations of each log; the first estimate of a mode has none."""
@@ -489,15 +495,6 @@ class _Tracker:
                 for i, mode in enumerate(self.history.modes)
             ]
         return events
-
-
-def _mixture(
-    mean: FloatArray, cov: FloatArray, other: FloatArray, other_cov: FloatArray, chance: float
-) -> tuple[FloatArray, FloatArray]:
-    """Return mean and covariance of a mixture of two states, the other with a probability."""
-    off = other - mean
-    between = chance * (1 - chance) * np.outer(off, off)
-    return mean + chance * off, (1 - chance) * cov + chance * other_cov + between
 
 
 def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -154,7 +154,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     disagrees = sum(not row["blind"]["consistent"] for row in repeats)
     yield counted(
-        "without the roller position, the tracker says that it does not agree with its logs",
+        "repeats in which the consistency test fails without the roller position",
         disagrees,
         len(repeats),
         "repeats",

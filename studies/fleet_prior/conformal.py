@@ -44,7 +44,8 @@ from studies.common.histories import make_history
 from studies.fleet_prior.lives import machine
 from studies.harness.claims import Claim, counted, number
 from studies.harness.study import Row, Study
-from studies.off_model.worlds import LN_F, LN_ZETA, LOST_AT_LIMIT, MODES, STD_F, STD_ZETA, Array
+from studies.off_model.remaining import course
+from studies.off_model.worlds import LN_F, LN_ZETA, MODES, STD_F, STD_ZETA, Array
 
 STEP = "prognose, young machines"
 SEED = 20261125
@@ -83,19 +84,6 @@ def main() -> None:
 def stage() -> Stage:
     """Load the description of all fleets."""
     return machine()
-
-
-def course(rng: np.random.Generator, kind: str) -> Callable[[Array], Array]:
-    """Draw the lost share of the preload over the share of the life, which ends at 1."""
-    full = LOST_AT_LIMIT
-    if kind == "late":
-        slow, power = rng.uniform(0.1, 0.3), rng.uniform(5, 9)
-        return lambda u: full * (slow * u + (1 - slow) * u**power)
-    if kind == "bathtub":
-        early, even, power = *rng.uniform(0.02, 0.05, 2), rng.uniform(7, 11)
-        rest = full - early - even
-        return lambda u: early * -np.expm1(-u / 0.03) + even * u + rest * u**power
-    return lambda u: full * u
 
 
 def history_of(

@@ -36,7 +36,7 @@ import numpy as np
 
 from lmshealth.errors import NotConverged
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import passages
+from lmshealth.prognosis.remaining_life import parameters_with_limit, passages
 from lmshealth.stage.description import Stage, load_stage
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
 from studies.harness.claims import Claim, Older, ranked
@@ -130,8 +130,8 @@ def true_quantities(drawn: Life, rng: np.random.Generator) -> Array:
 def quantities(found: LifePosterior, now: float, rng: np.random.Generator) -> Array:
     """Return what a posterior states of the same, ``(n_draws, n)``."""
     horizon = 1000 * machine().description.usage.horizon_km
-    told = [(j, p) for j, p in enumerate(machine().parameters) if p.limit is not None]
-    left, _ = passages(found, told, rng, now=now, horizon=horizon)
+    limited = parameters_with_limit(machine())
+    left, _ = passages(found, limited, rng, now=now, horizon=horizon)
     left[left > horizon] = np.inf
     n = found.rate.shape[0]
     paths = [

@@ -5,8 +5,8 @@ process per session reads such files, one after the other. It starts with the fi
 ends with this one. It is no fork, which is unsafe beside threads, and does not import the module
 ``__main__`` of a user. Requests and answers pass through its standard input and output, samples
 through a temporary file that both processes map, so that no shared memory of the system is needed.
-Answers are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
-their sender.
+Both are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
+the sender of an answer.
 """
 
 import atexit
