@@ -171,6 +171,8 @@ def schedule(plan: Plan) -> list[Visit]:
     travel = end_km * np.clip(share, 0.0, 1.0)
     travel[0] = end_km * 0.001
     if plan.logs > 1:
+        # Of many logs the second is near the first.
+        travel[0] = min(travel[0], travel[1] / 2)
         travel[-1] = end_km
     life, suffix = plan.draw_life(), file_suffix(plan.file_format)
     # Daily use varies; a long gap averages it out.

@@ -129,6 +129,12 @@ def test_schedule_runs_forward():
         assert 1400 <= travel[-1] <= 2000
 
 
+def test_many_logs_run_forward():
+    """The second of thousands of logs is not before the first."""
+    travel = [visit.travel_km for visit in schedule(Plan("lms-y", "both", 3000, 1.0, 0))]
+    assert np.all(np.diff(travel) > 0)
+
+
 def test_now_does_not_depend_on_the_life():
     """Every life of a seed has the same odometer readings."""
     readings = {
