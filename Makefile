@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo picture check test slow coverage statistics bench fuzz compat clean
+.PHONY: demo picture check test slow coverage statistics bench fuzz compat lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -62,6 +62,22 @@ fuzz: .venv/installed
 compat: .venv/installed
 	$(BIN)/python tests/compat.py
 
+# Versions and hashes of all that development needs; `make locked` installs just these.
+lock: .venv/installed
+	$(BIN)/uv pip compile --quiet --universal --python-version 3.11 --extra dev --generate-hashes \
+		--no-annotate --no-header --no-emit-index-url pyproject.toml -o tests/requirements.lock
+
+locked:
+	$(PYTHON) -m venv --clear .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check --require-hashes -r tests/requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps --editable .
+	@touch .venv/installed
+
+# Bill of materials of the environment (CycloneDX), with licences.
+sbom: .venv/installed
+	$(BIN)/uv tool run --from cyclonedx-bom cyclonedx-py environment .venv/bin/python \
+		--pyproject pyproject.toml --output-reproducible -o sbom.json
+
 # Reinstall when pyproject.toml is newer than the installation.
 .venv/installed: pyproject.toml
 	$(PYTHON) -m venv .venv
@@ -69,4 +85,4 @@ compat: .venv/installed
 	@touch $@
 
 clean:
-	rm -rf .venv $(DEMO) build .coverage .coverage.* *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf .venv $(DEMO) sbom.json build .coverage .coverage.* *.egg-info .pytest_cache .mypy_cache .ruff_cache

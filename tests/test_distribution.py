@@ -1,0 +1,135 @@
+"""What is distributed: the wheel holds the whole package, and dependencies have known licences."""
+
+import re
+import shutil
+import subprocess
+import sys
+import zipfile
+from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+
+ROOT = Path(__file__).parents[1]
+# Extras that people install to use the package; `peers` and `dev` stay with who develops it.
+EXTRAS = ("models", "formats", "pdf", "postgres", "distributed")
+PERMISSIVE = re.compile(
+    r"0BSD|Apache|BSD|CC0|HPND|ISC|MIT|PSF|Python[- ](2|Software)|Unlicense|Zlib|MPL|Mozilla"
+)
+STRONG_COPYLEFT = re.compile(r"(?<![A-Z])A?GPL")
+# Libraries that are imported and not changed, in extras only.
+WEAK_COPYLEFT = {"nptdms", "psycopg", "psycopg-binary", "pyphen"}
+
+
+def normal(name: str) -> str:
+    """Return the normalised name of a distribution."""
+    return re.sub(r"[-_.]+", "-", name).lower()
+
+
+def needed(name: str, extras: frozenset[str], found: dict[str, Distribution]) -> None:
+    """Collect the installed distributions that one needs, with those that these need."""
+    own = distribution(name)
+    for text in own.requires or ():
+        requirement = Requirement(text)
+        marker = requirement.marker
+        if marker and not any(marker.evaluate({"extra": e}) for e in (*extras, "")):
+            continue
+        other = normal(requirement.name)
+        if other == "lmshealth" or other in found:
+            continue
+        try:
+            found[other] = distribution(requirement.name)
+        except PackageNotFoundError:
+            continue  # an extra that is not installed
+        needed(requirement.name, frozenset(requirement.extras), found)
+
+
+def licence(one: Distribution) -> str:
+    """Return the licence that a distribution states: as expression, classifiers or first line."""
+    stated = one.metadata.get("License-Expression") or ""
+    classifiers = one.metadata.get_all("Classifier") or ()
+    stated = stated or " ".join(c for c in classifiers if c.startswith("License ::"))
+    return stated or (one.metadata.get("License") or "").strip().partition("\n")[0]
+
+
+def refused(licences: dict[str, str]) -> dict[str, str]:
+    """Return the distributions whose licence is neither permissive nor known."""
+    return {
+        name: text
+        for name, text in licences.items()
+        if name not in WEAK_COPYLEFT
+        and (not PERMISSIVE.search(text) or STRONG_COPYLEFT.search(text))
+    }
+
+
+def test_licences_of_dependencies() -> None:
+    """All dependencies have a permissive licence, or are named; a strong copyleft is refused."""
+    found: dict[str, Distribution] = {}
+    needed("lmshealth", frozenset(EXTRAS), found)
+    assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= set(found)
+    licences = {name: licence(one) for name, one in found.items()}
+    unstated = {"partd"}  # its licence is a file: BSD-3-Clause
+    assert not refused({k: v for k, v in licences.items() if k not in unstated})
+    strange = {"other": "GPL-3.0-or-later", "both": "MIT AND AGPL-3.0", "none": ""}
+    assert refused(strange) == strange
+
+
+def test_core_has_no_copyleft() -> None:
+    """Without extras nothing is under any copyleft but MPL."""
+    found: dict[str, Distribution] = {}
+    needed("lmshealth", frozenset(), found)
+    assert not WEAK_COPYLEFT & set(found)
+
+
+def test_lock_holds_what_is_declared() -> None:
+    """The lock file for development has every direct dependency, with hashes and no address."""
+    text = (ROOT / "tests" / "requirements.lock").read_text()
+    locked = {normal(name) for name in re.findall(r"^([\w.\-]+)==", text, re.M)}
+    requirements = map(Requirement, distribution("lmshealth").requires or ())
+    direct = {
+        normal(r.name)
+        for r in requirements
+        if not r.marker or any(r.marker.evaluate({"extra": e}) for e in (*EXTRAS, "dev", ""))
+    }
+    assert direct - locked == {"lmshealth"} & direct
+    assert text.count("--hash=sha256:") >= len(locked)
+    assert "://" not in text
+
+
+@pytest.mark.slow
+def test_wheel_works_on_its_own(tmp_path: Path) -> None:
+    """A wheel built from the sdist has all modules and data, and its program runs elsewhere."""
+    source = tmp_path / "source"
+    tracked = subprocess.run(
+        ["git", "ls-files", "lmshealth", "pyproject.toml", "README.md", "LICENSE"],
+        cwd=ROOT, check=True, capture_output=True, text=True,
+    ).stdout.split()  # fmt: skip
+    for name in tracked:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
+    built = tmp_path / "built"
+    # Without a format both are built: the sdist, and the wheel from it.
+    subprocess.run(
+        [sys.executable, "-m", "build", "--outdir", built, source], check=True, capture_output=True
+    )
+    (wheel,) = built.glob("*.whl")
+    assert list(built.glob("*.tar.gz"))
+    inside = set(zipfile.ZipFile(wheel).namelist())
+    expected = {n for n in tracked if n.startswith("lmshealth/") and not n.endswith(".md")}
+    assert expected <= inside
+    assert not [n for n in inside if n.split("/")[0] in ("models", "tests", "studies")]
+
+    place = tmp_path / "installed"
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(place)
+    libraries = Path(pytest.__file__).parents[1]
+    program = "import lmshealth.cli.main as m, sys; print(m.__file__); m.main()"
+    answer = subprocess.run(
+        [sys.executable, "-I", "-c", f"import sys; sys.path[:0] = [{str(place)!r}]; {program}",
+         "stage", "lms-y"],
+        cwd=tmp_path, check=True, capture_output=True, text=True,
+    ).stdout  # fmt: skip
+    assert str(libraries) not in answer.splitlines()[0]
+    assert answer.startswith(str(place))
+    assert "guide_preload" in answer
