@@ -5,11 +5,11 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.batch import constants
-from lmshealth.batch.store import Identified, Store
+from lmshealth.batch.store import Identified, OutcomeRow, Store
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
@@ -82,6 +82,25 @@ class _Task:
         return fingerprint(VERSION, self.digest, *as_read, description)
 
 
+class _Outcome(NamedTuple):
+    """What the main process needs of the outcome of a log."""
+
+    key: LogKey
+    description: str
+    machine: str | None
+    refused: tuple[Refusal, ...]  # of the log as a whole
+    row: OutcomeRow | None = None  # packed by the worker, if it is to be stored
+
+    @classmethod
+    def of(cls, task: _Task, found: Identified, *, is_new: bool) -> Self:
+        """Make it from an outcome."""
+        refused = () if isinstance(found.outcome, LogEstimates) else found.outcome
+        key = task.key(found.description)
+        row = OutcomeRow.of(key, task.digest, found) if is_new and found.lasting else None
+        machine = None if refused else found.stage
+        return cls((task.name, key), found.description, machine, refused, row)
+
+
 def ingest(
     folder: Path, stages: Sequence[Stage], resources: Resources, *, out: Path, reading: Reading
 ) -> Ingested:
@@ -100,25 +119,26 @@ def ingest(
     groups: dict[str, dict[str, list[LogKey]]] = {}
     lost: list[Refusal] = []
 
-    def add(task: _Task, found: Identified) -> None:
-        if isinstance(found.outcome, LogEstimates):
-            own = groups.setdefault(str(found.stage), {}).setdefault(found.description, [])
-            own.append((task.name, task.key(found.description)))
-        else:
-            lost.extend(found.outcome)
+    def add(found: _Outcome) -> None:
+        lost.extend(found.refused)
+        if not found.refused:
+            own = groups.setdefault(str(found.machine), {}).setdefault(found.description, [])
+            own.append(found.key)
 
     cached = set()
     for task, outcome in _cached(tasks, stages, store):
-        add(task, outcome)
+        add(_Outcome.of(task, outcome, is_new=False))
         cached.add(task.name)
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in cached]
-    work = partial(identify_log, stages=tuple(stages), max_memory=reading.max_memory)
-    for k, (task, outcome) in enumerate(pool.map_unordered(work, left, _crashed), start=1):
-        if outcome.lasting:
-            store.put_identified(task.key(outcome.description), task.digest, outcome)
-        add(task, outcome)
-        progress("identifying", len(cached) + k, len(tasks))
+    work = partial(_identify_logs, stages=tuple(stages), max_memory=reading.max_memory)
+    done = len(cached)
+    for part in _identified(left, work, pool):
+        store.put_identified(one.row for one in part if one.row is not None)
+        for one in part:
+            add(one)
+        done += len(part)
+        progress("identifying", done, len(tasks))
     names = {name_of(path, folder) for path in found}
     machines, descriptions, others = _grouped(groups, [stage.digest for stage in stages])
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
@@ -228,13 +248,40 @@ def _none_of(stages: Sequence[Stage]) -> str:
     return fingerprint([(stage.name, stage.description.match.stage) for stage in stages])
 
 
-def _crashed(task: _Task, why: str) -> Identified:
+def _identified(
+    left: Sequence[_Task], work: Callable[[Sequence[_Task]], list[_Outcome]], pool: Pool
+) -> Iterator[list[_Outcome]]:
+    """Identify logs, several in one task; those of a task that ended its worker one by one."""
+    size = min(constants.LOGS_PER_TASK, max(1, len(left) // (4 * pool.size)))
+    parts = [tuple(left[first : first + size]) for first in range(0, len(left), size)]
+    lost: list[tuple[_Task, ...]] = []
+    for part, outcomes in pool.map_unordered(work, parts, lambda part, why: []):
+        lost += [] if outcomes else [(task,) for task in part]
+        yield outcomes
+    for _, outcomes in pool.map_unordered(work, lost, _crashed):
+        yield outcomes
+
+
+def _crashed(tasks: Sequence[_Task], why: str) -> list[_Outcome]:
+    return [_Outcome.of(task, _end_of_worker(task, why), is_new=True) for task in tasks]
+
+
+def _end_of_worker(task: _Task, why: str) -> Identified:
     needed = "no other log is affected; run again with fewer --workers"
     refusal = Refusal(task.name, "crashed", f"{why} (crash or out of memory); {needed}")
     return Identified((refusal,), lasting=False)
 
 
-def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> Identified:
+def _identify_logs(
+    tasks: Sequence[_Task], stages: tuple[Stage, ...], max_memory: float
+) -> list[_Outcome]:
+    """Read and identify logs, and pack their outcomes where these are to be stored."""
+    return [
+        _Outcome.of(task, _identify_log(task, stages, max_memory), is_new=True) for task in tasks
+    ]
+
+
+def _identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> Identified:
     """Read and identify one log; every failure becomes its refusal, never an exception."""
     by, stage, asked = "", None, None
     try:

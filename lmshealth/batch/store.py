@@ -13,7 +13,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Self, cast
+from typing import Any, NamedTuple, Self, cast
 from urllib.parse import quote
 
 import sqlalchemy as sql
@@ -98,6 +98,22 @@ class Identified:
             return replace(self, outcome=_renamed(self.outcome, log))
         modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
+
+
+class OutcomeRow(NamedTuple):
+    """Packed outcome of a log under its key; digests of its content and of the description used."""
+
+    key: str
+    digest: str
+    description: str
+    machine: str | None
+    content: bytes
+
+    @classmethod
+    def of(cls, key: str, digest: str, found: Identified) -> Self:
+        """Pack an outcome."""
+        machine = found.stage if isinstance(found.outcome, LogEstimates) else None
+        return cls(key, digest, found.description, machine, pack(found))
 
 
 def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
@@ -189,11 +205,11 @@ class Store:
                 rows = connection.execute(query.where(_IDENTIFIED.c.key.in_(part))).all()
             yield from ((row.key, row.content) for row in rows)
 
-    def put_identified(self, key: str, digest: str, found: Identified) -> None:
-        """Store the outcome of a log whose content has a digest."""
-        row = {"key": key, "digest": digest, "description": found.description, "version": VERSION}
-        machine = found.stage if isinstance(found.outcome, LogEstimates) else None
-        self._put(_IDENTIFIED, row | {"machine": machine, "content": pack(found)})
+    def put_identified(self, rows: Iterable[OutcomeRow]) -> None:
+        """Store outcomes of logs in one transaction."""
+        with self._begin() as connection:
+            for row in rows:
+                connection.execute(self._upsert(_IDENTIFIED, row._asdict() | {"version": VERSION}))
 
     # Machines
 

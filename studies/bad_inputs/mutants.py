@@ -357,7 +357,7 @@ def main() -> None:
 
 def damaged_stores(n: int) -> Row:
     """Damage a store at random bytes, and read all that it holds."""
-    from lmshealth.batch.store import Identified, Store, StoreError
+    from lmshealth.batch.store import Identified, OutcomeRow, Store, StoreError
     from lmshealth.io.log import Refusal
 
     held = {
@@ -370,7 +370,7 @@ def damaged_stores(n: int) -> Row:
         path = Path(folder) / "store.sqlite"
         store = Store(f"sqlite:///{path}")
         for key, one in held.items():
-            store.put_identified(key, f"digest-{key}", one)
+            store.put_identified([OutcomeRow.of(key, f"digest-{key}", one)])
         store.close()
         intact = path.read_bytes()
 

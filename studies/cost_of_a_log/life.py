@@ -14,7 +14,7 @@ from lmshealth._serialize import fingerprint
 from lmshealth.batch import run as running
 from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Resources
-from lmshealth.batch.store import Identified, Store, unpack_or_none
+from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
 from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes
@@ -54,7 +54,8 @@ def run_with(logs: list[LogEstimates], stage: Stage, store: Store, out: Path) ->
     keys = []
     for log in logs:
         keys.append((log.log, fingerprint("key", log.digest)))
-        store.put_identified(keys[-1][1], log.digest, Identified(log, stage.digest, NAME))
+        found = Identified(log, stage.digest, NAME)
+        store.put_identified([OutcomeRow.of(keys[-1][1], log.digest, found)])
     machine = Machine(NAME, tuple(keys), stage, NO_MAINTENANCE, EPOCHS, SEED)
     with processes(1) as pool:
         resources = Resources(store, pool)

@@ -22,6 +22,7 @@ from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import (
     Identified,
     Outcome,
+    OutcomeRow,
     Store,
     StoreError,
     default_url,
@@ -79,7 +80,8 @@ def url(store_url: str) -> str:
 
 def put_in(store: Store, key: str, outcome: Outcome) -> None:
     """Keep what became of a log."""
-    store.put_identified(key, "d" * 64, Identified(outcome, "e" * 64, "test-A"))
+    found = Identified(outcome, "e" * 64, "test-A")
+    store.put_identified([OutcomeRow.of(key, "d" * 64, found)])
 
 
 def got_from(store: Store, key: str, log: str) -> Outcome | None:
