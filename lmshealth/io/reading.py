@@ -184,7 +184,9 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     if absent := sorted(set(columns.columns.values()) - set(content.columns) - left_out):
         raise Unusable("columns", f"the column map needs {listed(absent)}; {there}{hint}")
     series = []
-    for source, values in content.columns.items():
+    for source in tuple(content.columns):
+        # Taken out: a log of hundreds of channels is in memory once.
+        values = content.columns.pop(source)
         target = columns.target(source)
         if target is None:
             continue
