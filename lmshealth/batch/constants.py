@@ -42,3 +42,21 @@ instance because a run at the same time removed it."""
 SHORTEST_SECRET = 4
 """Least length of a value of a URL's options that is masked in messages. Shorter values are
 numbers and switches, which occur everywhere in a message."""
+
+STATUS_SCHEMA = 1
+"""Version of the keys of ``status.json`` and of the JSON that alerts get."""
+
+FAILURE_PROBABILITY = 0.5
+"""Probability that a limit is reached now, from which a machine has the state ``FAILURE``: it is
+more probable than not that the machine is outside what its description allows."""
+
+SERVICE_LEAD_DAYS = 30
+"""Days before the service date from which a machine has the state ``MAINTENANCE_REQUIRED``: time to
+plan a service."""
+
+ALERT_TIMEOUT_S = 60
+"""Seconds (s) that an alert command may take before it is killed with its children."""
+
+POINTS_PER_SERIES = 1000
+"""Newest logs of a machine whose frequencies are in the store for dashboards: what a run writes
+there does not grow with the number of logs."""

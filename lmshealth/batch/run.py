@@ -3,15 +3,21 @@
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
+from typing import NamedTuple
+
+import msgspec
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
+from lmshealth.batch.alerts import Alerts, deliver, read_fleet, update_fleet, write_status
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
+from lmshealth.batch.status import Change, Fleet, Status
 from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -49,6 +55,8 @@ class Settings:
         Most memory in bytes that reading a log may take.
     follow_links : bool
         Whether symbolic links out of the folder of logs are followed.
+    alerts : Alerts
+        Which changes since the last run are delivered, and how.
 
     Examples
     --------
@@ -68,6 +76,7 @@ class Settings:
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
     follow_links: bool = False
+    alerts: Alerts = field(default_factory=Alerts)
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""
@@ -76,7 +85,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Result of a run; the counts are 0 in a report."""
+    """Result of a run; in a report counts are 0, and status, changes and alerts empty."""
 
     index: Path  # front page of the report
     rows: tuple[Summary, ...]  # one per machine, most urgent first
@@ -85,6 +94,10 @@ class RunResult:
     n_refused: int = 0  # of them, refused as a whole
     n_remembered: int = 0  # of them, taken from the store
     n_unread: int = 0  # unreadable rows of ``manifest.csv`` and ``maintenance.csv``, or tables
+    # Status of all machines, those of earlier runs with it, and changes since the run before.
+    statuses: tuple[Status, ...] = ()
+    changes: tuple[Change, ...] = ()
+    unsent: dict[str, str] = field(default_factory=dict)  # options whose alerts failed, and why
 
     @property
     def pages(self) -> tuple[Path, ...]:
@@ -156,23 +169,30 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        summaries, excluded, not_reported = _report(usable, refused, resources, out)
+        done = _report(usable, refused, resources, out, settings.alerts)
+    rows = tuple(by_urgency(done.rows.values()))
+    index = write_index(out, rows, refused) if machines else out
+    fleet, unsent = deliver(done.fleet, settings.alerts, out)
+    write_status(out, fleet)
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
+    lost = ({refusal.log for refusal in refused} - copies | done.excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
             f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
+            + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
-    rows = tuple(by_urgency(summaries.values()))
     return RunResult(
-        index=write_index(out, rows, refused),
+        index=index,
         rows=rows,
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
-        failed=failed | not_reported,
+        failed=failed | done.failed,
+        statuses=fleet.machines,
+        changes=done.changes,
+        unsent=unsent,
     )
 
 
@@ -235,20 +255,34 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
     return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
+class _Reported(NamedTuple):
+    """Rows of the index, excluded logs, machines that failed and why, status and its changes."""
+
+    rows: dict[str, Summary]
+    excluded: set[str]
+    failed: dict[str, str]
+    fleet: Fleet
+    changes: tuple[Change, ...]
+
+
 def _report(
-    machines: Sequence[Machine], refused: Sequence[Refusal], resources: Resources, out: Path
-) -> tuple[dict[str, Summary], set[str], dict[str, str]]:
-    """Write pages and tables; return rows of the index, excluded logs, and machines that failed.
+    machines: Sequence[Machine],
+    refused: Sequence[Refusal],
+    resources: Resources,
+    out: Path,
+    alerts: Alerts,
+) -> _Reported:
+    """Write pages and tables, and find what has changed since the last run into this folder.
 
     Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
     refused_key = store.put_refused(tuple(refused))
-    rows, excluded = dict[str, Summary](), set[str]()
+    rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    packed = {"": pack({"refused": refused_rows(refused)})}
+    packed = dict[str, bytes]()
     left = list(machines)
     for attempt in range(constants.ASSESSMENT_ATTEMPTS):
         if attempt:
@@ -263,14 +297,20 @@ def _report(
             store.publish(name, (keys[name], own_keys[name]), refused_key)
             packed[name] = output.tables
             excluded.update(output.excluded)
+            made[name] = output.status
             rows[name] = output.page.summary
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
+    moment = datetime.now(UTC)
+    fleet, changes = update_fleet(read_fleet(out), made, moment, alerts)
+    store.put_status(fleet.machines, changes, moment)
+    changed = [msgspec.to_builtins(change) for change in changes]
+    packed[""] = pack({"refused": refused_rows(refused), "changes": changed})
     write_tables(out, names, packed)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    return rows, excluded, not_updated | unread | failed
+    return _Reported(rows, excluded, not_updated | unread | failed, fleet, tuple(changes))
 
 
 def _outputs(
@@ -298,6 +338,7 @@ def _outputs(
     )
     for name, output in write_pages(records, resources.pool, out):
         if isinstance(output, MachineOutput):
+            store.put_points(name, output.points)
             store.put_part(name, missing[name][1], pack(output))
         yield name, output
 

@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, Self, cast
 from urllib.parse import quote
@@ -25,6 +26,7 @@ from sqlalchemy.schema import CreateTable
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
+from lmshealth.batch.status import Change, Point, Status
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Summary
@@ -48,13 +50,19 @@ _METADATA = sql.MetaData()
 _BYTES, _DIGEST = sql.LargeBinary, sql.String(64)
 _KINDS: dict[str, Any] = {"content": _BYTES, "evidence": _BYTES, "summary": _BYTES}
 _KINDS |= {"number": sql.Integer, "version": sql.Text, "machine": sql.Text, "name": sql.Text}
+_KINDS |= dict.fromkeys(("low", "median", "high", "probability"), sql.Float)
+_KINDS |= dict.fromkeys(("service_by", "inspect_by"), sql.Date)
+_KINDS |= dict.fromkeys(("recorded_at", "noticed_at"), sql.DateTime(timezone=True))
+_KINDS |= dict.fromkeys(("state", "verdict", "service", "alarms", "silent"), sql.Text)
+_KINDS |= dict.fromkeys(("quantity", "subject", "what", "before", "now"), sql.Text)
+_OPTIONAL = {"machine", "low", "median", "high", "probability", "service_by", "inspect_by"}
 
 
 def _table(table: str, keys: str, columns: str) -> sql.Table:
     """Declare a table; keys, and columns of no other kind, are digests."""
     primary = [sql.Column(name, _DIGEST, primary_key=True) for name in keys.split()]
     others = [
-        sql.Column(name, _KINDS.get(name, _DIGEST), nullable=name == "machine")
+        sql.Column(name, _KINDS.get(name, _DIGEST), nullable=name in _OPTIONAL)
         for name in columns.split()
     ]
     return sql.Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
@@ -72,6 +80,12 @@ _PRESENT = _table("present", "machine", "name key refused")
 _REPORTED = _table("reported", "machine key", "number content")
 # Lists of logs that belong to no machine, by the fingerprint of the list.
 _REFUSED = _table("refused", "key", "content")
+# For dashboards: the present status of each machine, its values at logs, changes between runs.
+_SHOWN = "recorded_at verdict probability service service_by inspect_by"
+_STATUS = _table("status", "machine", f"name {_SHOWN} state alarms silent")
+_POINTS = _table("points", "machine key", "name recorded_at quantity subject low median high")
+_CHANGES = _table("changes", "machine key", "name recorded_at noticed_at what before now")
+_VIEWS = {f"lmshealth_{table.name.split('_')[0]}": table for table in (_STATUS, _POINTS, _CHANGES)}
 
 
 # Records
@@ -240,6 +254,30 @@ class Store:
         with self._begin() as connection:
             return {row.key: row.content for row in connection.execute(query)}
 
+    def put_points(self, machine: str, points: Sequence[Point]) -> None:
+        """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
+        rows = [own._asdict() | {"key": fingerprint(own[:3])} for own in points]
+        own, columns = _id(machine), _POINTS.c
+        lasting = columns.quantity == "remaining_km"
+        with self._begin() as connection:
+            connection.execute(sql.delete(_POINTS).where(columns.machine == own, ~lasting))
+            self._put_rows(connection, _POINTS, machine, rows)
+
+    def put_status(
+        self, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
+    ) -> None:
+        """Store the status of machines and what has changed, for dashboards."""
+        with self._begin() as connection:
+            for one in statuses:
+                row = {name: getattr(one, name) for name in _SHOWN.split()}
+                row |= {"state": one.device_health, "alarms": " ".join(one.alarms)}
+                row["silent"] = "yes" if one.silent else "no"
+                self._put_rows(connection, _STATUS, one.stage, [row])
+            for change in changes:
+                row = {name: getattr(change, name) for name in change.__struct_fields__[1:]}
+                row |= {"key": fingerprint(change), "noticed_at": noticed_at}
+                self._put_rows(connection, _CHANGES, change.stage, [row])
+
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
@@ -307,6 +345,18 @@ class Store:
     def _put(self, table: sql.Table, row: dict[str, Any]) -> None:
         with self._begin() as connection:
             connection.execute(self._upsert(table, row))
+
+    def _put_rows(
+        self, connection: Connection, table: sql.Table, machine: str, rows: Sequence[dict[str, Any]]
+    ) -> None:
+        """Write rows of a machine; SQLite knows no zones, so moments are in UTC."""
+        whole = [
+            {"machine": _id(machine), "name": machine}
+            | {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+            for row in rows
+        ]
+        if whole:
+            connection.execute(self._upsert(table, whole[0]), whole)
 
     def _upsert(self, table: sql.Table, row: dict[str, Any], *, where: Any = None) -> Any:
         """Insert or update a row, of another table with ``where``: a later write replaces it."""
@@ -403,10 +453,25 @@ def _create_tables(engine: Engine) -> None:
                 for table in _METADATA.sorted_tables:
                     if table.name not in existing:
                         connection.execute(CreateTable(table, if_not_exists=True))
+                _create_views(connection)
             return
         except SQLAlchemyError:
             if attempt == attempts - 1:
                 raise
+
+
+def _create_views(connection: Connection) -> None:
+    """Create the views of dashboards, or make them those of this schema; rights on them stay."""
+    there = sql.inspect(connection)
+    existing = there.get_view_names()
+    for name, table in _VIEWS.items():
+        if name in existing:
+            if table.name in (there.get_view_definition(name) or ""):
+                continue
+            connection.execute(sql.text(f"DROP VIEW {name}"))
+        names = [column.name for column in table.columns if not column.primary_key]
+        columns = ", ".join("name AS stage" if name == "name" else name for name in names)
+        connection.execute(sql.text(f"CREATE VIEW {name} AS SELECT {columns} FROM {table.name}"))
 
 
 def _reason(error: Exception, address: str) -> str:

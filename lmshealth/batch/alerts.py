@@ -1,0 +1,162 @@
+"""Alerts: changes of machines since the last run, delivered once to a command or a messenger."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from tempfile import TemporaryFile
+
+import msgspec
+
+from lmshealth._files import read_table, write_bytes
+from lmshealth.batch import constants
+from lmshealth.batch.status import Change, Fleet, Status, compare
+from lmshealth.io.refusal import visible
+
+FILE = "status.json"
+"""Status of all machines in the folder of the output: what the next run compares with."""
+
+NOTIFY = "LMSHEALTH_NOTIFY"
+"""Variable of the environment with the addresses of messengers, separated by blanks."""
+
+# Not the folder of the process: it may hold a module of any name.
+_NOTIFY = ("-P", "-c", "from lmshealth.batch.alerts import notify; notify()")
+
+
+@dataclass(frozen=True, slots=True)
+class Alerts:
+    """Which changes are delivered, and how.
+
+    Attributes
+    ----------
+    silent_days : float or None
+        A machine without a log for longer than this is one whose logs stopped coming.
+    command : tuple of str
+        Program and arguments; it gets the changes as JSON on standard input.
+    notify : bool
+        Whether apprise sends the changes to the addresses in ``LMSHEALTH_NOTIFY``.
+    """
+
+    silent_days: float | None = None
+    command: tuple[str, ...] = ()
+    notify: bool = False
+
+    def channels(self) -> dict[str, tuple[str, ...]]:
+        """Return the commands to run, by the option that asked for each."""
+        asked = {"--alert-command": self.command}
+        asked["--notify"] = (sys.executable, *_NOTIFY) if self.notify else ()
+        return {name: command for name, command in asked.items() if command}
+
+
+def read_fleet(folder: Path) -> Fleet:
+    """Read the status of all machines after the last run; empty without one, or of other keys."""
+    try:
+        return msgspec.json.decode(read_table(folder / FILE), type=Fleet)
+    except (OSError, ValueError):
+        return Fleet()
+
+
+def update_fleet(
+    before: Fleet, made: Mapping[str, Status], moment: datetime, alerts: Alerts
+) -> tuple[Fleet, list[Change]]:
+    """Judge all machines of this run and of the last, and list their changes.
+
+    A machine that has no result in this run keeps its last one: its logs may have been removed.
+    """
+    known = {one.stage: one for one in before.machines}
+    machines, changes = [], list[Change]()
+    for stage, status in sorted((known | dict(made)).items()):
+        judged, own = compare(known.get(stage), status, moment, alerts.silent_days)
+        machines.append(judged)
+        changes += own
+    pending = {name: (*before.pending.get(name, ()), *changes) for name in alerts.channels()}
+    return Fleet(tuple(machines), {name: own for name, own in pending.items() if own}), changes
+
+
+def deliver(fleet: Fleet, alerts: Alerts, out: Path) -> tuple[Fleet, dict[str, str]]:
+    """Deliver pending changes; return what stays pending, and why, by the option that failed."""
+    by_stage = {one.stage: one for one in fleet.machines}
+    failed = {}
+    for name, changes in fleet.pending.items():
+        rows = [
+            msgspec.to_builtins(change)
+            | {"text": str(change), "DeviceHealth": by_stage[change.stage].device_health}
+            | {"page": str(out.absolute() / by_stage[change.stage].page)}
+            for change in changes
+        ]
+        content = {"schema": constants.STATUS_SCHEMA, "changes": rows}
+        why = run_command(alerts.channels()[name], msgspec.json.encode(content))
+        if why:
+            failed[name] = f"{why}; {len(changes)} changes are sent again by the next run"
+    left = {name: own for name, own in fleet.pending.items() if name in failed}
+    return msgspec.structs.replace(fleet, pending=left), failed
+
+
+def run_command(command: Sequence[str], content: bytes) -> str:
+    """Run a command without a shell, with bytes on standard input; return why it failed, or "".
+
+    It is killed with its children after `constants.ALERT_TIMEOUT_S`. Files take its input and its
+    output: a pipe that a child holds open would be waited for.
+    """
+    with TemporaryFile() as given, TemporaryFile() as output:
+        given.write(content)
+        given.seek(0)
+        try:
+            process = subprocess.Popen(
+                command, stdin=given, stdout=output, stderr=output, start_new_session=True
+            )
+        except OSError as error:
+            return f"{visible(command[0])} cannot be started: {error.strerror}"
+        try:
+            status = process.wait(constants.ALERT_TIMEOUT_S)
+        except subprocess.TimeoutExpired:
+            return f"took longer than {constants.ALERT_TIMEOUT_S} s, and was killed"
+        finally:
+            if process.poll() is None:
+                _kill(process)
+        output.seek(max(output.seek(0, os.SEEK_END) - 1000, 0))
+        lines = output.read().decode(errors="replace").split("\n")
+    last = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
+    return f"ended with status {status}: {visible(last[:200])}" if status else ""
+
+
+def _kill(process: "subprocess.Popen[bytes]") -> None:
+    """Kill a process and, where there are process groups, its children."""
+    with suppress(ProcessLookupError):
+        if hasattr(os, "killpg"):
+            os.killpg(process.pid, signal.SIGKILL)
+        else:
+            process.kill()
+    process.wait()
+
+
+def notify() -> None:
+    """Send the changes on standard input by apprise, in a process that `run_command` bounds.
+
+    The addresses hold passwords: no message quotes them.
+    """
+    import apprise  # an extra
+
+    changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
+    messenger = apprise.Apprise()
+    if not all([messenger.add(address) for address in os.environ.get(NOTIFY, "").split()]):
+        sys.exit(f"apprise does not know an address in {NOTIFY}")
+    body = "\n".join(change["text"] for change in changes)
+    if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):
+        sys.exit(f"apprise could not deliver to every address in {NOTIFY}")
+
+
+def write_status(folder: Path, fleet: Fleet) -> None:
+    """Write the status of each machine beside its page, then that of all machines."""
+    rest: Iterable[tuple[str, Status | Fleet]] = [
+        (f"{Path(one.page).stem}.status.json", one)
+        for one in sorted(fleet.machines, key=lambda one: one.recorded_at)
+    ]
+    for name, content in (*rest, (FILE, fleet)):
+        encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
+        write_bytes(folder / name, msgspec.json.format(encoded, indent=1) + b"\n")
