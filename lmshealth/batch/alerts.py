@@ -21,11 +21,8 @@ from lmshealth.io.refusal import visible
 FILE = "status.json"
 """Status of all machines in the folder of the output: what the next run compares with."""
 
-NOTIFY = "LMSHEALTH_NOTIFY"
-"""Variable of the environment with the addresses of messengers, separated by blanks."""
-
 # Not the folder of the process: it may hold a module of any name.
-_NOTIFY = ("-P", "-c", "from lmshealth.batch.alerts import notify; notify()")
+_NOTIFY = ("-P", "-c", "from lmshealth.batch.addresses import notify; notify()")
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,22 +130,6 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
         else:
             process.kill()
     process.wait()
-
-
-def notify() -> None:
-    """Send the changes on standard input by apprise, in a process that `run_command` bounds.
-
-    The addresses hold passwords: no message quotes them.
-    """
-    import apprise  # an extra
-
-    changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
-    messenger = apprise.Apprise()
-    if not all([messenger.add(address) for address in os.environ.get(NOTIFY, "").split()]):
-        sys.exit(f"apprise does not know an address in {NOTIFY}")
-    body = "\n".join(change["text"] for change in changes)
-    if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):
-        sys.exit(f"apprise could not deliver to every address in {NOTIFY}")
 
 
 def write_status(folder: Path, fleet: Fleet) -> None:

@@ -60,3 +60,7 @@ ALERT_TIMEOUT_S = 60
 POINTS_PER_SERIES = 1000
 """Newest logs of a machine whose frequencies are in the store for dashboards: what a run writes
 there does not grow with the number of logs."""
+
+NOTIFY = "LMSHEALTH_NOTIFY"
+"""Variable of the environment with the addresses of messengers, separated by blanks: they hold
+passwords, which all users of a computer can read on a command line."""

@@ -57,6 +57,8 @@ class Settings:
         Whether symbolic links out of the folder of logs are followed.
     alerts : Alerts
         Which changes since the last run are delivered, and how.
+    growing : frozenset of Path
+        Files that are left to a later run.
 
     Examples
     --------
@@ -77,6 +79,7 @@ class Settings:
     max_memory: float = MAX_MEMORY
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
+    growing: frozenset[Path] = frozenset()
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""
@@ -157,7 +160,8 @@ def run(
     work = read_maintenance(folder, follow_links=settings.follow_links)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         resources = Resources(store, pool, progress)
-        reading = Reading(settings.columns, settings.max_memory, settings.follow_links)
+        how = settings.columns, settings.max_memory, settings.follow_links, settings.growing
+        reading = Reading(*how)
         ingested = ingest(folder, stages, resources, out=out, reading=reading)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         by_digest = {stage.digest: stage for stage in stages}

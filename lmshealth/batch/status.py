@@ -47,8 +47,8 @@ class Change(msgspec.Struct, frozen=True):
     recorded_at: datetime  # of the last log
 
     def __str__(self) -> str:
-        states = [state for state in (self.before, self.now) if state]
-        return f"{self.stage}: {self.what}: {' → '.join(states)}"
+        states = " → ".join(state for state in (self.before, self.now) if state)
+        return f"{self.stage}: {self.what} {states}"
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
@@ -204,7 +204,7 @@ def _of_verdict(before: Status | None, now: Status) -> Iterator[tuple[str, str, 
     if was != now.verdict and (before is not None or _is_loss(now.verdict)):
         yield "recovered" if lost and now.verdict == "healthy" else "verdict", was, now.verdict
     elif before is not None and before.alarms and not now.alarms:
-        yield "recovered", f"alarm of {' and '.join(map(spell, before.alarms))}", now.verdict
+        yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
 
 
 def _is_loss(verdict: str) -> bool:

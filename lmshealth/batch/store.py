@@ -170,7 +170,8 @@ class Store:
         self._engine, self._address = _connect(url, create=create)
         self._shown = shown_address(self._address)
         tables = sql.inspect(self._engine).get_table_names()
-        if missing := set(_METADATA.tables) - set(tables):
+        shown = {table.name for table in _VIEWS.values()}
+        if missing := _METADATA.tables.keys() - shown - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
