@@ -64,10 +64,8 @@ def notify() -> None:
     import apprise  # an extra
 
     changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
-    messenger = apprise.Apprise()
-    if not all(
-        [messenger.add(address) for address in os.environ.get(constants.NOTIFY, "").split()]
-    ):
+    messenger, addresses = apprise.Apprise(), os.environ.get(constants.NOTIFY, "").split()
+    if not all([messenger.add(address) for address in addresses]):
         sys.exit(f"apprise does not know an address in {constants.NOTIFY}")
     body = "\n".join(change["text"] for change in changes)
     if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):

@@ -85,6 +85,7 @@ _SHOWN = "recorded_at verdict probability service service_by inspect_by"
 _STATUS = _table("status", "machine", f"name {_SHOWN} state alarms silent")
 _POINTS = _table("points", "machine key", "name recorded_at quantity subject low median high")
 _CHANGES = _table("changes", "machine key", "name recorded_at noticed_at what before now")
+_CREATE_VIEW = {"sqlite": "CREATE VIEW IF NOT EXISTS", "postgresql": "CREATE OR REPLACE VIEW"}
 _VIEWS = {f"lmshealth_{table.name.split('_')[0]}": table for table in (_STATUS, _POINTS, _CHANGES)}
 
 
@@ -472,7 +473,8 @@ def _create_views(connection: Connection) -> None:
             connection.execute(sql.text(f"DROP VIEW {name}"))
         names = [column.name for column in table.columns if not column.primary_key]
         columns = ", ".join("name AS stage" if name == "name" else name for name in names)
-        connection.execute(sql.text(f"CREATE VIEW {name} AS SELECT {columns} FROM {table.name}"))
+        create = _CREATE_VIEW[connection.dialect.name]
+        connection.execute(sql.text(f"{create} {name} AS SELECT {columns} FROM {table.name}"))
 
 
 def _reason(error: Exception, address: str) -> str:

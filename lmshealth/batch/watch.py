@@ -29,8 +29,9 @@ def watch(
         now, today = _files(folder, out), datetime.now(UTC).date()
         settled = {path: seen for path, seen in now.items() if before.get(path) == seen}
         before = now
+        new = settled.items() - done.items() or done.keys() - now.keys()
         # A folder without files may be a share that is not mounted now: tables stay as they are.
-        if (settled and settled != done) or today != day:
+        if (settled and new) or today != day:
             done, day = settled, today
             growing = frozenset(now.keys() - settled.keys())
             try:

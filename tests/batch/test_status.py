@@ -155,13 +155,13 @@ def test_a_silence_is_reported_once_and_lasts_until_the_next_log() -> None:
 def document(assessment: Assessment) -> dict[str, Any]:
     """Give the status of an assessment as other programs read it."""
     made = make_status(assessment, summarise(assessment, assessment.service(), "a.html"))
-    assert repr(unpack(pack(made), Status)) == repr(made)
 
     def refuse(name: str) -> None:
         raise ValueError(f"{name} is no JSON")
 
     text = msgspec.json.encode(made)
     assert msgspec.json.encode(msgspec.json.decode(text, type=Status)) == text
+    assert msgspec.json.encode(unpack(pack(made), Status)) == text
     found: dict[str, Any] = json.loads(text, parse_constant=refuse)
     return found
 
