@@ -4,8 +4,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
@@ -27,21 +26,11 @@ _NOTIFY = ("-P", "-c", "from lmshealth.batch.addresses import notify; notify()")
 
 @dataclass(frozen=True, slots=True)
 class Alerts:
-    """Which changes are delivered, and how.
+    """Which changes are delivered, and how."""
 
-    Attributes
-    ----------
-    silent_days : float or None
-        A machine without a log for longer than this is one whose logs stopped coming.
-    command : tuple of str
-        Program and arguments; it gets the changes as JSON on standard input.
-    notify : bool
-        Whether apprise sends the changes to the addresses in ``LMSHEALTH_NOTIFY``.
-    """
-
-    silent_days: float | None = None
-    command: tuple[str, ...] = ()
-    notify: bool = False
+    silent_days: float | None = None  # a machine without a log for longer is silent
+    command: tuple[str, ...] = ()  # program and arguments, with the changes as JSON on its input
+    notify: bool = False  # whether apprise sends them to the addresses in ``LMSHEALTH_NOTIFY``
 
     def channels(self) -> dict[str, tuple[str, ...]]:
         """Return the commands to run, by the option that asked for each."""
@@ -75,10 +64,12 @@ def update_fleet(
     return Fleet(tuple(machines), {name: own for name, own in pending.items() if own}), changes
 
 
-def deliver(fleet: Fleet, alerts: Alerts, out: Path) -> tuple[Fleet, dict[str, str]]:
-    """Deliver pending changes; return what stays pending, and why, by the option that failed."""
-    by_stage = {one.stage: one for one in fleet.machines}
-    failed = {}
+def publish(fleet: Fleet, alerts: Alerts, out: Path) -> dict[str, str]:
+    """Deliver pending changes, and write the status of each machine and of all.
+
+    Return why an option failed; its changes stay pending.
+    """
+    by_stage, failed = {one.stage: one for one in fleet.machines}, dict[str, str]()
     for name, changes in fleet.pending.items():
         rows = [
             msgspec.to_builtins(change)
@@ -87,11 +78,18 @@ def deliver(fleet: Fleet, alerts: Alerts, out: Path) -> tuple[Fleet, dict[str, s
             for change in changes
         ]
         content = {"schema": constants.STATUS_SCHEMA, "changes": rows}
-        why = run_command(alerts.channels()[name], msgspec.json.encode(content))
-        if why:
+        if why := run_command(alerts.channels()[name], msgspec.json.encode(content)):
             failed[name] = f"{why}; {len(changes)} changes are sent again by the next run"
-    left = {name: own for name, own in fleet.pending.items() if name in failed}
-    return msgspec.structs.replace(fleet, pending=left), failed
+    left = {name: fleet.pending[name] for name in failed}
+    # Where the page of a machine that is gone has the name of another, the newer one is kept.
+    documents: list[tuple[str, Status | Fleet]] = [
+        (f"{Path(one.page).stem}.status.json", one)
+        for one in sorted(fleet.machines, key=lambda one: one.recorded_at)
+    ]
+    for name, document in (*documents, (FILE, msgspec.structs.replace(fleet, pending=left))):
+        encoded = msgspec.json.encode(document, enc_hook=lambda number: number.item())
+        write_bytes(out / name, msgspec.json.format(encoded, indent=1))
+    return failed
 
 
 def run_command(command: Sequence[str], content: bytes) -> str:
@@ -115,29 +113,12 @@ def run_command(command: Sequence[str], content: bytes) -> str:
             return f"took longer than {constants.ALERT_TIMEOUT_S} s, and was killed"
         finally:
             if process.poll() is None:
-                _kill(process)
+                if hasattr(os, "killpg"):
+                    os.killpg(process.pid, signal.SIGKILL)
+                else:  # Windows
+                    process.kill()
+                process.wait()
         output.seek(max(output.seek(0, os.SEEK_END) - 1000, 0))
         lines = output.read().decode(errors="replace").split("\n")
     last = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
     return f"ended with status {status}: {visible(last[:200])}" if status else ""
-
-
-def _kill(process: "subprocess.Popen[bytes]") -> None:
-    """Kill a process and, where there are process groups, its children."""
-    with suppress(ProcessLookupError):
-        if hasattr(os, "killpg"):
-            os.killpg(process.pid, signal.SIGKILL)
-        else:
-            process.kill()
-    process.wait()
-
-
-def write_status(folder: Path, fleet: Fleet) -> None:
-    """Write the status of each machine beside its page, then that of all machines."""
-    rest: Iterable[tuple[str, Status | Fleet]] = [
-        (f"{Path(one.page).stem}.status.json", one)
-        for one in sorted(fleet.machines, key=lambda one: one.recorded_at)
-    ]
-    for name, content in (*rest, (FILE, fleet)):
-        encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
-        write_bytes(folder / name, msgspec.json.format(encoded, indent=1) + b"\n")

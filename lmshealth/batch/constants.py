@@ -57,8 +57,8 @@ plan a service."""
 ALERT_TIMEOUT_S = 60
 """Seconds (s) that an alert command may take before it is killed with its children."""
 
-POINTS_PER_SERIES = 1000
-"""Newest logs of a machine whose frequencies are in the store for dashboards: what a run writes
+TRACK_POINTS = 3000
+"""Newest rows of track.csv of a machine that are in the store for dashboards: what a run writes
 there does not grow with the number of logs."""
 
 NOTIFY = "LMSHEALTH_NOTIFY"

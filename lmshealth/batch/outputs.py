@@ -13,7 +13,7 @@ from pathlib import Path
 from lmshealth._files import replacing, write_text
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
-from lmshealth.batch.status import Point, Status, make_status, points
+from lmshealth.batch.status import Status, make_status, points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
 from lmshealth.report.assessment import Assessment, Summary
@@ -47,7 +47,7 @@ class MachineOutput:
     tables: bytes
     excluded: tuple[str, ...]
     status: Status
-    points: tuple[Point, ...]
+    points: tuple[Row, ...]
 
 
 def machine_output(record: MachineRecord) -> MachineOutput | None:
@@ -64,7 +64,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         tables=pack(rows),
         excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
         status=make_status(found, page.summary),
-        points=tuple(points(found, page.summary.life)),
+        points=tuple(points(rows)),
     )
 
 

@@ -6,14 +6,13 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
-from typing import NamedTuple
 
 import msgspec
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
-from lmshealth.batch.alerts import Alerts, deliver, read_fleet, update_fleet, write_status
+from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
@@ -160,8 +159,7 @@ def run(
     work = read_maintenance(folder, follow_links=settings.follow_links)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         resources = Resources(store, pool, progress)
-        how = settings.columns, settings.max_memory, settings.follow_links, settings.growing
-        reading = Reading(*how)
+        reading = Reading(*(getattr(settings, name) for name in Reading._fields))
         ingested = ingest(folder, stages, resources, out=out, reading=reading)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         by_digest = {stage.digest: stage for stage in stages}
@@ -173,29 +171,25 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        done = _report(usable, refused, resources, out, settings.alerts)
-    rows = tuple(by_urgency(done.rows.values()))
-    index = write_index(out, rows, refused) if machines else out
-    fleet, unsent = deliver(done.fleet, settings.alerts, out)
-    write_status(out, fleet)
+        done, fleet, excluded = _report(usable, refused, resources, out, settings.alerts)
+    if machines:
+        write_index(out, done.rows, refused)
+    unsent = publish(fleet, settings.alerts, out)
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | done.excluded) & ingested.logs
+    lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
             f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
-    return RunResult(
-        index=index,
-        rows=rows,
+    return replace(
+        done,
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
         failed=failed | done.failed,
-        statuses=fleet.machines,
-        changes=done.changes,
         unsent=unsent,
     )
 
@@ -259,26 +253,17 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
     return f": {len(details)} as {reason}, such as {log}: {detail}"
 
 
-class _Reported(NamedTuple):
-    """Rows of the index, excluded logs, machines that failed and why, status and its changes."""
-
-    rows: dict[str, Summary]
-    excluded: set[str]
-    failed: dict[str, str]
-    fleet: Fleet
-    changes: tuple[Change, ...]
-
-
 def _report(
     machines: Sequence[Machine],
     refused: Sequence[Refusal],
     resources: Resources,
     out: Path,
     alerts: Alerts,
-) -> _Reported:
-    """Write pages and tables, and find what has changed since the last run into this folder.
+) -> tuple[RunResult, Fleet, set[str]]:
+    """Write pages and tables; return the result without counts, status, and excluded logs.
 
-    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
+    Changes are those since the last run into this folder. Machines whose assessment is missing, or
+    cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
@@ -314,7 +299,14 @@ def _report(
     packed[""] = pack({"refused": refused_rows(refused), "changes": changed})
     write_tables(out, names, packed)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    return _Reported(rows, excluded, not_updated | unread | failed, fleet, tuple(changes))
+    result = RunResult(
+        index=out / "index.html",
+        rows=tuple(by_urgency(rows.values())),
+        failed=not_updated | unread | failed,
+        statuses=fleet.machines,
+        changes=tuple(changes),
+    )
+    return result, fleet, excluded
 
 
 def _outputs(

@@ -2,39 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, date, datetime, time, timedelta
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
 from lmshealth.batch import constants
 from lmshealth.health.verdict import degraded_words, undeclared_events
-from lmshealth.report.assessment import Assessment, Life, Summary
-from lmshealth.report.constants import LEVELS
+from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.notices import notices
-from lmshealth.report.tables import prognosis_rows
+from lmshealth.report.tables import Row, prognosis_rows
 from lmshealth.report.text import spell
 from lmshealth.stage.constants import INFORMED
 
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
 """State by NAMUR NE 107, as OPC 10000-100 names the values of ``DeviceHealthEnumeration``."""
-
-
-class Condition(msgspec.Struct, frozen=True):
-    """Reason for a state: README.md lists the codes."""
-
-    device_health: DeviceHealth = msgspec.field(name="DeviceHealth")
-    code: str
-
-
-class MaintenancePrognosis(msgspec.Struct, frozen=True, rename="pascal"):
-    """Activity and the time when it becomes necessary: MaintenancePrognosisType of OPC 40501-1."""
-
-    activity: str
-    predicted_time: datetime  # UTC
-    probability: float | None  # of reaching a limit before that time; no part of OPC 40501-1
 
 
 class Change(msgspec.Struct, frozen=True):
@@ -61,7 +45,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     recorded_at: datetime  # of the last log
     baseline_at: datetime
     device_health: DeviceHealth = msgspec.field(name="DeviceHealth", default="NORMAL")
-    conditions: tuple[Condition, ...] = ()
+    conditions: dict[str, DeviceHealth] = {}  # `conditions`; the first one is `device_health`
     silent: bool = False  # no log for longer than ``--silent-days``
     verdict: str
     probability: float | None
@@ -76,7 +60,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     service: str  # service, service_by, inspect_by: as in prognosis.csv
     service_by: date | None
     inspect_by: date | None
-    prognoses: tuple[MaintenancePrognosis, ...] = msgspec.field(name="Prognoses")
+    # Activities and when they become necessary: MaintenancePrognosisType of OPC 40501-1.
+    prognoses: tuple[dict[str, Any], ...] = msgspec.field(name="Prognoses")
 
 
 class Fleet(msgspec.Struct, frozen=True):
@@ -87,19 +72,8 @@ class Fleet(msgspec.Struct, frozen=True):
     schema: int = constants.STATUS_SCHEMA
 
 
-class Point(NamedTuple):
-    """Value of a quantity at a log with its 90 % interval, for dashboards; None is missing."""
-
-    quantity: Literal["health", "frequency_hz", "remaining_km"]
-    subject: str  # parameter, mode or limit
-    recorded_at: datetime
-    low: float | None
-    median: float | None
-    high: float | None
-
-
-def conditions(status: Status, today: date) -> tuple[Condition, ...]:
-    """Return what keeps a machine from the state ``NORMAL``; the first one decides its state.
+def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
+    """Return what keeps a machine from the state ``NORMAL``, by code; the first is its state.
 
     Evidence of damage comes before missing logs, which must not hide it.
     """
@@ -120,7 +94,7 @@ def conditions(status: Status, today: date) -> tuple[Condition, ...]:
         ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
         ("CHECK_FUNCTION", "silent", status.silent),
     ]
-    return tuple(Condition(state, code) for state, code, applies in found if applies)
+    return {code: state for state, code, applies in found if applies}
 
 
 def make_status(assessment: Assessment, summary: Summary) -> Status:
@@ -159,8 +133,11 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
     )
 
 
-def _prognoses(summary: Summary) -> Iterator[MaintenancePrognosis]:
-    """Yield what has to be done and when, as far as that is before the horizon."""
+def _prognoses(summary: Summary) -> Iterator[dict[str, Any]]:
+    """Yield what has to be done and when (UTC), as far as that is before the horizon.
+
+    The probability to reach a limit before that time is no part of OPC 40501-1.
+    """
     service, zone = summary.service, summary.recorded_at.tzinfo
     limits = summary.life.limits[:-1] if summary.life else ()
     found = [("Service", service.by, service.risk), ("Record a log", service.inspect_by, np.nan)]
@@ -168,7 +145,7 @@ def _prognoses(summary: Summary) -> Iterator[MaintenancePrognosis]:
     for activity, day, risk in found:
         if day is not None:
             moment = datetime.combine(day, time(), zone).astimezone(UTC)
-            yield MaintenancePrognosis(activity, moment, _or_none(risk))
+            yield {"Activity": activity, "PredictedTime": moment, "Probability": _or_none(risk)}
 
 
 def _or_none(value: float) -> float | None:
@@ -191,58 +168,52 @@ def compare(
     announced = tuple(dict.fromkeys((*known, *now.alarms)))
     now = msgspec.structs.replace(now, silent=silent, announced=announced)
     found = conditions(now, moment.date())
-    state: DeviceHealth = found[0].device_health if found else "NORMAL"
+    state: DeviceHealth = next(iter(found.values()), "NORMAL")
     now = msgspec.structs.replace(now, conditions=found, device_health=state)
     changes = [("alarm", "", mode) for mode in announced if mode not in known]
-    changes += [*_of_verdict(before, now), *_of_silence(before, now, moment)]
+    changes += _transitions(before, now, moment)
     return now, [Change(now.stage, *one, now.recorded_at) for one in changes]
 
 
-def _of_verdict(before: Status | None, now: Status) -> Iterator[tuple[str, str, str]]:
-    """Yield the change of the verdict; of a new machine a loss or a step is one."""
-    was, lost = (before.verdict, _is_loss(before.verdict)) if before else ("", False)
-    if was != now.verdict and (before is not None or _is_loss(now.verdict)):
-        yield "recovered" if lost and now.verdict == "healthy" else "verdict", was, now.verdict
-    elif before is not None and before.alarms and not now.alarms:
+def _transitions(
+    before: Status | None, now: Status, moment: datetime
+) -> Iterator[tuple[str, str, str]]:
+    """Yield changes of verdict, silence and alarms; of a new machine only what is bad."""
+    was = before.verdict if before else ""
+    last = (before or now).recorded_at.date().isoformat()
+    if was != now.verdict and (before or _is_loss(now.verdict)):
+        recovered = _is_loss(was) and now.verdict == "healthy"
+        yield "recovered" if recovered else "verdict", was, now.verdict
+    elif before and before.alarms and not now.alarms:
         yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
+    if now.silent and not (before and before.silent):
+        yield "silent", f"last log of {last}", f"no log for {(moment - now.recorded_at).days} days"
+    elif before and before.silent and not now.silent:
+        yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
 
 
 def _is_loss(verdict: str) -> bool:
-    return verdict == "step" or bool(degraded_words(verdict))
+    return verdict not in ("", "healthy", "not-enough-data")
 
 
-def _of_silence(
-    before: Status | None, now: Status, moment: datetime
-) -> Iterator[tuple[str, str, str]]:
-    """Yield that logs stopped coming, or came again."""
-    was = before is not None and before.silent
-    if now.silent and not was:
-        last = now.recorded_at.date().isoformat()
-        days = (moment - now.recorded_at).days
-        yield "silent", f"last log of {last}", f"no log for {days} days"
-    elif before is not None and was and not now.silent:
-        last, new = (one.recorded_at.date().isoformat() for one in (before, now))
-        yield "recovered", f"no log since {last}", f"log of {new}"
+def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
+    """Return values of a machine with 90 % intervals for dashboards, from the rows of its tables.
 
-
-def points(assessment: Assessment, life: Life | None) -> Iterator[Point]:
-    """Yield health, frequencies and remaining life of a machine, at its newest logs."""
-    health, track = assessment.latest_health, assessment.track
-    if health is not None:
-        usable = health.converged[:, None] & health.identifiable & (health.informed >= INFORMED)
-        quantiles = health.quantile(np.array(LEVELS))
-        for k, j in np.argwhere(usable).tolist():
-            own = quantiles[:, k, j].tolist()
-            yield Point("health", health.parameters[j], health.recorded_at[k], *own)
-    if track is not None:
-        # 5, 50 and 95 % quantiles of a normal distribution.
-        spread = 1.645 * track.ln_frequency_std[:, :, None] * np.array([-1.0, 0.0, 1.0])
-        hertz = np.exp(track.ln_frequency[:, :, None] + spread)[-constants.POINTS_PER_SERIES :]
-        newest = track.recorded_at[-constants.POINTS_PER_SERIES :]
-        for k, i in np.argwhere(np.isfinite(hertz).all(axis=2)).tolist():
-            yield Point("frequency_hz", track.modes[i], newest[k], *hertz[k, i].tolist())
-    if life is None:
-        return
-    for limit in life.limits:
-        km = [_or_none(travel / 1000) for travel in limit.travel[::3]]  # 5, 50 and 95 %
-        yield Point("remaining_km", limit.parameter, life.recorded_at, *km)
+    Health (in units of the parameter) and frequency at its newest logs, remaining life at the last.
+    """
+    tables = {name: rows.get(name, ()) for name in ("health", "track", "prognosis", "verdict")}
+    found = [
+        ("health", row["parameter"], row["recorded_at"], row["q05"], row["median"], row["q95"])
+        for row in tables["health"]
+        if row["converged"] and row["identifiable"] and row["informed"] >= INFORMED
+    ]
+    for row in tables["track"][-constants.TRACK_POINTS :]:
+        hertz, spread = row["frequency_hz"], 1.645 * row["frequency_std_hz"]
+        own = hertz - spread, hertz, hertz + spread
+        if np.isfinite(own).all():
+            found.append(("frequency_hz", row["mode"], row["recorded_at"], *map(float, own)))
+    for row in tables["prognosis"]:
+        own = tuple(row[f"rul_km_{name}"] for name in ("q05", "q50", "q95"))
+        found.append(("remaining_km", row["parameter"], tables["verdict"][0]["recorded_at"], *own))
+    names = "quantity", "subject", "recorded_at", "low", "median", "high"
+    return [dict(zip(names, own, strict=True)) for own in found]

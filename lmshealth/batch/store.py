@@ -26,7 +26,7 @@ from sqlalchemy.schema import CreateTable
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
-from lmshealth.batch.status import Change, Point, Status
+from lmshealth.batch.status import Change, Status
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Summary
@@ -256,9 +256,13 @@ class Store:
         with self._begin() as connection:
             return {row.key: row.content for row in connection.execute(query)}
 
-    def put_points(self, machine: str, points: Sequence[Point]) -> None:
+    def put_points(self, machine: str, points: Sequence[dict[str, Any]]) -> None:
         """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
-        rows = [own._asdict() | {"key": fingerprint(own[:3])} for own in points]
+        named = [(own["quantity"], own["subject"], own["recorded_at"]) for own in points]
+        rows = [
+            own | {"key": fingerprint(name), "recorded_at": datetime.fromisoformat(name[2])}
+            for name, own in zip(named, points, strict=True)
+        ]
         own, columns = _id(machine), _POINTS.c
         lasting = columns.quantity == "remaining_km"
         with self._begin() as connection:

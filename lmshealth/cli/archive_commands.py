@@ -61,12 +61,9 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
-    counts = ("n_logs", "n_refused", "n_remembered", "n_unread")
-    names = (*counts, "failed", "unsent", "changes")
-    document = {name: getattr(result, name) for name in names}
-    index = str(result.index.absolute())
-    schema = {"schema": constants.STATUS_SCHEMA, "report": index}
-    return schema | document | {"machines": result.statuses}
+    names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
+    head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
+    return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 
 def _errors(result: RunResult) -> list[str]:
@@ -83,16 +80,10 @@ def _errors(result: RunResult) -> list[str]:
 @_run_options
 @click.pass_context
 def run(
-    ctx: click.Context,
-    /,
-    logs: Path,
-    stages: tuple[Stage, ...],
-    out: Path,
-    pdf: bool,
-    style: str,
-    **given: Any,
+    ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
+    pdf, style = given.pop("pdf"), given.pop("style")
     with terminal.progress_bars() as progress:
         result = run_pipeline(logs, stages, out, _settings(given), progress)
     if style == "json":
@@ -126,19 +117,12 @@ def run(
     metavar="SECONDS",
     help="Time between polls; a file is analysed when it is the same at two of them.",
 )
-def watch(
-    logs: Path,
-    stages: tuple[Stage, ...],
-    out: Path,
-    pdf: bool,
-    style: str,
-    interval: float,
-    **given: Any,
-) -> None:
+def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **given: Any) -> None:
     """Run over a folder of logs whenever logs have arrived; ends by SIGTERM or Ctrl-C.
 
     Prints one line for each run, change and failure; with --format json one document a line.
     """
+    pdf, style = given.pop("pdf"), given.pop("style")
     # Like an interrupt: workers end, and the next run continues.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):

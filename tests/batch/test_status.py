@@ -14,6 +14,7 @@ import pytest
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch.status import Status, compare, conditions, make_status, points
 from lmshealth.report.assessment import Assessment, summarise
+from lmshealth.report.tables import machine_tables
 from lmshealth.tracking.track import Event
 from tests.assessments import Maker, blind, make, nothing
 
@@ -90,8 +91,8 @@ def status(**given: Any) -> Status:
 def test_every_result_has_a_namur_state(given: dict[str, Any], state: str, codes: str) -> None:
     """The first condition decides; all of them are listed."""
     found = conditions(status(**given), TODAY)
-    assert " ".join(one.code for one in found) == codes
-    assert (found[0].device_health if found else "NORMAL") == state
+    assert " ".join(found) == codes
+    assert next(iter(found.values()), "NORMAL") == state
 
 
 @pytest.mark.parametrize(
@@ -217,16 +218,18 @@ def test_points_of_a_dashboard_are_those_of_the_tables(make: Maker) -> None:
     """Health and frequencies per log with 90 % intervals, and the remaining life now."""
     assessment = make()
     summary = summarise(assessment, assessment.service())
-    found = list(points(assessment, summary.life))
-    health = [one for one in found if one.quantity == "health"]
+    found = points(machine_tables((), assessment))
+    health = [one for one in found if one["quantity"] == "health"]
     assert assessment.health is not None and assessment.track is not None
     expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))
-    np.testing.assert_allclose([one[3:] for one in health][-1], expected[:, -1, 1])
-    roll = [one for one in found if (one.quantity, one.subject) == ("frequency_hz", "roll")]
+    last = [health[-1][name] for name in ("low", "median", "high")]
+    np.testing.assert_allclose(last, expected[:, -1, 1])
+    roll = [one for one in found if (one["quantity"], one["subject"]) == ("frequency_hz", "roll")]
     frequency = np.exp(assessment.track.ln_frequency[:, 0])
-    np.testing.assert_allclose([one.median for one in roll], frequency)
-    assert [one.recorded_at for one in roll] == list(assessment.track.recorded_at)
-    km = {one.subject: one.median for one in found if one.quantity == "remaining_km"}
+    np.testing.assert_allclose([one["median"] for one in roll], frequency)
+    moments = [moment.isoformat() for moment in assessment.track.recorded_at]
+    assert [one["recorded_at"] for one in roll] == moments
+    km = {one["subject"]: one["median"] for one in found if one["quantity"] == "remaining_km"}
     assert summary.life is not None
     assert km["any"] == summary.life.any.travel[3] / 1000
-    assert list(points(nothing(assessment), None)) == []
+    assert points(machine_tables((), nothing(make()))) == points({}) == []

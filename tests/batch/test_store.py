@@ -34,6 +34,7 @@ from lmshealth.batch.store import (
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
 from lmshealth.report.assessment import Assessment, summarise
+from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
@@ -470,7 +471,7 @@ def show(url: str, assessment: Assessment, changes: tuple[Change, ...] = ()) -> 
     moment = summary.recorded_at + timedelta(hours=12)
     status, _ = compare(None, make_status(assessment, summary), moment, None)
     store = Store(url)
-    store.put_points(summary.identity, tuple(points(assessment, summary.life)))
+    store.put_points(summary.identity, points(machine_tables((), assessment)))
     store.put_status([status], changes, moment)
     store.close()
     return status
@@ -507,12 +508,11 @@ def test_views_show_status_points_and_changes_once(url: str, tmp_path: Path) -> 
 def test_points_are_replaced_but_remaining_lives_stay(file_url: str, tmp_path: Path) -> None:
     """A new assessment replaces what the old one had; what it predicted then is history."""
     assessment = worn(tmp_path)
-    life = summarise(assessment, assessment.service()).life
-    found = tuple(points(assessment, life))
-    later = [own._replace(recorded_at=own.recorded_at + timedelta(days=1)) for own in found]
+    found = points(machine_tables((), assessment))
+    later = [own | {"recorded_at": "2027-01-01T00:00:00+01:00"} for own in found]
     store = Store(file_url)
     store.put_points("M7-Y", found)
-    store.put_points("M7-Y", [own for own in later if own.subject in ("roll", "any")])
+    store.put_points("M7-Y", [own for own in later if own["subject"] in ("roll", "any")])
     store.put_points("M8-Y", [])
     store.close()
     rows = rows_of(file_url, "SELECT DISTINCT quantity, subject FROM lmshealth_points")
