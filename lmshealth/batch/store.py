@@ -256,33 +256,36 @@ class Store:
         with self._begin() as connection:
             return {row.key: row.content for row in connection.execute(query)}
 
-    def put_points(self, machine: str, points: Sequence[dict[str, Any]]) -> None:
+    def put_points(self, machine: str, points: Iterable[dict[str, Any]]) -> None:
         """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
-        named = [(own["quantity"], own["subject"], own["recorded_at"]) for own in points]
-        rows = [
-            own | {"key": fingerprint(name), "recorded_at": datetime.fromisoformat(name[2])}
-            for name, own in zip(named, points, strict=True)
-        ]
-        own, columns = _id(machine), _POINTS.c
-        lasting = columns.quantity == "remaining_km"
+        rows = []
+        for own in points:
+            key = fingerprint(own["quantity"], own["subject"], own["recorded_at"])
+            moment = datetime.fromisoformat(own["recorded_at"])
+            rows.append(own | {"name": machine, "key": key, "recorded_at": moment})
+        earlier = _POINTS.c.machine == _id(machine), _POINTS.c.quantity != "remaining_km"
         with self._begin() as connection:
-            connection.execute(sql.delete(_POINTS).where(columns.machine == own, ~lasting))
-            self._put_rows(connection, _POINTS, machine, rows)
+            connection.execute(sql.delete(_POINTS).where(*earlier))
+            self._put_rows(connection, _POINTS, rows)
 
     def put_status(
         self, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
     ) -> None:
         """Store the status of machines and what has changed, for dashboards."""
+        present = [
+            {name: getattr(one, name) for name in _SHOWN.split()}
+            | {"name": one.stage, "state": one.device_health, "alarms": " ".join(one.alarms)}
+            | {"silent": "yes" if one.silent else "no"}
+            for one in statuses
+        ]
+        changed = [
+            {name: getattr(one, name) for name in ("recorded_at", "what", "before", "now")}
+            | {"name": one.stage, "key": fingerprint(one), "noticed_at": noticed_at}
+            for one in changes
+        ]
         with self._begin() as connection:
-            for one in statuses:
-                row = {name: getattr(one, name) for name in _SHOWN.split()}
-                row |= {"state": one.device_health, "alarms": " ".join(one.alarms)}
-                row["silent"] = "yes" if one.silent else "no"
-                self._put_rows(connection, _STATUS, one.stage, [row])
-            for change in changes:
-                row = {name: getattr(change, name) for name in change.__struct_fields__[1:]}
-                row |= {"key": fingerprint(change), "noticed_at": noticed_at}
-                self._put_rows(connection, _CHANGES, change.stage, [row])
+            self._put_rows(connection, _STATUS, present)
+            self._put_rows(connection, _CHANGES, changed)
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
@@ -353,12 +356,12 @@ class Store:
             connection.execute(self._upsert(table, row))
 
     def _put_rows(
-        self, connection: Connection, table: sql.Table, machine: str, rows: Sequence[dict[str, Any]]
+        self, connection: Connection, table: sql.Table, rows: Iterable[dict[str, Any]]
     ) -> None:
-        """Write rows of a machine; SQLite knows no zones, so moments are in UTC."""
+        """Write rows of machines by their names; SQLite knows no zones: moments are in UTC."""
         whole = [
-            {"machine": _id(machine), "name": machine}
-            | {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+            {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+            | {"machine": _id(row["name"])}
             for row in rows
         ]
         if whole:

@@ -19,6 +19,7 @@ from lmshealth.batch.store import Store
 from lmshealth.batch.watch import watch as watch_folder
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import LmshealthError
+from lmshealth.report.constants import TERMINAL_ROWS
 from lmshealth.report.rendering import write_pdfs
 from lmshealth.report.text import plain
 from lmshealth.stage.description import Stage
@@ -95,8 +96,10 @@ def run(
         if result.n_unread:
             click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
         views.print_summaries(result.rows)
-        for change in result.changes:
+        for change in result.changes[:TERMINAL_ROWS]:
             terminal.print_text(f"Changed: {change}")
+        if rest := len(result.changes[TERMINAL_ROWS:]):
+            click.echo(f"{rest} more changes; changes.csv lists all.")
         click.echo(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     if pdf:
