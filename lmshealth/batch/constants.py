@@ -58,8 +58,8 @@ ALERT_TIMEOUT_S = 60
 """Seconds (s) that an alert command may take before it is killed with its children."""
 
 TRACK_POINTS = 1000
-"""Newest rows of track.csv of a machine that are in the store for dashboards, a year of daily logs of
-three modes: writing them takes about 0.2 s, however many logs there are."""
+"""Newest rows of track.csv of a machine that are in the store for dashboards: a year of daily logs
+of three modes. Writing them takes about 0.2 s, however many logs there are."""
 
 NOTIFY = "LMSHEALTH_NOTIFY"
 """Variable of the environment with the addresses of messengers, separated by blanks: they hold
