@@ -166,6 +166,37 @@ def test_what_was_not_delivered_is_sent_by_the_next_run(nights: Nights) -> None:
     assert len(nights.delivered()) == 1
 
 
+def test_each_way_of_delivery_has_changes_of_its_own(
+    nights: Nights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where one of two fails, the next run sends nothing twice by the other."""
+    calls: list[str] = []
+
+    def deliver(command: tuple[str, ...], content: bytes) -> str:
+        calls.append("notify" if "-P" in command else "command")
+        return "" if "-P" in command or calls.count("command") > 1 else "fails"
+
+    monkeypatch.setattr(alerting, "run_command", deliver)
+    found = nights.run(N_BEFORE + 3, notify=True)
+    assert list(found.unsent) == ["--alert-command"]
+    assert nights.run(N_BEFORE + 3, notify=True).unsent == {}
+    assert calls == ["command", "notify", "command"]
+    # What is pending for an option that is no longer given is forgotten.
+    calls.clear()
+    nights.run(N_BEFORE + 3, command=())
+    assert calls == [] and read_fleet(nights.out).pending == {}
+
+
+def test_growing_files_are_left_to_a_later_run(nights: Nights) -> None:
+    """They are neither analysed nor refused."""
+    growing = frozenset({nights.logs.absolute() / "A-07.csv"})
+    nights.now = START + timedelta(days=N_BEFORE)
+    found = run(nights.logs, [nights.stage], nights.out, Settings(growing=growing))
+    assert (found.n_logs, found.n_refused) == (4 * N_BEFORE - 1, 0)
+    assert "A-07" not in (nights.out / "modes.csv").read_text()
+    assert run(nights.logs, [nights.stage], nights.out).n_logs == 4 * N_BEFORE
+
+
 def test_a_command_that_hangs_is_killed_with_its_children(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
