@@ -1,7 +1,11 @@
-"""Addresses of stores and schedulers in messages, without their secrets."""
+"""Addresses of stores, schedulers and messengers, whose secrets no message quotes."""
 
+import os
 import re
+import sys
 from urllib.parse import parse_qsl, unquote
+
+import msgspec
 
 from lmshealth.batch import constants
 
@@ -50,3 +54,19 @@ def without_secrets(text: str, address: str) -> str:
     for secret in sorted(set(secrets) - {""}, key=len, reverse=True):
         text = text.replace(secret, "***")
     return text
+
+
+def notify() -> None:
+    """Send the changes on standard input by apprise, in a process that `run_command` bounds.
+
+    The addresses hold passwords: no message quotes them.
+    """
+    import apprise  # an extra
+
+    changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
+    messenger, addresses = apprise.Apprise(), os.environ.get(constants.NOTIFY, "").split()
+    if not all([messenger.add(address) for address in addresses]):
+        sys.exit(f"apprise does not know an address in {constants.NOTIFY}")
+    body = "\n".join(change["text"] for change in changes)
+    if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):
+        sys.exit(f"apprise could not deliver to every address in {constants.NOTIFY}")

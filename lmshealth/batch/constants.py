@@ -46,3 +46,25 @@ instance because a run at the same time removed it."""
 SHORTEST_SECRET = 4
 """Least length of a value of a URL's options that is masked in messages. Shorter values are
 numbers and switches, which occur everywhere in a message."""
+
+STATUS_SCHEMA = 1
+"""Version of the keys of ``status.json`` and of the JSON that alerts get."""
+
+FAILURE_PROBABILITY = 0.5
+"""Probability that a limit is reached now, from which a machine has the state ``FAILURE``: it is
+more probable than not that the machine is outside what its description allows."""
+
+SERVICE_LEAD_DAYS = 30
+"""Days before the service date from which a machine has the state ``MAINTENANCE_REQUIRED``: time to
+plan a service."""
+
+ALERT_TIMEOUT_S = 60
+"""Seconds (s) that an alert command may take before it is killed with its children."""
+
+TRACK_POINTS = 1000
+"""Newest rows of track.csv of a machine that are in the store for dashboards: a year of daily logs
+of three modes. Writing them takes about 0.2 s, however many logs there are."""
+
+NOTIFY = "LMSHEALTH_NOTIFY"
+"""Variable of the environment with the addresses of messengers, separated by blanks: they hold
+passwords, which all users of a computer can read on a command line."""

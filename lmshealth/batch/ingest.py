@@ -46,11 +46,15 @@ class Resources:
 
 
 class Reading(NamedTuple):
-    """How logs are read: columns and most memory in bytes of `read_log`, links of `find_logs`."""
+    """How logs are read: columns and most memory in bytes of `read_log`, links of `find_logs`.
+
+    Files that are still growing are no logs yet.
+    """
 
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
     follow_links: bool = False
+    growing: frozenset[Path] = frozenset()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -113,7 +117,8 @@ def ingest(
     folder = folder.absolute()  # workers may have another working directory
     archive = find_logs(folder, follow_links=reading.follow_links)
     inside = out.resolve()
-    found = [path for path in archive.logs if inside not in path.resolve().parents]
+    logs = (path for path in archive.logs if path not in reading.growing)
+    found = [path for path in logs if inside not in path.resolve().parents]
     tasks, refused = _tasks(folder, found, reading, resources)
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}

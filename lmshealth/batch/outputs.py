@@ -13,6 +13,7 @@ from pathlib import Path
 from lmshealth._files import replacing, write_text
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
+from lmshealth.batch.status import Status, make_status, points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
 from lmshealth.report.assessment import Assessment, Summary
@@ -40,11 +41,13 @@ class MachineRecord:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class MachineOutput:
-    """Page and packed table rows of a machine, and the logs that were excluded from its life."""
+    """Page, packed table rows and status of a machine, and logs that its life excludes."""
 
     page: Page
     tables: bytes
     excluded: tuple[str, ...]
+    status: Status
+    points: tuple[Row, ...]
 
 
 def machine_output(record: MachineRecord) -> MachineOutput | None:
@@ -60,6 +63,8 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page=page,
         tables=pack(rows),
         excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
+        status=make_status(found, page.summary),
+        points=tuple(points(rows)),
     )
 
 

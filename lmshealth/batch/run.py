@@ -3,15 +3,20 @@
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
+
+import msgspec
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
+from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
 from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
+from lmshealth.batch.status import Change, Fleet, Status
 from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -49,6 +54,10 @@ class Settings:
         Most memory in bytes that reading a log may take.
     follow_links : bool
         Whether symbolic links out of the folder of logs are followed.
+    alerts : Alerts
+        Which changes since the last run are delivered, and how.
+    growing : frozenset of Path
+        Files that are left to a later run.
 
     Examples
     --------
@@ -68,6 +77,8 @@ class Settings:
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
     follow_links: bool = False
+    alerts: Alerts = field(default_factory=Alerts)
+    growing: frozenset[Path] = frozenset()
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""
@@ -76,7 +87,7 @@ class Settings:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RunResult:
-    """Result of a run; the counts are 0 in a report."""
+    """Result of a run; in a report counts are 0, and status, changes and alerts empty."""
 
     index: Path  # front page of the report
     rows: tuple[Summary, ...]  # one per machine, most urgent first
@@ -85,6 +96,10 @@ class RunResult:
     n_refused: int = 0  # of them, refused as a whole
     n_remembered: int = 0  # of them, taken from the store
     n_unread: int = 0  # unreadable rows of ``manifest.csv`` and ``maintenance.csv``, or tables
+    # Status of all machines, those of earlier runs with it, and changes since the run before.
+    statuses: tuple[Status, ...] = ()
+    changes: tuple[Change, ...] = ()
+    unsent: dict[str, str] = field(default_factory=dict)  # options whose alerts failed, and why
 
     @property
     def pages(self) -> tuple[Path, ...]:
@@ -144,7 +159,7 @@ def run(
     work = read_maintenance(folder, follow_links=settings.follow_links)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         resources = Resources(store, pool, progress)
-        reading = Reading(settings.columns, settings.max_memory, settings.follow_links)
+        reading = Reading(*(getattr(settings, name) for name in Reading._fields))
         ingested = ingest(folder, stages, resources, out=out, reading=reading)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         by_digest = {stage.digest: stage for stage in stages}
@@ -156,23 +171,26 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        summaries, excluded, not_reported = _report(usable, refused, resources, out)
+        done, fleet, excluded = _report(usable, refused, resources, out, settings.alerts)
+    if machines:
+        write_index(out, done.rows, refused)
+    unsent = publish(fleet, settings.alerts, out)
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
     lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
             f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
+            + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
-    rows = tuple(by_urgency(summaries.values()))
-    return RunResult(
-        index=write_index(out, rows, refused),
-        rows=rows,
+    return replace(
+        done,
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
-        failed=failed | not_reported,
+        failed=failed | done.failed,
+        unsent=unsent,
     )
 
 
@@ -236,19 +254,24 @@ def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
 
 
 def _report(
-    machines: Sequence[Machine], refused: Sequence[Refusal], resources: Resources, out: Path
-) -> tuple[dict[str, Summary], set[str], dict[str, str]]:
-    """Write pages and tables; return rows of the index, excluded logs, and machines that failed.
+    machines: Sequence[Machine],
+    refused: Sequence[Refusal],
+    resources: Resources,
+    out: Path,
+    alerts: Alerts,
+) -> tuple[RunResult, Fleet, set[str]]:
+    """Write pages and tables; return the result without counts, status, and excluded logs.
 
-    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
+    Changes are those since the last run into this folder. Machines whose assessment is missing, or
+    cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
     refused_key = store.put_refused(tuple(refused))
-    rows, excluded = dict[str, Summary](), set[str]()
+    rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    packed = {"": pack({"refused": refused_rows(refused)})}
+    packed = dict[str, bytes]()
     left = list(machines)
     for attempt in range(constants.ASSESSMENT_ATTEMPTS):
         if attempt:
@@ -263,14 +286,27 @@ def _report(
             store.publish(name, (keys[name], own_keys[name]), refused_key)
             packed[name] = output.tables
             excluded.update(output.excluded)
+            made[name] = output.status
             rows[name] = output.page.summary
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
+    moment = datetime.now(UTC)
+    fleet, changes = update_fleet(read_fleet(out), made, moment, alerts)
+    store.put_status(fleet.machines, changes, moment)
+    changed = [msgspec.to_builtins(change) for change in changes]
+    packed[""] = pack({"refused": refused_rows(refused), "changes": changed})
     write_tables(out, names, packed)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    return rows, excluded, not_updated | unread | failed
+    result = RunResult(
+        index=out / "index.html",
+        rows=tuple(by_urgency(rows.values())),
+        failed=not_updated | unread | failed,
+        statuses=fleet.machines,
+        changes=tuple(changes),
+    )
+    return result, fleet, excluded
 
 
 def _outputs(
@@ -298,6 +334,7 @@ def _outputs(
     )
     for name, output in write_pages(records, resources.pool, out):
         if isinstance(output, MachineOutput):
+            store.put_points(name, output.points)
             store.put_part(name, missing[name][1], pack(output))
         yield name, output
 

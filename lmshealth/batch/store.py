@@ -12,6 +12,7 @@ import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple, Self, cast
 from urllib.parse import quote
@@ -25,6 +26,7 @@ from sqlalchemy.schema import CreateTable
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
+from lmshealth.batch.status import Change, Status
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import Summary
@@ -48,13 +50,19 @@ _METADATA = sql.MetaData()
 _BYTES, _DIGEST = sql.LargeBinary, sql.String(64)
 _KINDS: dict[str, Any] = {"content": _BYTES, "evidence": _BYTES, "summary": _BYTES}
 _KINDS |= {"number": sql.Integer, "version": sql.Text, "machine": sql.Text, "name": sql.Text}
+_KINDS |= dict.fromkeys(("low", "median", "high", "probability"), sql.Float)
+_KINDS |= dict.fromkeys(("service_by", "inspect_by"), sql.Date)
+_KINDS |= dict.fromkeys(("recorded_at", "noticed_at"), sql.DateTime(timezone=True))
+_KINDS |= dict.fromkeys(("state", "verdict", "service", "alarms", "silent"), sql.Text)
+_KINDS |= dict.fromkeys(("quantity", "subject", "what", "before", "now"), sql.Text)
+_OPTIONAL = {"machine", "low", "median", "high", "probability", "service_by", "inspect_by"}
 
 
 def _table(table: str, keys: str, columns: str) -> sql.Table:
     """Declare a table; keys, and columns of no other kind, are digests."""
     primary = [sql.Column(name, _DIGEST, primary_key=True) for name in keys.split()]
     others = [
-        sql.Column(name, _KINDS.get(name, _DIGEST), nullable=name == "machine")
+        sql.Column(name, _KINDS.get(name, _DIGEST), nullable=name in _OPTIONAL)
         for name in columns.split()
     ]
     return sql.Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
@@ -72,6 +80,13 @@ _PRESENT = _table("present", "machine", "name key refused")
 _REPORTED = _table("reported", "machine key", "number content")
 # Lists of logs that belong to no machine, by the fingerprint of the list.
 _REFUSED = _table("refused", "key", "content")
+# For dashboards: the present status of each machine, its values at logs, changes between runs.
+_SHOWN = "recorded_at verdict probability service service_by inspect_by"
+_STATUS = _table("status", "machine", f"name {_SHOWN} state alarms silent")
+_POINTS = _table("points", "machine key", "name recorded_at quantity subject low median high")
+_CHANGES = _table("changes", "machine key", "name recorded_at noticed_at what before now")
+_CREATE_VIEW = {"sqlite": "CREATE VIEW IF NOT EXISTS", "postgresql": "CREATE OR REPLACE VIEW"}
+_VIEWS = {f"lmshealth_{table.name.split('_')[0]}": table for table in (_STATUS, _POINTS, _CHANGES)}
 
 
 # Records
@@ -172,7 +187,8 @@ class Store:
         self._engine, self._address = _connect(url, create=create)
         self._shown = shown_address(self._address)
         tables = sql.inspect(self._engine).get_table_names()
-        if missing := set(_METADATA.tables) - set(tables):
+        shown = {table.name for table in _VIEWS.values()}
+        if missing := _METADATA.tables.keys() - shown - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
@@ -256,6 +272,37 @@ class Store:
         with self._begin() as connection:
             return {row.key: row.content for row in connection.execute(query)}
 
+    def put_points(self, machine: str, points: Iterable[dict[str, Any]]) -> None:
+        """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
+        rows = []
+        for own in points:
+            key = fingerprint(own["quantity"], own["subject"], own["recorded_at"])
+            moment = datetime.fromisoformat(own["recorded_at"])
+            rows.append(own | {"name": machine, "key": key, "recorded_at": moment})
+        earlier = _POINTS.c.machine == _id(machine), _POINTS.c.quantity != "remaining_km"
+        with self._begin() as connection:
+            connection.execute(sql.delete(_POINTS).where(*earlier))
+            self._put_rows(connection, _POINTS, rows)
+
+    def put_status(
+        self, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
+    ) -> None:
+        """Store the status of machines and what has changed, for dashboards."""
+        present = [
+            {name: getattr(one, name) for name in _SHOWN.split()}
+            | {"name": one.stage, "state": one.device_health, "alarms": " ".join(one.alarms)}
+            | {"silent": "yes" if one.silent else "no"}
+            for one in statuses
+        ]
+        changed = [
+            {name: getattr(one, name) for name in ("recorded_at", "what", "before", "now")}
+            | {"name": one.stage, "key": fingerprint(one), "noticed_at": noticed_at}
+            for one in changes
+        ]
+        with self._begin() as connection:
+            self._put_rows(connection, _STATUS, present)
+            self._put_rows(connection, _CHANGES, changed)
+
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
@@ -323,6 +370,18 @@ class Store:
     def _put(self, table: sql.Table, row: dict[str, Any]) -> None:
         with self._begin() as connection:
             connection.execute(self._upsert(table, row))
+
+    def _put_rows(
+        self, connection: Connection, table: sql.Table, rows: Iterable[dict[str, Any]]
+    ) -> None:
+        """Write rows of machines by their names; SQLite knows no zones: moments are in UTC."""
+        whole = [
+            {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+            | {"machine": _id(row["name"])}
+            for row in rows
+        ]
+        if whole:
+            connection.execute(self._upsert(table, whole[0]), whole)
 
     def _upsert(self, table: sql.Table, row: dict[str, Any], *, where: Any = None) -> Any:
         """Insert or update a row, of another table with ``where``: a later write replaces it."""
@@ -419,10 +478,26 @@ def _create_tables(engine: Engine) -> None:
                 for table in _METADATA.sorted_tables:
                     if table.name not in existing:
                         connection.execute(CreateTable(table, if_not_exists=True))
+                _create_views(connection)
             return
         except SQLAlchemyError:
             if attempt == attempts - 1:
                 raise
+
+
+def _create_views(connection: Connection) -> None:
+    """Create the views of dashboards, or make them those of this schema; rights on them stay."""
+    there = sql.inspect(connection)
+    existing = there.get_view_names()
+    for name, table in _VIEWS.items():
+        if name in existing:
+            if table.name in (there.get_view_definition(name) or ""):
+                continue
+            connection.execute(sql.text(f"DROP VIEW {name}"))
+        names = [column.name for column in table.columns if not column.primary_key]
+        columns = ", ".join("name AS stage" if name == "name" else name for name in names)
+        create = _CREATE_VIEW[connection.dialect.name]
+        connection.execute(sql.text(f"{create} {name} AS SELECT {columns} FROM {table.name}"))
 
 
 def _reason(error: Exception, address: str) -> str:

@@ -1,18 +1,74 @@
-"""Commands on archives and stores: run, report."""
+"""Commands on archives and stores: run, watch, report."""
 
+import signal
+import sys
+from collections.abc import Callable
 from contextlib import closing
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import click
 
-from lmshealth.batch.run import Settings
+from lmshealth.batch import constants
+from lmshealth.batch.alerts import Alerts
+from lmshealth.batch.run import RunResult, Settings
 from lmshealth.batch.run import report as write_pages
 from lmshealth.batch.run import run as run_pipeline
 from lmshealth.batch.store import Store
+from lmshealth.batch.watch import watch as watch_folder
 from lmshealth.cli import options, terminal, views
+from lmshealth.errors import LmshealthError
+from lmshealth.report.constants import TERMINAL_ROWS
 from lmshealth.report.rendering import write_pdfs
+from lmshealth.report.text import plain
 from lmshealth.stage.description import Stage
+
+
+def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add argument and options of a run."""
+    scheduler = click.option(
+        "--scheduler",
+        metavar="ADDRESS",
+        help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, "
+        "and its workers access to the logs under the same paths.",
+    )
+    text = "Stage description: a .toml file or a shipped name; may be given several times."
+    store = "Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
+    added = (
+        click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path)),
+        options.stage_option("stages", multiple=True, required=True, help=text),
+        options.out_option(type=options.FOLDER, help="Folder for tables and report."),
+        options.store_option(help=store),
+        options.reading_options,
+        options.WORKERS,
+        scheduler,
+        options.EPOCHS,
+        options.SEED,
+        options.alert_options,
+        options.PDF,
+        options.format_option("table", "json"),
+    )
+    for option in reversed(added):
+        command = option(command)
+    return command
+
+
+def _settings(given: dict[str, Any]) -> Settings:
+    """Return the settings of a run by its options."""
+    alerts = Alerts(**{name: given.pop(name) for name in ("silent_days", "command", "notify")})
+    return Settings(**given, alerts=alerts, follow_links=options.follow_links())
+
+
+def _document(result: RunResult) -> dict[str, Any]:
+    """Return the result of a run for other programs."""
+    names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
+    head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
+    return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
+
+
+def _errors(result: RunResult) -> list[str]:
+    return [f"{name}: {why}" for name, why in (*result.failed.items(), *result.unsent.items())]
 
 
 @options.command(
@@ -20,51 +76,73 @@ from lmshealth.stage.description import Stage
     "run exports/ --columns map.toml --stage my-stage.toml --out result/",
     "run archive/ --stage lms-x --stage lms-y --out result/ "
     "--store postgresql://me@host/fleet --scheduler tcp://host:8786",
+    "run logs/ --stage lms-y --out result/ --silent-days 7 --alert-command 'mail -s lms me@host'",
 )
-@click.argument("logs", type=click.Path(exists=True, file_okay=False, path_type=Path))
-@options.stage_option(
-    "stages",
-    multiple=True,
-    required=True,
-    help="Stage description: a .toml file or a shipped name; may be given several times.",
-)
-@options.out_option(type=options.FOLDER, help="Folder for tables and report.")
-@options.store_option(
-    help="Store of results: sqlite:///PATH or a PostgreSQL database; default a file in --out."
-)
-@options.reading_options
-@options.WORKERS
-@click.option(
-    "--scheduler",
-    metavar="ADDRESS",
-    help="Run on the Dask cluster with this scheduler. It needs the same version of lmshealth, and "
-    "its workers access to the logs under the same paths.",
-)
-@options.EPOCHS
-@options.SEED
-@options.PDF
+@_run_options
 @click.pass_context
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
-    pdf = given.pop("pdf")
+    pdf, style = given.pop("pdf"), given.pop("style")
     with terminal.progress_bars() as progress:
-        result = run_pipeline(
-            logs, stages, out, Settings(**given, follow_links=options.follow_links()), progress
-        )
-    used = result.n_logs - result.n_refused
-    again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
-    click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
-    if result.n_unread:
-        click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
-    views.print_summaries(result.rows)
-    terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
-    click.echo(f"Report: {result.index}")
+        result = run_pipeline(logs, stages, out, _settings(given), progress)
+    if style == "json":
+        terminal.print_json(_document(result))
+    else:
+        used = result.n_logs - result.n_refused
+        again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
+        click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
+        if result.n_unread:
+            click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
+        views.print_summaries(result.rows)
+        for change in result.changes[:TERMINAL_ROWS]:
+            terminal.print_text(f"Changed: {change}")
+        if rest := len(result.changes[TERMINAL_ROWS:]):
+            click.echo(f"{rest} more changes; changes.csv lists all.")
+        click.echo(f"Report: {result.index}")
+    terminal.print_errors(_errors(result))
     if pdf:
         write_pdfs(result.pages)
     some = result.n_refused or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
+
+
+@options.command(
+    "watch logs/ --stage lms-y --out result/",
+    "watch /mnt/logs/ --stage lms-y --out result/ --silent-days 7 --notify --interval 60",
+)
+@_run_options
+@click.option(
+    "--interval",
+    type=options.Finite(0, min_open=True),
+    default=30.0,
+    metavar="SECONDS",
+    help="Time between polls; a file is analysed when it is the same at two of them.",
+)
+def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **given: Any) -> None:
+    """Run over a folder of logs whenever logs have arrived; ends by SIGTERM or Ctrl-C.
+
+    Prints one line for each run, change and failure; with --format json one document a line.
+    """
+    pdf, style = given.pop("pdf"), given.pop("style")
+    # Like an interrupt: workers end, and the next run continues.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
+    for result in watch_folder(logs, stages, out, _settings(given), interval=interval):
+        now = f"{datetime.now().astimezone().isoformat(timespec='seconds')} "
+        if isinstance(result, LmshealthError):
+            terminal.print_errors([now + str(result)])
+            continue
+        if style == "json":
+            terminal.print_json(_document(result), indent=-1)
+        else:
+            used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
+            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run")
+            for change in result.changes:
+                click.echo(f"{now}{plain(str(change))}")
+        terminal.print_errors(now + error for error in _errors(result))
+        if pdf:
+            write_pdfs(result.pages)
 
 
 @options.command(

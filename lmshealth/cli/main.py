@@ -27,6 +27,7 @@ _COMMANDS = {
     "spectrum": ("log_commands", "Measure accelerations per mode and velocity."),
     "stage": ("stage_commands", "Check a stage description."),
     "track": ("machine_commands", "Track modes through a table of estimates."),
+    "watch": ("archive_commands", "Run over a folder of logs whenever logs arrive."),
 }
 
 
@@ -59,7 +60,8 @@ class _Group(click.Group):
             print_errors([f"{error.filename or 'output'}: {error.strerror}"])
         except KeyboardInterrupt:
             # Only a run keeps what is finished.
-            kept = "; run again to continue" if ctx.invoked_subcommand == "run" else ""
+            runs = ctx.invoked_subcommand in ("run", "watch")
+            kept = "; run again to continue" if runs else ""
             print_errors([f"interrupted{kept}"])
             ctx.exit(_INTERRUPTED)
         ctx.exit(1)

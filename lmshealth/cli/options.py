@@ -1,15 +1,20 @@
 """Options that several commands share, and the types of their values."""
 
 import math
+import os
+import shlex
 from collections.abc import Callable
 from datetime import date, datetime
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import click
 from loky import cpu_count
 
+from lmshealth.batch.constants import NOTIFY
+from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
@@ -54,6 +59,26 @@ def _band(
             f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
         )
     return band
+
+
+def _words(ctx: click.Context, option: click.Parameter, command: str | None) -> tuple[str, ...]:
+    """Split a command into program and arguments: no shell reads it."""
+    try:
+        words = tuple(shlex.split(command or ""))
+    except ValueError as error:
+        raise click.BadParameter(f"{error} in {command!r}") from error
+    if command is not None and not words:
+        raise click.BadParameter("names no program")
+    return words
+
+
+def _notify(ctx: click.Context, option: click.Parameter, given: bool) -> bool:
+    """Require apprise, and an address, before the first log is read."""
+    if given and not os.environ.get(NOTIFY, "").split():
+        raise click.BadParameter(f"the environment variable {NOTIFY} holds no address")
+    if given and find_spec("apprise") is None:
+        raise LmshealthError("--notify needs apprise: pip install 'lmshealth[notify]'")
+    return given
 
 
 TABLE = click.Path(exists=True, dir_okay=False, path_type=Path)
@@ -138,12 +163,36 @@ WORKERS = click.option(
     callback=lambda ctx, option, count: count or cpu_count(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
+_SILENT_DAYS = click.option(
+    "--silent-days",
+    type=Finite(0, min_open=True),
+    metavar="N",
+    help="Report a machine without a log for more than N days.",
+)
+_ALERT_COMMAND = click.option(
+    "--alert-command",
+    "command",
+    metavar="CMD",
+    callback=_words,
+    help="Run a program with the changes since the last run as JSON on standard input.",
+)
+_NOTIFY = click.option(
+    "--notify",
+    is_flag=True,
+    callback=_notify,
+    help=f"Send the changes to the addresses of apprise in {NOTIFY}.",
+)
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options by which logs are read: --columns and --max-memory (bytes)."""
     return _COLUMNS(_MAX_MEMORY(command))
+
+
+def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:
+    """Add the fields of `Alerts`: --silent-days, --alert-command and --notify."""
+    return _SILENT_DAYS(_ALERT_COMMAND(_NOTIFY(command)))
 
 
 def format_option(*styles: str) -> Callable[[Any], Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from string import Formatter
@@ -29,11 +29,11 @@ _REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | deta
 _NAME = 16
 
 
-def print_json(content: dict[str, list[Row]]) -> None:
-    """Print JSON with null where a number is missing."""
+def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
+    """Print JSON with null where a number is missing; with a negative indent in one line."""
     # msgspec writes null for NaN and infinity.
     encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
-    click.echo(msgspec.json.format(encoded, indent=1))
+    click.echo(msgspec.json.format(encoded, indent=indent))
 
 
 def print_notes(notes: Iterable[str]) -> None:

@@ -57,6 +57,7 @@ COLUMNS = {
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
     "warnings": "stage recorded_at code severity where what what_to_do",
+    "changes": "stage what before now recorded_at",
 }
 
 # Tables of single logs, of plans and of stage descriptions.

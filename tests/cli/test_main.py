@@ -781,6 +781,43 @@ def test_a_description_that_a_manifest_asks_for_and_nobody_gave_is_named(
     assert "column description of manifest.csv" in result.stderr
 
 
+@pytest.mark.slow
+def test_a_run_as_json_is_one_document(folder: Path, stage: Path, tmp_path: Path) -> None:
+    """Counts, status and changes on standard output and nothing else; alerts that fail beside."""
+    fails = f"{sys.executable} -c 'import sys; sys.exit(5)'"
+    words = ["run", folder / "good", "--stage", stage, "--out", tmp_path / "out", "--workers", 1]
+    words += ["--format", "json", "--silent-days", 7, "--alert-command", fails]
+    result = call(*words)
+    assert result.exit_code == 0  # a failed alert changes no exit status
+    document = strict(result.stdout)
+    assert (document["n_logs"], document["n_refused"], document["failed"]) == (2, 0, {})
+    (machine,), (change,) = document["machines"], document["changes"]
+    assert (machine["stage"], machine["DeviceHealth"]) == ("test-A", "CHECK_FUNCTION")
+    assert machine["verdict"] == "not-enough-data" and machine["service_by"] is None
+    assert (change["what"], change["stage"]) == ("silent", "test-A")
+    assert Path(str(document["report"])).is_file()
+    assert "--alert-command: ended with status 5" in result.stderr
+    assert len(result.stderr.splitlines()) == 1
+    again = call(*words[:-4])
+    assert strict(again.stdout)["changes"] == [] and again.stderr == ""
+
+
+def test_alerts_that_cannot_be_sent_are_known_before_the_run(
+    stage: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No address, no program and half a quotation are wrong usage; without apprise: status 1."""
+    words = ["run", tmp_path, "--stage", stage, "--out", tmp_path / "out"]
+    monkeypatch.delenv("LMSHEALTH_NOTIFY", raising=False)
+    for more in (["--notify"], ["--alert-command", " "], ["--alert-command", "mail 'me"]):
+        assert call(*words, *more).exit_code == 2
+    monkeypatch.setenv("LMSHEALTH_NOTIFY", "mailto://me:secret@host")
+    monkeypatch.setattr("lmshealth.cli.options.find_spec", lambda name: None)
+    result = call(*words, "--notify")
+    assert result.exit_code == 1
+    assert "pip install 'lmshealth[notify]'" in result.stderr and "secret" not in result.output
+    assert not (tmp_path / "out").exists()
+
+
 @pytest.mark.parametrize("reference", ["lms-q", "nowhere/stage.toml"])
 def test_an_unknown_stage_is_status_1_with_one_line(
     folder: Path, tmp_path: Path, reference: str

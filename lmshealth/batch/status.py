@@ -1,0 +1,219 @@
+"""Status of machines for other programs: NAMUR NE 107 state, service, remaining life, changes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from datetime import UTC, date, datetime, time, timedelta
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+
+from lmshealth.batch import constants
+from lmshealth.health.verdict import degraded_words, undeclared_events
+from lmshealth.report.assessment import Assessment, Summary
+from lmshealth.report.notices import notices
+from lmshealth.report.tables import Row, prognosis_rows
+from lmshealth.report.text import spell
+from lmshealth.stage.constants import INFORMED
+
+DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
+"""State by NAMUR NE 107, as OPC 10000-100 names the values of ``DeviceHealthEnumeration``."""
+
+
+class Change(msgspec.Struct, frozen=True):
+    """Change of a machine from one run to the next: a row of ``changes.csv``."""
+
+    stage: str
+    what: str  # alarm, verdict, silent or recovered
+    before: str
+    now: str
+    recorded_at: datetime  # of the last log
+
+    def __str__(self) -> str:
+        states = " → ".join(state for state in (self.before, self.now) if state)
+        return f"{self.stage}: {self.what} {states}"
+
+
+class Status(msgspec.Struct, frozen=True, kw_only=True):
+    """Status of a machine after a run: one ``<stage>.status.json``."""
+
+    schema: int = constants.STATUS_SCHEMA
+    stage: str
+    page: str  # file in the same folder
+    description: str  # name of the stage description
+    recorded_at: datetime  # of the last log
+    baseline_at: datetime
+    device_health: DeviceHealth = msgspec.field(name="DeviceHealth", default="NORMAL")
+    conditions: dict[str, DeviceHealth] = {}  # `conditions`; the first one is `device_health`
+    silent: bool = False  # no log for longer than ``--silent-days``
+    verdict: str
+    probability: float | None
+    why: str
+    alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
+    announced: tuple[str, ...] = ()  # modes whose alarm was a change since the baseline
+    warnings: dict[str, str]  # code and severity of what was noticed
+    infers_health: bool  # whether the description has a parameter
+    probability_limit_reached: float | None  # now; None where no limit is determined
+    health: tuple[dict[str, Any], ...]  # parameters that the logs determine, over their baselines
+    remaining_life: tuple[dict[str, Any], ...]  # rows of prognosis.csv; the last one is any limit
+    service: str  # service, service_by, inspect_by: as in prognosis.csv
+    service_by: date | None
+    inspect_by: date | None
+    # Activities and when they become necessary: MaintenancePrognosisType of OPC 40501-1.
+    prognoses: tuple[dict[str, Any], ...] = msgspec.field(name="Prognoses")
+
+
+class Fleet(msgspec.Struct, frozen=True):
+    """Status of all machines after a run, and changes that were not delivered by channel."""
+
+    machines: tuple[Status, ...] = ()
+    pending: dict[str, tuple[Change, ...]] = {}
+    schema: int = constants.STATUS_SCHEMA
+
+
+def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
+    """Return what keeps a machine from the state ``NORMAL``, by code; the first is its state.
+
+    Evidence of damage comes before missing logs, which must not hide it.
+    """
+    verdict, by, inspect = status.verdict, status.service_by, status.inspect_by
+    judged = verdict != "not-enough-data"
+    serious = {code for code, severity in status.warnings.items() if severity == "serious"}
+    reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
+    soon = today + timedelta(days=constants.SERVICE_LEAD_DAYS)
+    found: list[tuple[DeviceHealth, str, object]] = [
+        ("FAILURE", "limit-reached", reached),
+        ("OFF_SPEC", "alarm", status.alarms and not judged),
+        ("OFF_SPEC", "step", verdict == "step"),
+        ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
+        ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
+        ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
+        ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
+        ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
+        ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
+        ("CHECK_FUNCTION", "silent", status.silent),
+    ]
+    return {code: state for state, code, applies in found if applies}
+
+
+def make_status(assessment: Assessment, summary: Summary) -> Status:
+    """Collect the status of a machine from its results, before it is compared and judged."""
+    track, life, service = assessment.track, summary.life, summary.service
+    alarms = undeclared_events(track, assessment.history.baseline, "alarm")
+    shown = [one for one in summary.health if one.determined]
+    reached = [one.below_limit for one in shown if one.limit is not None]
+    reached += [life.any.already_past] if life else []
+    health = [
+        {
+            **{"parameter": one.name, "q05": one.low, "median": one.median, "q95": one.high},
+            **{"limit": one.limit, "probability_below_limit": _or_none(one.below_limit)},
+        }
+        for one in shown
+    ]
+    return Status(
+        stage=summary.identity,
+        page=summary.file,
+        description=assessment.stage.name,
+        recorded_at=summary.recorded_at,
+        baseline_at=summary.baseline_at,
+        verdict=summary.verdict,
+        probability=_or_none(summary.probability),
+        why=summary.why,
+        alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
+        warnings={one.code: one.severity for one in reversed(notices(assessment))},
+        infers_health=bool(assessment.stage.parameters),
+        probability_limit_reached=max(reached, default=None),
+        health=tuple(health),
+        remaining_life=tuple(prognosis_rows(life, service)) if life else (),
+        service=service.kind,
+        service_by=service.by,
+        inspect_by=service.inspect_by,
+        prognoses=tuple(_prognoses(summary)),
+    )
+
+
+def _prognoses(summary: Summary) -> Iterator[dict[str, Any]]:
+    """Yield what has to be done and when (UTC), as far as that is before the horizon.
+
+    The probability to reach a limit before that time is no part of OPC 40501-1.
+    """
+    service, zone = summary.service, summary.recorded_at.tzinfo
+    limits = summary.life.limits[:-1] if summary.life else ()
+    found = [("Service", service.by, service.risk), ("Record a log", service.inspect_by, np.nan)]
+    found += [(f"Restore {spell(one.parameter)}", one.dates[3], 0.5) for one in limits]  # medians
+    for activity, day, risk in found:
+        if day is not None:
+            moment = datetime.combine(day, time(), zone).astimezone(UTC)
+            yield {"Activity": activity, "PredictedTime": moment, "Probability": _or_none(risk)}
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None
+
+
+def compare(
+    before: Status | None, now: Status, moment: datetime, silent_days: float | None
+) -> tuple[Status, list[Change]]:
+    """Judge a status at a moment, and list its changes since the run before; None if it is new.
+
+    An alarm of a mode is a change once per baseline, the silence of a machine once until its next
+    log. Without ``silent_days`` a silence only lasts.
+    """
+    if silent_days is None:
+        silent = before is not None and before.silent and before.recorded_at == now.recorded_at
+    else:
+        silent = moment - now.recorded_at > timedelta(days=silent_days)
+    known = before.announced if before and before.baseline_at == now.baseline_at else ()
+    announced = tuple(dict.fromkeys((*known, *now.alarms)))
+    now = msgspec.structs.replace(now, silent=silent, announced=announced)
+    found = conditions(now, moment.date())
+    state: DeviceHealth = next(iter(found.values()), "NORMAL")
+    now = msgspec.structs.replace(now, conditions=found, device_health=state)
+    changes = [("alarm", "", mode) for mode in announced if mode not in known]
+    changes += _transitions(before, now, moment)
+    return now, [Change(now.stage, *one, now.recorded_at) for one in changes]
+
+
+def _transitions(
+    before: Status | None, now: Status, moment: datetime
+) -> Iterator[tuple[str, str, str]]:
+    """Yield changes of verdict, silence and alarms; of a new machine only what is bad."""
+    was = before.verdict if before else ""
+    last = (before or now).recorded_at.date().isoformat()
+    if was != now.verdict and (before or _is_loss(now.verdict)):
+        recovered = _is_loss(was) and now.verdict == "healthy"
+        yield "recovered" if recovered else "verdict", was, now.verdict
+    elif before and before.alarms and not now.alarms:
+        yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
+    if now.silent and not (before and before.silent):
+        yield "silent", f"last log of {last}", f"no log for {(moment - now.recorded_at).days} days"
+    elif before and before.silent and not now.silent:
+        yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
+
+
+def _is_loss(verdict: str) -> bool:
+    return verdict not in ("", "healthy", "not-enough-data")
+
+
+def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
+    """Return values of a machine with 90 % intervals for dashboards, from the rows of its tables.
+
+    Health (in units of the parameter) and frequency at its newest logs, remaining life at the last.
+    """
+    tables = {name: rows.get(name, ()) for name in ("health", "track", "prognosis", "verdict")}
+    found = [
+        ("health", row["parameter"], row["recorded_at"], row["q05"], row["median"], row["q95"])
+        for row in tables["health"]
+        if row["converged"] and row["identifiable"] and row["informed"] >= INFORMED
+    ]
+    for row in tables["track"][-constants.TRACK_POINTS :]:
+        hertz, spread = row["frequency_hz"], 1.645 * row["frequency_std_hz"]
+        own = hertz - spread, hertz, hertz + spread
+        if np.isfinite(own).all():
+            found.append(("frequency_hz", row["mode"], row["recorded_at"], *map(float, own)))
+    for row in tables["prognosis"]:
+        own = tuple(row[f"rul_km_{name}"] for name in ("q05", "q50", "q95"))
+        found.append(("remaining_km", row["parameter"], tables["verdict"][0]["recorded_at"], *own))
+    names = "quantity", "subject", "recorded_at", "low", "median", "high"
+    return [dict(zip(names, own, strict=True)) for own in found]

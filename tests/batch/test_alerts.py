@@ -1,0 +1,274 @@
+"""Alerts: what changed from night to night is delivered once, and nothing waits for a command."""
+
+from __future__ import annotations
+
+import csv
+import json
+import os
+import sys
+import time
+from dataclasses import replace
+from datetime import datetime, timedelta
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lmshealth.batch import alerts as alerting
+from lmshealth.batch import constants, ingest, outputs
+from lmshealth.batch import run as running
+from lmshealth.batch.alerts import Alerts, read_fleet, run_command
+from lmshealth.batch.run import RunResult, Settings, run
+from lmshealth.batch.store import Identified
+from lmshealth.errors import NothingUsable
+from lmshealth.report.assessment import Assessment, summarise
+from lmshealth.report.machine_page import Page
+from lmshealth.stage.description import Stage
+from studies.harness.servers import wait_until
+from tests.lives import FREQUENCY, MODES, START, make_reading, make_stage
+
+N_BEFORE, N_NIGHTS = 8, 10
+# Program that appends what it is given as a line to a file.
+KEEP = "import sys; open(sys.argv[1], 'a').write(sys.stdin.read() + '\\n')"
+
+
+class Nights:
+    """An archive whose logs are estimates already, and the nights that add to it."""
+
+    def __init__(self, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.logs, self.out, self.sent = (folder / name for name in ("logs", "out", "sent.jsonl"))
+        self.logs.mkdir()
+        self.stage = make_stage(folder / "stage", parameters=(), tail="")
+        self.now = START
+        self.command = (sys.executable, "-c", KEEP, str(self.sent))
+        nights = self
+
+        class Clock(datetime):
+            @classmethod
+            def now(cls, tz: Any = None) -> datetime:  # type: ignore[override]
+                return nights.now
+
+        monkeypatch.setattr(running, "datetime", Clock)
+        monkeypatch.setattr(ingest, "identify_log", self.identify)
+        monkeypatch.setattr(outputs, "make_page", _no_page)
+
+    def identify(self, task: Any, stages: tuple[Stage, ...], max_memory: float) -> Identified:
+        """Return the estimates that a file states."""
+        machine, day, drift = task.path.read_text().split(",")
+        rng = np.random.default_rng([*machine.encode(), int(day)])
+        values = np.log(FREQUENCY[:2]) + [float(drift), 0.0] + 5e-4 * rng.standard_normal(2)
+        modes = dict(zip(MODES, values.tolist(), strict=False))
+        found = make_reading(task.name, float(day), 1e5 * float(day), modes)
+        cov = np.diag([2.5e-7, 2.5e-7, 1e-3, 1e-3])
+        metadata = replace(found.metadata, stage=machine)
+        found = replace(
+            found, digest=task.digest, metadata=metadata, modes=replace(found.modes, cov=cov)
+        )
+        return Identified(found, self.stage.digest, machine)
+
+    def add(self, machine: str, day: int, drift: float = 0.0) -> None:
+        """Write a log of a day, with ln f of the first mode off by a drift."""
+        (self.logs / f"{machine}-{day:02d}.csv").write_text(f"{machine},{day},{drift}")
+
+    def run(self, day: int, **alerts: Any) -> RunResult:
+        """Run in the evening of a day."""
+        self.now = START + timedelta(days=day, hours=12)
+        given = {"silent_days": 3.0, "command": self.command, **alerts}
+        return run(self.logs, [self.stage], self.out, Settings(alerts=Alerts(**given)))
+
+    def delivered(self) -> list[list[dict[str, str]]]:
+        """Return the changes of each call of the command."""
+        lines = self.sent.read_text().splitlines() if self.sent.exists() else []
+        return [json.loads(line)["changes"] for line in lines]
+
+
+def rows_of(path: Path) -> list[dict[str, str]]:
+    """Read a table."""
+    with path.open(encoding="utf-8", newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _no_page(found: Assessment, file: str, **_: Any) -> Page:
+    return Page("", summarise(found, found.service(), file))
+
+
+@pytest.fixture
+def nights(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Nights:
+    """Make an archive with some logs of four machines."""
+    made = Nights(tmp_path, monkeypatch)
+    for machine in "ABCD":
+        for day in range(N_BEFORE):
+            made.add(machine, day)
+    return made
+
+
+@pytest.mark.slow
+def test_ten_nights_are_reported_once_each(nights: Nights) -> None:
+    """Two new alarms, a silence and a recovery: one call of the command for each, and no other."""
+    changes = []
+    for night in range(N_NIGHTS):
+        day = N_BEFORE + night
+        nights.add("A", day)
+        nights.add("B", day, -0.004 * max(night - 2, 0))
+        nights.add("C", day, -0.004 * max(night - 3, 0) * (night < 8))
+        if night < 2:
+            nights.add("D", day)
+        if night == 8:  # the guide of C is replaced in the morning
+            moment = (START + timedelta(days=day, hours=-3)).isoformat()
+            rows = ["stage,recorded_at,travel_km,action", f"C,{moment},1550,guide-replaced"]
+            (nights.logs / "maintenance.csv").write_text("\n".join(rows) + "\n")
+        changes.append([str(change) for change in nights.run(day).changes])
+        assert len(rows_of(nights.out / "changes.csv")) == len(changes[-1])
+    expected = {
+        4: "D: silent last log of 2026-03-10 → no log for 3 days",
+        5: "B: alarm roll",
+        6: "C: alarm roll",
+        8: "C: recovered alarm roll → no alarm",
+    }
+    assert {night: own for night, own in enumerate(changes) if own} == {
+        night: [text] for night, text in expected.items()
+    }
+    assert [[row["text"] for row in call] for call in nights.delivered()] == [
+        [text] for text in expected.values()
+    ]
+    states = {one.stage: one.device_health for one in read_fleet(nights.out).machines}
+    assert states == {"A": "NORMAL", "B": "OFF_SPEC", "C": "NORMAL", "D": "CHECK_FUNCTION"}
+
+
+def test_an_archive_that_lost_all_logs_is_silent(nights: Nights) -> None:
+    """Machines whose files are gone are reported as silent, although the run itself fails."""
+    nights.run(N_BEFORE)
+    for path in nights.logs.iterdir():
+        path.unlink()
+    with pytest.raises(NothingUsable):
+        nights.run(N_BEFORE + 5)
+    (call,) = nights.delivered()
+    assert [(row["stage"], row["what"]) for row in call] == [(m, "silent") for m in "ABCD"]
+    document = json.loads((nights.out / "A.status.json").read_text())
+    assert document["silent"] and document["DeviceHealth"] == "CHECK_FUNCTION"
+    with pytest.raises(NothingUsable):
+        nights.run(N_BEFORE + 6)
+    assert len(nights.delivered()) == 1
+
+
+def test_what_was_not_delivered_is_sent_by_the_next_run(nights: Nights) -> None:
+    """A command that fails leaves the run whole; its changes come with those of the next run."""
+    fails = (sys.executable, "-c", "import sys; sys.exit('no \x1b route')")
+    found = nights.run(N_BEFORE + 3, command=fails)
+    (why,) = found.unsent.values()
+    assert "ended with status 1: no \\x1b route" in why and "4 changes are sent again" in why
+    assert (found.index.is_file(), len(found.changes)) == (True, 4)
+    assert nights.run(N_BEFORE + 4).changes == ()
+    (call,) = nights.delivered()
+    assert [row["stage"] for row in call] == list("ABCD")
+    nights.run(N_BEFORE + 4)
+    assert len(nights.delivered()) == 1
+
+
+def test_each_way_of_delivery_has_changes_of_its_own(
+    nights: Nights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where one of two fails, the next run sends nothing twice by the other."""
+    calls: list[str] = []
+
+    def deliver(command: tuple[str, ...], content: bytes) -> str:
+        calls.append("notify" if "-P" in command else "command")
+        return "" if "-P" in command or calls.count("command") > 1 else "fails"
+
+    monkeypatch.setattr(alerting, "run_command", deliver)
+    found = nights.run(N_BEFORE + 3, notify=True)
+    assert list(found.unsent) == ["--alert-command"]
+    assert nights.run(N_BEFORE + 3, notify=True).unsent == {}
+    assert calls == ["command", "notify", "command"]
+    # What is pending for an option that is no longer given is forgotten.
+    calls.clear()
+    nights.run(N_BEFORE + 3, command=())
+    assert calls == [] and read_fleet(nights.out).pending == {}
+
+
+def test_growing_files_are_left_to_a_later_run(nights: Nights) -> None:
+    """They are neither analysed nor refused."""
+    growing = frozenset({nights.logs.absolute() / "A-07.csv"})
+    nights.now = START + timedelta(days=N_BEFORE)
+    found = run(nights.logs, [nights.stage], nights.out, Settings(growing=growing))
+    assert (found.n_logs, found.n_refused) == (4 * N_BEFORE - 1, 0)
+    assert "A-07" not in (nights.out / "modes.csv").read_text()
+    assert run(nights.logs, [nights.stage], nights.out).n_logs == 4 * N_BEFORE
+
+
+def test_a_command_that_hangs_is_killed_with_its_children(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither it nor a child that holds its output open is waited for."""
+    monkeypatch.setattr(constants, "ALERT_TIMEOUT_S", 0.5)
+    pid = tmp_path / "pid"
+    child = f"import os, time; open({str(pid)!r}, 'w').write(str(os.getpid())); time.sleep(60)"
+    parent = f"import subprocess, sys; subprocess.run([sys.executable, '-c', {child!r}])"
+    begin = time.monotonic()
+    why = run_command((sys.executable, "-c", parent), b"{}")
+    assert why == "took longer than 0.5 s, and was killed"
+    assert time.monotonic() - begin < 10
+    if pid.exists():
+        wait_until(lambda: not Path(f"/proc/{pid.read_text()}/cmdline").exists(), "its end")
+
+
+def test_a_command_is_a_list_of_words_and_never_read_by_a_shell(tmp_path: Path) -> None:
+    """What a shell would expand arrives as it is; large input to a program that reads none too."""
+    out, word = tmp_path / "out", "$(touch bad); `id` > x *"
+    write = "import sys; open(sys.argv[1], 'w').write(sys.argv[2])"
+    assert run_command((sys.executable, "-c", write, str(out), word), b"x" * 10_000_000) == ""
+    assert out.read_text() == word
+    missing = str(tmp_path / "none")
+    assert run_command((missing,), b"") == f"{missing} cannot be started: No such file or directory"
+
+
+def test_messengers_get_a_line_for_each_change(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Addresses are those of the environment, and no failure quotes them."""
+    code = f"""
+class Apprise:
+    def __init__(self):
+        self.addresses = []
+    def add(self, address):
+        self.addresses.append(address)
+        return address.startswith("mailto:")
+    def notify(self, title, body):
+        open({str(tmp_path / "sent")!r}, "w").write(f"{{self.addresses}} {{title}} {{body}}")
+        return "refuse" not in self.addresses[0]
+"""
+    (tmp_path / "apprise.py").write_text(code)
+    (command,) = Alerts(notify=True).channels().values()
+    here = Path(alerting.__file__).parents[2]
+    monkeypatch.setenv("PYTHONPATH", f"{here}{os.pathsep}{tmp_path}")
+    content = b'{"changes": [{"text": "A: alarm roll"}]}'
+    monkeypatch.setenv("LMSHEALTH_NOTIFY", " mailto://me:secret@host \n mailto://you ")
+    assert run_command(command, content) == ""
+    sent = "['mailto://me:secret@host', 'mailto://you'] lmshealth: 1 changes A: alarm roll"
+    assert (tmp_path / "sent").read_text() == sent
+    for addresses in ("mailto://refuse:secret@host", "wrong:secret"):
+        monkeypatch.setenv("LMSHEALTH_NOTIFY", addresses)
+        why = run_command(command, content)
+        assert "LMSHEALTH_NOTIFY" in why and "secret" not in why
+
+
+def test_no_module_of_the_working_folder_is_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file named apprise.py among the logs is not what sends messages."""
+    (tmp_path / "apprise.py").write_text("raise SystemExit('run from the folder')")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PYTHONPATH", str(Path(alerting.__file__).parents[2]))
+    monkeypatch.setenv("LMSHEALTH_NOTIFY", "")
+    (command,) = Alerts(notify=True).channels().values()
+    assert "run from the folder" not in run_command(command, b'{"changes": []}')
+
+
+def test_a_status_that_cannot_be_read_counts_as_none(tmp_path: Path) -> None:
+    """Damaged, foreign or missing: the run goes on as the first one does."""
+    for content in (b"", b"{", b'{"machines": 3}'):
+        (tmp_path / alerting.FILE).write_bytes(content)
+        assert read_fleet(tmp_path).machines == ()
+    (tmp_path / alerting.FILE).unlink()
+    assert read_fleet(tmp_path).machines == ()

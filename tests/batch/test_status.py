@@ -1,0 +1,235 @@
+"""Status: the NAMUR state by a table, changes by another, and what other programs read."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from datetime import UTC, date, datetime, timedelta
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from lmshealth._serialize import pack, unpack
+from lmshealth.batch.status import Status, compare, conditions, make_status, points
+from lmshealth.report.assessment import Assessment, summarise
+from lmshealth.report.tables import machine_tables
+from lmshealth.tracking.track import Event
+from tests.assessments import Maker, blind, make, nothing
+
+__all__ = ["make"]
+
+TODAY = date(2026, 11, 25)
+LAST = datetime(2026, 11, 20, 6, tzinfo=UTC)
+SOUND: dict[str, Any] = {
+    "stage": "M7-Y",
+    "page": "M7-Y.html",
+    "description": "lms-y",
+    "recorded_at": LAST,
+    "baseline_at": datetime(2026, 1, 1, tzinfo=UTC),
+    "verdict": "healthy",
+    "probability": 0.97,
+    "why": "",
+    "alarms": {},
+    "warnings": {},
+    "infers_health": True,
+    "probability_limit_reached": 0.0,
+    "health": (),
+    "remaining_life": (),
+    "service": "by",
+    "service_by": date(2027, 6, 1),
+    "inspect_by": date(2026, 12, 24),
+    "prognoses": (),
+}
+ALARM = {"roll": LAST}
+OPEN = {"verdict": "not-enough-data", "service_by": None, "inspect_by": None}
+
+
+def status(**given: Any) -> Status:
+    """Give the status of a sound machine, but for some fields."""
+    return Status(**SOUND | given)
+
+
+@pytest.mark.parametrize(
+    ("given", "state", "codes"),
+    [
+        ({}, "NORMAL", ""),
+        ({"verdict": "preload"}, "MAINTENANCE_REQUIRED", "loss"),
+        ({"verdict": "both"}, "MAINTENANCE_REQUIRED", "loss"),
+        ({"verdict": "step"}, "OFF_SPEC", "step"),
+        (OPEN, "CHECK_FUNCTION", "no-verdict"),
+        (OPEN | {"infers_health": False}, "NORMAL", ""),
+        (OPEN | {"alarms": ALARM}, "OFF_SPEC", "alarm no-verdict"),
+        (OPEN | {"alarms": ALARM, "infers_health": False}, "OFF_SPEC", "alarm"),
+        ({"alarms": ALARM}, "NORMAL", ""),
+        ({"probability_limit_reached": 0.49}, "NORMAL", ""),
+        ({"probability_limit_reached": 0.5}, "FAILURE", "limit-reached"),
+        ({"probability_limit_reached": None}, "NORMAL", ""),
+        ({"service_by": TODAY + timedelta(days=31)}, "NORMAL", ""),
+        ({"service_by": TODAY + timedelta(days=30)}, "MAINTENANCE_REQUIRED", "service-due"),
+        ({"service_by": TODAY - timedelta(days=3)}, "MAINTENANCE_REQUIRED", "service-due"),
+        ({"inspect_by": TODAY}, "NORMAL", ""),
+        ({"inspect_by": TODAY - timedelta(days=1)}, "CHECK_FUNCTION", "inspection-overdue"),
+        ({"silent": True}, "CHECK_FUNCTION", "silent"),
+        ({"silent": True, "verdict": "mount"}, "MAINTENANCE_REQUIRED", "loss silent"),
+        ({"warnings": {"laws-do-not-fit": "serious"}}, "OFF_SPEC", "unreliable"),
+        ({"warnings": {"mode-off-map": "caution"}}, "NORMAL", ""),
+        (OPEN | {"warnings": {"no-result": "serious"}}, "CHECK_FUNCTION", "no-verdict"),
+        (
+            OPEN | {"warnings": {"unexplained-drifts": "serious"}},
+            "OFF_SPEC",
+            "unreliable no-verdict",
+        ),
+        (
+            {"warnings": {"no-log-since": "caution"}},
+            "CHECK_FUNCTION",
+            "no-log-since-maintenance",
+        ),
+    ],
+)
+def test_every_result_has_a_namur_state(given: dict[str, Any], state: str, codes: str) -> None:
+    """The first condition decides; all of them are listed."""
+    found = conditions(status(**given), TODAY)
+    assert " ".join(found) == codes
+    assert next(iter(found.values()), "NORMAL") == state
+
+
+@pytest.mark.parametrize(
+    ("before", "now", "expected"),
+    [
+        ({}, {}, []),
+        (None, {}, []),
+        (None, OPEN, []),
+        (None, {"verdict": "preload"}, [("verdict", "", "preload")]),
+        (None, OPEN | {"alarms": ALARM}, [("alarm", "", "roll")]),
+        ({}, {"verdict": "preload"}, [("verdict", "healthy", "preload")]),
+        (OPEN, {}, [("verdict", "not-enough-data", "healthy")]),
+        ({"verdict": "step"}, {}, [("recovered", "step", "healthy")]),
+        ({"verdict": "preload"}, {"verdict": "both"}, [("verdict", "preload", "both")]),
+        ({}, {"alarms": ALARM}, [("alarm", "", "roll")]),
+        ({"alarms": ALARM, "announced": ("roll",)}, {"alarms": ALARM}, []),
+        # The alarm comes and goes as logs arrive: it is announced once per baseline.
+        ({"announced": ("roll",)}, {"alarms": ALARM}, []),
+        (
+            {"announced": ("roll",), "baseline_at": LAST - timedelta(days=400)},
+            {"alarms": ALARM},
+            [("alarm", "", "roll")],
+        ),
+        (
+            {"alarms": ALARM, "announced": ("roll",)},
+            {},
+            [("recovered", "alarm roll", "no alarm")],
+        ),
+        (
+            {"silent": True, "recorded_at": LAST - timedelta(days=9)},
+            {},
+            [("recovered", "no log since 2026-11-11", "log of 2026-11-20")],
+        ),
+    ],
+)
+def test_changes_since_the_last_run(
+    before: dict[str, Any] | None, now: dict[str, Any], expected: list[tuple[str, str, str]]
+) -> None:
+    """New alarms, changed verdicts, recoveries; of a new machine only what is bad."""
+    was = None if before is None else status(**before)
+    _, found = compare(was, status(**now), LAST + timedelta(days=5), 7.0)
+    assert [(one.what, one.before, one.now) for one in found] == expected
+    assert all((one.stage, one.recorded_at) == ("M7-Y", LAST) for one in found)
+
+
+def test_a_silence_is_reported_once_and_lasts_until_the_next_log() -> None:
+    """Also through a run that does not ask for silences; the limit itself is none yet."""
+    found, changes = compare(status(), status(), LAST + timedelta(days=7), 7.0)
+    assert (found.silent, changes) == (False, [])
+    found, changes = compare(found, status(), LAST + timedelta(days=7, hours=1), 7.0)
+    assert [str(one) for one in changes] == [
+        "M7-Y: silent last log of 2026-11-20 → no log for 7 days"
+    ]
+    for days in (7.0, None, 7.0):
+        found, changes = compare(found, status(), LAST + timedelta(days=9), days)
+        assert (found.silent, changes) == (True, [])
+    later = status(recorded_at=LAST + timedelta(days=9))
+    assert not compare(found, later, LAST + timedelta(days=9), None)[0].silent
+
+
+def document(assessment: Assessment) -> dict[str, Any]:
+    """Give the status of an assessment as other programs read it."""
+    made = make_status(assessment, summarise(assessment, assessment.service(), "a.html"))
+
+    def refuse(name: str) -> None:
+        raise ValueError(f"{name} is no JSON")
+
+    text = msgspec.json.encode(made)
+    assert msgspec.json.encode(msgspec.json.decode(text, type=Status)) == text
+    assert msgspec.json.encode(unpack(pack(made), Status)) == text
+    found: dict[str, Any] = json.loads(text, parse_constant=refuse)
+    return found
+
+
+def test_a_status_has_the_numbers_of_the_tables(make: Maker) -> None:
+    """Service, life and health are those of the page; dates are moments in UTC."""
+    assessment = make()
+    service, found = assessment.service(), document(assessment)
+    summary = summarise(assessment, service)
+    assert found["verdict"] == "both" and found["service"] == service.kind == "by"
+    assert service.by is not None and service.inspect_by is not None
+    assert found["service_by"] == service.by.isoformat()
+    first, log, *limits = found["Prognoses"]
+    assert first["PredictedTime"] == f"{service.by.isoformat()}T00:00:00Z"
+    assert (first["Activity"], first["Probability"]) == ("Service", service.risk)
+    assert log["PredictedTime"] == f"{service.inspect_by.isoformat()}T00:00:00Z"
+    assert [one["Activity"] for one in limits] == [
+        "Restore guide preload",
+        "Restore mount stiffness",
+    ]
+    assert summary.life is not None
+    last = found["remaining_life"][-1]
+    assert (last["parameter"], last["service"]) == ("any", "by")
+    assert last["rul_km_q50"] == summary.life.any.travel[3] / 1000
+    assert [own["parameter"] for own in found["health"]] == ["guide_preload", "mount_stiffness"]
+    assert found["health"][0]["median"] == summary.health[0].median
+    past = [own.below_limit for own in summary.health]
+    assert found["probability_limit_reached"] == max(*past, summary.life.any.already_past)
+
+
+def test_what_is_not_known_is_null_or_left_out(make: Maker) -> None:
+    """Without results there is no probability, date or life; an undetermined value is left out."""
+    found = document(nothing(make()))
+    assert (found["probability"], found["service_by"], found["Prognoses"]) == (None, None, [])
+    assert (found["service"], found["probability_limit_reached"]) == ("unknown", None)
+    assert [own["parameter"] for own in document(blind(make()))["health"]] == ["guide_preload"]
+
+
+def test_alarms_since_the_baseline_are_listed(make: Maker) -> None:
+    """By mode, with the log at which they begin; declared ones are none."""
+    assessment = make()
+    track = assessment.track
+    assert track is not None
+    alarm = Event("alarm", 30, "roll", "", -0.02, 0.001, 9.0, False, 31)
+    events = (alarm, replace(alarm, mode="yaw", declared=True))
+    found = document(replace(assessment, track=replace(track, events=events)))
+    assert list(found["alarms"]) == ["roll"]
+    moment = datetime.fromisoformat(found["alarms"]["roll"])
+    assert moment == track.recorded_at[30]
+
+
+def test_points_of_a_dashboard_are_those_of_the_tables(make: Maker) -> None:
+    """Health and frequencies per log with 90 % intervals, and the remaining life now."""
+    assessment = make()
+    summary = summarise(assessment, assessment.service())
+    found = points(machine_tables((), assessment))
+    health = [one for one in found if one["quantity"] == "health"]
+    assert assessment.health is not None and assessment.track is not None
+    expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))
+    last = [health[-1][name] for name in ("low", "median", "high")]
+    np.testing.assert_allclose(last, expected[:, -1, 1])
+    roll = [one for one in found if (one["quantity"], one["subject"]) == ("frequency_hz", "roll")]
+    frequency = np.exp(assessment.track.ln_frequency[:, 0])
+    np.testing.assert_allclose([one["median"] for one in roll], frequency)
+    moments = [moment.isoformat() for moment in assessment.track.recorded_at]
+    assert [one["recorded_at"] for one in roll] == moments
+    km = {one["subject"]: one["median"] for one in found if one["quantity"] == "remaining_km"}
+    assert summary.life is not None
+    assert km["any"] == summary.life.any.travel[3] / 1000
+    assert points(machine_tables((), nothing(make()))) == points({}) == []
