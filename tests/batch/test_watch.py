@@ -120,7 +120,7 @@ def test_tables_stay_while_a_share_is_gone_and_a_new_day_is_a_reason(
 
     def next_day() -> None:
         nonlocal moment
-        moment += timedelta(hours=2)
+        moment += timedelta(days=1)
 
     monkeypatch.setattr(watching, "datetime", Clock)
     log.write_text("x")
