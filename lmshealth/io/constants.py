@@ -100,7 +100,5 @@ MOST_ROWS = 1_000_000
 """Rows of such a table: as many logs are an archive of several tables."""
 MOST_ARRAYS = 20_000
 """Arrays of a MAT variable."""
-DEEPEST = 32
-"""Nesting of structs in a MAT variable, and its dimensions."""
 MOST_SCALES = 10_000
 """Scales and coefficients of a TDMS channel: npTDMS iterates over as many as are claimed."""

@@ -98,7 +98,7 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
     (``too-slow``), and where the system ends the process (``too-large``).
     """
     stored = path.stat().st_size
-    memory = max(3 * constants.SMALL_ENOUGH, min(max_memory, 4 * stored))
+    memory = max(3 * constants.SMALL_ENOUGH, min(max_memory, constants.LARGEST_RATIO * stored))
     seconds = _max_seconds() + stored / constants.SLOWEST_READING
     load = f"{form.load.__module__}:{form.load.__qualname__}"
     arguments = form.name, load, str(path.absolute()), msgspec.to_builtins(columns), max_memory

@@ -112,14 +112,24 @@ def test_metadata_that_is_no_text(tmp_path):
     refused(path, "metadata", "sample_rate_hz")
 
 
+def foreign(kind, name):
+    """Write an object (3), a function (16), or an object of a newer class (17), without a name."""
+    value = vector(VALUES, name=b"")
+    if kind == 17:
+        words = element(1, b"") + element(1, b"MCOS") + element(1, b"gadget")
+        return element(14, element(6, struct.pack("<II", kind, 0)) + words + value)
+    content = value if kind == 16 else element(1, b"gadget") + fields(b"x") + value
+    return array(kind, (1, 1), name=name, content=content)
+
+
 @pytest.mark.parametrize("kind", [3, 16, 17])
 @pytest.mark.parametrize("packed", [True, False])
 def test_objects_are_never_loaded(tmp_path, kind, packed):
-    """Objects and functions are refused unread where they are wanted; elsewhere they are left."""
-    wanted = array(kind, (1, 1), content=bytes(16))
+    """Objects and functions are refused where they are wanted; elsewhere they are left."""
     if kind != 17:  # those have no name that could be wanted
+        wanted = array(kind, (1, 1), content=bytes(16))
         refused(mat_file(tmp_path / "a.mat", pack(wanted, packed)), "columns", "save plain arrays")
-    inner = array(kind, (1, 1), name=b"", content=bytes(16))
+    inner = foreign(kind, b"")
     wanted = pack(array(2, (1, 1), content=fields(b"x") + inner), packed)
     refused(mat_file(tmp_path / "b.mat", wanted), "columns", "save plain arrays")
     write(tmp_path / "c.mat", {"delta_e_um": NOISE, **RATE})
@@ -131,11 +141,11 @@ def test_objects_are_never_loaded(tmp_path, kind, packed):
 @pytest.mark.parametrize(
     "content",
     [
-        array(6, (1 << 30, 1), content=element(9, bytes(80))),
+        array(6, (1 << 20, 1), content=element(9, bytes(80))),
         array(6, (-1, 10), content=element(9, bytes(80))),
         array(6, (10, 1), content=element(99, bytes(80))),
         array(2, (1, 1), content=element(5, struct.pack("<i", 0)) + element(1, b"")),
-        array(2, (1 << 15, 1 << 15), content=fields(b"x")),
+        array(2, (1 << 10, 1 << 10), content=fields(b"x")),
         array(2, (1, 1), content=fields(b"x") + element(6, bytes(8))),
         array(42, (10, 1), content=element(9, bytes(80))),
         element(14, element(6, bytes(4))),
@@ -149,6 +159,13 @@ def test_impossible_sizes(tmp_path, content):
     refused(mat_file(tmp_path / "log.mat", content), "corrupt")
 
 
+@pytest.mark.parametrize(("kind", "rest"), [(6, element(9, bytes(80))), (2, fields(b"x"))])
+def test_claims_of_gigabytes(tmp_path, kind, rest):
+    """Numbers that do not fit into the file are refused before memory is taken for them."""
+    content = array(kind, (1 << 15, 1 << 15), content=rest)
+    refused(mat_file(tmp_path / "log.mat", content), "too-large", "swell")
+
+
 @pytest.mark.parametrize(
     "claim", [array(4, (1, 1 << 30), content=element(4, b"")), array(1, (1 << 15, 1 << 15))]
 )
@@ -158,11 +175,11 @@ def test_claims_of_what_is_not_read(tmp_path, claim):
 
 
 def test_nesting(tmp_path):
-    """Structs in structs without end are refused before they fill the stack."""
+    """Structs in structs without end are refused, and fill no stack of this process."""
     inner = array(6, (0, 0), content=element(9, b""))
-    for _ in range(200):
+    for _ in range(2000):
         inner = array(2, (1, 1), content=fields(b"x") + inner)
-    refused(mat_file(tmp_path / "log.mat", inner), "corrupt", "nested")
+    refused(mat_file(tmp_path / "log.mat", inner), "corrupt")
 
 
 @pytest.mark.slow
@@ -190,8 +207,8 @@ def test_damaged_checksum(tmp_path):
 def test_more_than_claimed(tmp_path):
     """A packed variable that continues after its end is damaged."""
     good = array(6, (2, 1), content=element(9, bytes(16)))
-    refused(mat_file(tmp_path / "log.mat", pack(good + bytes(8))), "corrupt", "damaged")
-    refused(mat_file(tmp_path / "log.mat", pack(good[:-8])), "corrupt", "cut off")
+    refused(mat_file(tmp_path / "log.mat", pack(good + bytes(8))), "corrupt", "corrupted")
+    refused(mat_file(tmp_path / "log.mat", pack(good[:-8])), "corrupt")
 
 
 def test_version_7_3(tmp_path):
@@ -263,21 +280,30 @@ def test_entries_of_a_struct(tmp_path):
 @pytest.mark.parametrize("order", ["<", ">"])
 @pytest.mark.parametrize(
     ("kind", "encoding"),
-    [(1, "latin-1"), (2, "latin-1"), (4, "utf-16"), (16, "utf-8"), (17, "utf-16"), (18, "utf-32")],
+    [(4, "utf-16"), (16, "utf-8"), (17, "utf-16"), (18, "utf-32")],
 )
 def test_text(tmp_path, kind, encoding, order):
-    """Text is read in its encoding, and the shortest is inside a tag."""
+    """Text is read in its encoding; one byte per letter is ASCII; the shortest is inside a tag."""
     end = {"<": "-le", ">": "-be"}[order] if encoding in ("utf-16", "utf-32") else ""
     written = element(kind, "Bühne ä".encode(encoding + end), order)
     path = mat_file(
         tmp_path / "log.mat",
         array(4, (1, 7), b"stage", written, order),
         array(4, (1, 1), b"servo_id", small(2, b"B", order), order),
+        array(4, (1, 4), b"travel_km", element(2, b"12.5", order), order),
         array(4, (0, 0), b"description", element(kind, b"", order), order),
         order=order,
     )
     metadata = load(path, ColumnMap()).metadata
-    assert metadata == {"stage": "Bühne ä", "servo_id": "B", "description": ""}
+    read = {"stage": "Bühne ä", "servo_id": "B", "travel_km": "12.5", "description": ""}
+    assert metadata == read
+
+
+@pytest.mark.parametrize("kind", [1, 2])
+def test_text_in_an_unknown_encoding(tmp_path, kind):
+    """Letters of one byte that are not ASCII are refused: the file does not name their encoding."""
+    made = array(4, (1, 7), b"stage", element(kind, "Bühne ä".encode("latin-1")))
+    refused(mat_file(tmp_path / "log.mat", vector(VALUES), made), "metadata", "MATLAB 7")
 
 
 def test_numbers_as_metadata(tmp_path):
@@ -295,7 +321,7 @@ def test_numbers_as_metadata(tmp_path):
 @pytest.mark.parametrize("sizes", [(2, 99), (98, 1), (99, 1, 2)])
 def test_other_numbers_of_entries(tmp_path, sizes):
     """An array whose content has another length than its shape is refused."""
-    with pytest.raises(Unusable, match="cut off") as caught:
+    with pytest.raises(Unusable) as caught:
         load(mat_file(tmp_path / "log.mat", vector(VALUES, sizes=sizes)), ColumnMap())
     assert caught.value.reason == "corrupt"
 
@@ -317,7 +343,10 @@ def test_small_types_that_swell(tmp_path):
 
 @pytest.mark.parametrize(
     ("n", "item"),
-    [(100_000, element(14, b"")), (100, vector(np.zeros(1800), name=b"", sizes=(2, 900)))],
+    [
+        (30_000, vector(np.zeros(1), name=b"")),
+        (100, vector(np.zeros(1800), name=b"", sizes=(2, 900))),
+    ],
 )
 def test_arrays_without_end(tmp_path, n, item):
     """A variable with a huge number of arrays is refused before their names fill the memory."""
@@ -330,7 +359,7 @@ def test_arrays_without_end(tmp_path, n, item):
 def test_limit_of_memory(tmp_path, packed):
     """A variable that takes more memory than allowed is refused with the next step."""
     path = mat_file(tmp_path / "log.mat", pack(vector(VALUES), packed))
-    size = len(vector(VALUES))
+    size = 8 * VALUES.size
     assert load(path, ColumnMap(), size).columns
     with pytest.raises(Unusable, match=r"'delta_e_um' needs .* raise --max-memory") as caught:
         load(path, ColumnMap(), size - 1)

@@ -115,6 +115,6 @@ def test_no_file_is_left_open(tmp_path, monkeypatch, name):
         content = content[: len(content) // 2]
     path.write_bytes(content)
     before = os.listdir("/proc/self/fd")
-    with pytest.raises(Unusable, match=r"cut off|damaged"):
+    with pytest.raises(Unusable, match=r"cut off|incorrect data check"):
         load(path, ColumnMap())
     assert os.listdir("/proc/self/fd") == before
