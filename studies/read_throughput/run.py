@@ -5,7 +5,7 @@ Method
     The bare library call that gives the same columns and the reader take turns in one process; the
     least processor time of each counts, beside that of `read_log`, which also hashes the file and
     judges every sample. CSV is compared with the faster one of pandas' C engine and pyarrow's
-    reader. The time of the process that reads HDF5, Parquet and MAT counts too. Then ten minutes of the
+    reader. The time of the process that reads HDF5, Parquet and MAT counts. Then ten minutes of the
     same signals, read in a process of its own by the reader and by the bare call, which holds all
     of the log (control): the peak of its memory, less what it had after a short file, in minutes of
     the log (8 bytes for each sample of each channel), and the processor time. Then every UFF58,
