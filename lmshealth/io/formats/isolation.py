@@ -43,6 +43,10 @@ _START = (
 # Bytes of samples that are handed over at once: they stay in the processor's cache.
 _WINDOW = 1 << 21
 _SETTING = "LMSHEALTH_MAX_SECONDS"
+# Threads of linear algebra take memory, and none is needed. What a column has freed is used for the
+# next one (glibc): taking it from the system again costs as much as a copy.
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+_ENVIRONMENT |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 25), "MALLOC_TRIM_THRESHOLD_": str(1 << 27)}
 
 
 class _Request(NamedTuple):
@@ -162,8 +166,7 @@ class _Reader:
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.DEVNULL,
-                # Threads of linear algebra take memory, and none is needed.
-                env=os.environ | {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"},
+                env=os.environ | _ENVIRONMENT,
             )
             self.process.stdout.readline()
 
