@@ -410,9 +410,8 @@ def _add(cov: FloatArray, rows: slice, variance: FloatArray, correlation: FloatA
     cov[:, rows, rows] += variance[:, None, None] * correlation
 
 
-def _diagonal(cov: FloatArray, rows: slice, columns: slice | None = None) -> FloatArray:
+def _diagonal(cov: FloatArray, rows: slice) -> FloatArray:
     """Return the diagonals of a block of matrices as a writeable view, ``(n, n_modes)``."""
-    size, other = cov.shape[1], rows if columns is None else columns
-    first = rows.start * size + other.start
+    size = cov.shape[1]
     # In a flattened matrix the diagonal has a stride of its size plus one.
-    return cov.reshape(-1, size * size)[:, first :: size + 1][:, : rows.stop - rows.start]
+    return cov.reshape(-1, size * size)[:, :: size + 1][:, rows]
