@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 from collections import Counter
@@ -23,10 +24,16 @@ from lmshealth.report.text import fixed, number, percent, plain
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.report.tables import Row
 
-_WIDTH = 78
+# Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
+_WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000
 _REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
 # Names up to this length are not split in a table that is too wide.
 _NAME = 16
+
+
+def _columns() -> int | None:
+    """Return the width of the terminal; None for a pipe or a file."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def print_json(content: dict[str, list[Row]]) -> None:
@@ -50,10 +57,11 @@ def print_errors(errors: Iterable[str]) -> None:
 
 def print_text(text: str, mark: str = "") -> None:
     """Print text in lines that fit, indented below the mark."""
+    width = min((_columns() or _WIDTH + 2) - 2, _WIDEST)
     for paragraph in (mark + text).split("\n"):
         lines = wrap(
             paragraph,
-            _WIDTH,
+            width,
             subsequent_indent=" " * len(mark),
             break_long_words=False,
             break_on_hyphens=False,
@@ -92,7 +100,10 @@ def cells(columns: str, rows: Iterable[Row]) -> list[dict[str, str]]:
 
 
 def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:
-    """Print rows under their keys: texts left-aligned, then numbers right-aligned."""
+    """Print rows under their keys: texts left-aligned, then numbers right-aligned.
+
+    On a terminal texts are wrapped to its width; in a pipe every row is one line.
+    """
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for place, name in enumerate(rows[0]):
         if place < n_texts:
@@ -101,12 +112,18 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
             least = min(max(map(len, words), default=0), _NAME) if place < n_texts - 1 else None
             table.add_column(name, overflow="fold", min_width=least)
         else:
-            table.add_column(name, justify="right", no_wrap=True)
+            longest = max((len(plain(row[name])) for row in rows), default=0)
+            least = max(longest, *map(len, name.split() or [""]), 1)
+            table.add_column(name, justify="right", min_width=least)
     for row in rows:
         table.add_row(*map(plain, row.values()))
     click.echo(plain(title))
     # Brackets in the cells are not markup.
-    Console(markup=False, emoji=False, highlight=False).print(table)
+    console = Console(markup=False, emoji=False, highlight=False, width=_columns() or _UNLIMITED)
+    # A table that does not fit is wrapped by the terminal, not cut.
+    free = console.options.update(max_width=_UNLIMITED)
+    console.width = max(console.width, console.measure(table, options=free).minimum)
+    console.print(table)
 
 
 def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:

@@ -9,7 +9,13 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Verdict, degraded_below, degraded_words, undeclared_events
+from lmshealth.health.verdict import (
+    NO_HEALTH,
+    Verdict,
+    degraded_below,
+    degraded_words,
+    undeclared_events,
+)
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
@@ -67,7 +73,7 @@ class Assessment:
     @property
     def alarmed(self) -> tuple[str, ...]:
         """Modes with an alarm since the baseline, when no verdict explains it."""
-        if self.judgement.verdict != "not-enough-data":
+        if self.judgement.verdict not in NO_HEALTH:
             return ()
         alarms = undeclared_events(self.track, self.history.baseline, "alarm")
         return tuple(dict.fromkeys(event.mode for event in alarms))
@@ -110,7 +116,7 @@ class Assessment:
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: days until the service; without a verdict before safe machines."""
         identity, verdict = self.judgement.stage, self.judgement.verdict
-        if verdict == "not-enough-data":
+        if verdict in NO_HEALTH:
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
@@ -202,7 +208,7 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
-    states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
+    states: dict[str, State] = {"healthy": "good", **dict.fromkeys(NO_HEALTH, "open")}
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
         file=file,
@@ -269,6 +275,8 @@ def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
     """Return a verdict in words, with the parameters as the description names them."""
     texts = {
         "healthy": "healthy",
+        "alarm": "alarm of the modes",
+        "no-alarm": "modes tracked, no alarm",
         "not-enough-data": "not enough data for a verdict",
         "step": "sudden change without a known cause",
     }
@@ -282,8 +290,6 @@ def _headline(assessment: Assessment) -> str:
     verdict, parameters = assessment.judgement.verdict, assessment.stage.parameters
     if assessment.alarmed:
         return f"Alarm: unexplained change of {' and '.join(map(spell, assessment.alarmed))}"
-    if not parameters and verdict == "not-enough-data":
-        return "Modes tracked; no health parameter described"
     text = verdict_text(verdict, parameters)
     return text[0].upper() + text[1:]
 

@@ -71,7 +71,7 @@ LOG_COLUMNS = {
     "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
     "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
     "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
-    "smallest_loss_of_one_log smallest_loss",
+    "smallest_loss_of_one_log smallest_loss value_std_ln",
     "fit": "log input output method note period_s n_averages n_lines low_hz high_hz mean_coherence "
     "chi_square distortion colour",
     "harmonics": "log channel frequency_hz amplitude_um phase_rad above_floor",
@@ -83,7 +83,7 @@ LOG_COLUMNS = {
     "map_at_limits_hz surrogate_error_ln_f logs_reach_ln_f",
     "stage_parameters": "parameter baseline limit limit_on_map map_low map_high prior_q005 "
     "prior_q05 prior_q95 prior_q995 prior_below_map prior_above_map prior_std_ln logs_std_ln "
-    "endless_logs_std_ln exact_map_std_ln others_known_std_ln informed verdict",
+    "endless_logs_std_ln exact_map_std_ln others_known_std_ln change_std_ln informed verdict",
     "sensitivities": "mode parameter at_baseline at_limits",
     "correlations": "parameter_a parameter_b correlation",
 }
@@ -428,7 +428,7 @@ def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, l
         values = (
             *(one.name, one.spec.baseline, *limits, one.low, one.high),
             *(*one.quantiles, one.below, one.above, one.prior_std, one.usual_std),
-            *(one.endless_std, one.exact_map_std, one.known_std),
+            *(one.endless_std, one.exact_map_std, one.known_std, one.change_std),
             *(one.variance_removed(one.usual_std), one.verdict),
         )
         parameters.append(values)

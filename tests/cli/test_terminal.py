@@ -9,6 +9,7 @@ import sys
 
 import pytest
 
+from lmshealth.cli import terminal
 from lmshealth.cli.terminal import print_json, print_refused, print_text, progress_bars
 
 NAN = float("nan")
@@ -55,8 +56,11 @@ def test_prose_is_wrapped_between_words(capsys: pytest.CaptureFixture[str]) -> N
     assert any("2026-03-01" in line for line in lines)
 
 
-def test_names_in_a_wide_table_are_not_torn(capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_in_a_wide_table_are_not_torn(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The last column gives way; folders are left out unless two logs have one name."""
+    monkeypatch.setattr(terminal, "_columns", lambda: 80)
     row = {"log": "far/away/on/a/disk/log-0001.h5", "channel": "acc_pitch", "mode": "roll",
            "reason": "not-excited", "detail": "no " * 40}  # fmt: skip
     print_refused([row])
@@ -69,3 +73,19 @@ def test_names_in_a_wide_table_are_not_torn(capsys: pytest.CaptureFixture[str]) 
     print_refused([row | {"log": f"{k}/log.h5"} for k in "ab"])
     out = capsys.readouterr().out
     assert "a/log.h5" in out and "b/log.h5" in out
+
+
+@pytest.mark.parametrize("columns", [None, 12, 80, 200])
+def test_a_table_is_as_wide_as_its_terminal_and_never_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None
+) -> None:
+    """In a pipe every row is one line; on a terminal only texts are wrapped, numbers stay whole."""
+    monkeypatch.setattr(terminal, "_columns", lambda: columns)
+    row = {"mode": "roll", "detail": "no resonance " * 30, "loss, 5 logs": "1 234 567.8"}
+    terminal.print_table("Title", [row, row | {"mode": "pitch"}], 2)
+    out = capsys.readouterr().out
+    assert "…" not in out and out.count("1 234 567.8") == 2
+    lines = [line for line in out.splitlines() if "resonance" in line]
+    assert len(lines) == 2 if columns is None else len(lines) > 2
+    if columns in (80, 200):
+        assert columns - 20 < max(map(len, out.splitlines())) <= columns

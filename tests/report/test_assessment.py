@@ -31,6 +31,7 @@ def summary(assessment: Assessment) -> Summary:
         ("both", "Loss of guide preload and mount stiffness", "bad"),
         ("step", "Sudden change without a known cause", "bad"),
         ("not-enough-data", "Not enough data for a verdict", "open"),
+        ("no-alarm", "Modes tracked, no alarm", "open"),
     ],
 )
 def test_every_verdict_has_a_headline(make: Maker, verdict: str, headline: str, state: str) -> None:
@@ -63,12 +64,9 @@ def test_a_description_without_parameters_has_no_verdict(make: Maker) -> None:
     assessment = make()
     description = structs.replace(assessment.stage.description, parameter=())
     stage = replace(assessment.stage, description=description)
-    judgement = replace(assessment.judgement, verdict="not-enough-data")
+    judgement = replace(assessment.judgement, verdict="no-alarm")
     found = summary(replace(assessment, stage=stage, health=None, judgement=judgement))
-    assert (found.headline, found.state) == (
-        "Modes tracked; no health parameter described",
-        "open",
-    )
+    assert (found.headline, found.state) == ("Modes tracked, no alarm", "open")
 
 
 def test_health_is_that_of_the_draws(make: Maker) -> None:
