@@ -21,7 +21,7 @@ from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, 
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report import constants
-from lmshealth.report.text import quantiles, spell
+from lmshealth.report.text import km, quantiles, spell
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History, LogEstimates
@@ -140,6 +140,8 @@ class ParameterHealth:
     below_limit: float  # probability of being below the limit; NaN without one
     baseline: float = 1.0  # baseline, unit: baseline value with its unit; "" for a pure fraction
     unit: str = ""
+    # Odometer in m, low, median and high of some epochs, in order; empty if not determined.
+    course: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -202,6 +204,7 @@ class Summary:
     health: tuple[ParameterHealth, ...]
     life: Life | None
     service: Service
+    to_do: str = ""  # the next step in a sentence
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
@@ -227,6 +230,7 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         health=tuple(_parameters(assessment)),
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
+        to_do=_next_step(assessment, service, state),
     )
 
 
@@ -266,6 +270,22 @@ def summarise_life(
     )
 
 
+def first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
+    """Return the parameter whose limit is most probably reached first, and its probability.
+
+    None with a single limit, or when no draw reaches one before the horizon.
+    """
+    if prognosis is None or len(prognosis.limits) < 3:
+        return None
+    parts = prognosis.censored()[:, :-1]
+    ending = np.isfinite(parts).any(axis=1)
+    if not ending.any():
+        return None
+    shares = np.bincount(parts[ending].argmin(axis=1), minlength=parts.shape[1]) / ending.sum()
+    k = int(shares.argmax())
+    return prognosis.parameters[k], float(shares[k])
+
+
 def limit_of(spec: ParameterSpec) -> float | None:
     """Return the limit of a parameter as a fraction of its baseline; None without one."""
     return None if spec.limit is None else spec.limit.below / spec.baseline
@@ -294,6 +314,39 @@ def _headline(assessment: Assessment) -> str:
     return text[0].upper() + text[1:]
 
 
+# Work that restores a parameter; of any other: work on it.
+_WORK = {"preload": "a preload adjustment", "mount": "a tightening of the mount"}
+
+
+def _next_step(assessment: Assessment, service: Service, state: State) -> str:
+    """Return what to do next in a sentence."""
+    prognosis, verdict = assessment.prognosis, assessment.judgement.verdict
+    if assessment.alarmed or verdict == "step":
+        what = "Inspect guide and mount now, and look for work, loads or tunings that the logs lack"
+        return f"{what}; then record a log."
+    if prognosis is None or service.kind == "unknown":
+        return "" if state == "good" else "Record further logs; the reasons are below."
+    first = first_limit(prognosis)
+    name = first[0] if first else prognosis.parameters[0]
+    words = {spec.name: spec.word for spec in assessment.stage.parameters}
+    work = _WORK.get(words.get(name, ""), f"work on {spell(name)}")
+    every = service.inspect_every / float(np.median(prognosis.usage))
+    if service.kind == "now":
+        return f"Do {work} now, before the machine travels on, and record logs for a new baseline."
+    if service.kind == "by" and service.by is not None:
+        return f"Order and plan {work} before {service.by.isoformat()}; until then {_often(every)}."
+    return f"No service is needed within {km(prognosis.horizon)}; record {_often(every)}."
+
+
+def _often(days: float) -> str:
+    """Return how often to record a log."""
+    if days < 2:
+        return "a log a day"
+    if days < 14:
+        return "a log a week" if 7 <= days < 8 else f"a log every {days:.0f} days"
+    return f"a log every {int(min(days, 182) // 7)} weeks"
+
+
 def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     health = assessment._relative(assessment.present)
     if health is None:
@@ -303,9 +356,16 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
         below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
+        determined = bool(health.publishable_parameters()[k])
+        rows = np.linspace(0, len(health.travel) - 1, constants.COURSE_POINTS).round().astype(int)
+        rows = np.unique(rows[health.converged[rows]])
+        bands = np.quantile(health.samples[rows, :, k], constants.LEVELS, axis=1)
+        # Without an odometer the epochs are at equal distances.
+        at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
+        course = np.stack([at[rows], *bands], axis=1).round(4)
         yield ParameterHealth(
             name=name,
-            determined=bool(health.publishable_parameters()[k]),
+            determined=determined,
             converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
             low=low,
@@ -315,6 +375,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             below_limit=below,
             baseline=specs[name].baseline,
             unit=specs[name].unit,
+            course=tuple(map(tuple, course.tolist())) if determined else (),
         )
 
 

@@ -31,6 +31,10 @@ FLEET_BAR = 1.5
 MANY_MACHINES = 10
 # Refused logs shown per reason; up to this many refusals are shown unfolded.
 REFUSED_SHOWN, REFUSED_UNFOLDED = 50, 12
+# Weeks by which a service may be late, of which the page has the risk.
+POSTPONED_WEEKS = (0, 1, 2, 4, 8)
+# Epochs, at most, in a small picture of health over travel.
+COURSE_POINTS = 24
 # Months of the calendar of services.
 CALENDAR_MONTHS = 12
 # Titles that appear under the pointer, per figure.

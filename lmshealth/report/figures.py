@@ -38,7 +38,7 @@ _NAMED = {INK: "ink", MUTED: "muted", GRID: "line", PAPER: "card"}
 _NAMED |= {BLUE: "blue", RED: "red", GREEN: "green"}
 _STYLE: dict[str, Any] = {
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same layout everywhere
-    "font.size": 9,
+    "font.size": 10,
     "text.usetex": False,
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
@@ -49,7 +49,7 @@ _STYLE: dict[str, Any] = {
     "grid.color": GRID,
     "grid.linewidth": 0.6,
     "hatch.linewidth": 0.6,
-    "legend.fontsize": 8,
+    "legend.fontsize": 10,
     "legend.frameon": False,
     "svg.fonttype": "none",
     **dict.fromkeys(("xtick.color", "ytick.color"), MUTED),
@@ -61,8 +61,8 @@ _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
 _GRID_POINTS = 72
-SIZE = (4.8, 2.8)  # of a figure in inches
-ROOM = 72  # characters that fit on a line of its legend
+SIZE = (4.5, 2.8)  # of a figure in inches: its text is readable on a phone
+ROOM = 46  # characters that fit on a line of its legend
 
 
 def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
@@ -272,7 +272,7 @@ def plot_life(
     ax.set_ylabel("% of baseline")
     odometer(ax)
     if not shown:
-        ax.set_xlabel(f"odometer in km (horizon at {end:.0f} km, not shown)")
+        ax.set_xlabel(f"odometer in km (horizon at {whole_km(_KM * end)}, not shown)")
     return ax
 
 
@@ -308,6 +308,7 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
+    grouped(ax)
     ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
     ax.set_ylabel("probability in %")
     return legend(ax)
@@ -414,8 +415,15 @@ def _density(ax: Axes, draws: FloatArray) -> None:
 
 def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
     """Label the odometer axis and add the legend."""
+    grouped(ax)
     ax.set_xlabel("odometer in km")
     return legend(ax, room=room)
+
+
+def grouped(ax: Axes) -> None:
+    """Group the thousands at the horizontal axis, as the text of the page does."""
+    ax.locator_params(axis="x", nbins=6)
+    ax.xaxis.set_major_formatter(lambda value, _: f"{value:,g}".replace(",", GAP))
 
 
 def legend(ax: Axes, *, room: int = ROOM) -> Axes:
@@ -451,6 +459,8 @@ _WORDS = {
     "sensor": "sensor changed",
     "reset": "guide or mount serviced",
 }
+# Height of the axes above which a label is below its line.
+_TOP = 0.88
 # On images; not from the palette, which changes on dark pages.
 _WHITE, _BLACK = "#ffffff", "#000000"
 
@@ -547,15 +557,15 @@ def plot_waterfall(
     bar.outline.set_visible(False)
     _column_hints(ax, sides, waterfall, history)
     _waterfall_lines(ax, waterfall, history)
-    if track is not None:
-        for k in range(len(track.modes)):
-            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.grid(visible=False)
     ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
+    if track is not None:
+        for k in range(len(track.modes)):
+            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.set_ylabel("frequency in Hz")
-    return odometer(ax, room=54)  # next to the colour bar
+    return odometer(ax, room=36)  # next to the colour bar
 
 
 def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Axes:
@@ -582,7 +592,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     hints(ax, x, before, texts)
     ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
     ax.set_ylabel("change of frequency in %")
-    return legend(ax)
+    return legend(ax, room=35)
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
@@ -696,13 +706,16 @@ def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None
     x = track.travel / _KM
     name = None if k else "tracked modes, 95 % band"
     ax.fill_between(x, np.exp(level - reach), np.exp(level + reach), fc=_WHITE, alpha=0.4, lw=0)
-    ax.plot(x, np.exp(level), color=_WHITE, lw=0.7, path_effects=_halo(1.5), label=name)
+    ax.plot(x, np.exp(level), color=_WHITE, lw=1.0, path_effects=_halo(2.6), label=name)
     if np.isfinite(level).any():
         first = int(np.argmax(np.isfinite(level)))
-        style: Any = {"color": _WHITE, "size": 8, "clip_on": True, "path_effects": _halo(1.8)}
+        style: Any = {"color": _WHITE, "size": 9.5, "path_effects": _halo(2.2)}
         place = (x[first], np.exp(level[first]))
+        # Below the line where there is no room above it.
+        share = ax.transAxes.inverted().transform(ax.transData.transform(place))[1]
+        offset, side = ((3, -4), "top") if share > _TOP else ((3, 4), "bottom")
         name = _spell(track.modes[k])
-        ax.annotate(name, place, xytext=(2, 3), textcoords="offset points", **style)
+        ax.annotate(name, place, xytext=offset, textcoords="offset points", va=side, **style)
 
 
 def _halo(width: float) -> list[Any]:

@@ -184,10 +184,10 @@ def _effort(
         best = test.power(size, std(constants.MOST_LOGS, constants.MOST_LOGS))
         hindrance = "baseline" if best >= test.required else "parameters"
     n_logs = None if hindrance else counts[place]
-    losses = [test.smallest_loss(std(n)) for n in (1, information.n_baseline)]
+    one, many = (test.smallest_loss(std(n)) for n in (1, information.n_baseline))
     noise = information.drift_variance(duration, information.n_baseline)
     value_std = float(information.std(noise)[j])
-    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), *losses, value_std)
+    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), one, many, value_std)
 
 
 def _change_std(

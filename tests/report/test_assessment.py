@@ -9,7 +9,7 @@ import pytest
 from msgspec import structs
 
 from lmshealth.report.assessment import Summary, summarise, summarise_life
-from lmshealth.report.machine_page import _first_limit
+from lmshealth.report.assessment import first_limit
 from lmshealth.report.text import time_left, travel_left
 from lmshealth.tracking.track import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
@@ -100,9 +100,9 @@ def test_the_first_limit_is_named(make: Maker) -> None:
     mount[: n // 4] = 3e5
     draws = np.stack([preload, mount, np.minimum(preload, mount)], axis=1)
     share = 1 - (n // 4) / n
-    assert _first_limit(replace(prognosis, remaining=draws)) == ("guide_preload", share)
-    assert _first_limit(replace(prognosis, remaining=np.full((n, 3), np.inf))) is None
-    assert _first_limit(None) is None
+    assert first_limit(replace(prognosis, remaining=draws)) == ("guide_preload", share)
+    assert first_limit(replace(prognosis, remaining=np.full((n, 3), np.inf))) is None
+    assert first_limit(None) is None
 
 
 def test_censored_and_negative_lives(make: Maker) -> None:

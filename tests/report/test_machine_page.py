@@ -402,7 +402,7 @@ def test_use_of_the_logs_is_counted(make: Maker, tmp_path: Path) -> None:
     text = words(one(tmp_path, replace(assessment, track=track)))
     part = text[text.index("Data used") : text.index("Fit of the laws")]
     assert "based on 40 logs of this machine" in part
-    assert "2 parts were refused: 1 × not excited, 1 × gap." in part
+    assert "2 parts refused: 1 × not excited, 1 × gap." in part
     assert "roll 39 of 40 (98 %) none 1 × not excited" in part
     assert "pitch 40 of 40 (100 %) 2 –" in part
     assert "logs/0007.csv mode roll by acc, channel acc_feed not excited" in part
