@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.report.assessment import Summary, summarise, summarise_life
-from lmshealth.report.assessment import first_limit
+from lmshealth.report.assessment import Summary, first_limit, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
 from lmshealth.tracking.track import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing

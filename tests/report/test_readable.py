@@ -35,7 +35,7 @@ CUT = """() => {
   const walker = document.createTreeWalker(document.body, NodeFilter.SHOW_TEXT);
   for (let node; (node = walker.nextNode()); ) {
     const own = node.parentElement;
-    if (!node.data.trim() || own.closest("svg, .unseen, .scroll, script, details:not([open])")) continue;
+    if (!node.data.trim() || own.closest("svg, .unseen, .scroll, script")) continue;
     const range = document.createRange();
     range.selectNodeContents(node);
     const frame = own.closest(".card")?.getBoundingClientRect();
@@ -48,11 +48,12 @@ CUT = """() => {
   }
   return out;
 }"""
+# Exponents of powers of ten are left out: they have 70 % of the 10 points of all other text.
 TINY = """(least) => [...document.querySelectorAll("figure svg text")]
   .map((text) => [text, text.getScreenCTM()])
-  .map(([text, way]) => [parseFloat(getComputedStyle(text).fontSize) * Math.hypot(way.a, way.b), text])
-  .filter(([size, text]) => size < least && parseFloat(getComputedStyle(text).fontSize) > 7)
-  .map(([size, text]) => `${text.textContent}: ${size.toFixed(1)} px`)"""
+  .map(([text, way]) => [text, parseFloat(getComputedStyle(text).fontSize), Math.hypot(way.a, way.b)])
+  .filter(([text, points, scale]) => points > 7 && points * scale < least)
+  .map(([text, points, scale]) => `${text.textContent}: ${(points * scale).toFixed(1)} px`)"""
 PALE = """(least) => {
   const pixel = document.createElement("canvas").getContext("2d", { willReadFrequently: true });
   const known = new Map();
