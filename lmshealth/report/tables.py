@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
@@ -27,7 +26,7 @@ from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.smoother import Smoothed
-from lmshealth.tracking.track import Track
+from lmshealth.tracking.track import Track, mode_columns
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
@@ -145,13 +144,8 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         metadata.servo_id,
         None if error is None else error / _MICRO,
     )
-    numbers = (
-        *(modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std),
-        *(modes.correlation, modes.snr, modes.dispersion, modes.excitation / _MILLI),
-    )
-    lists = [one.tolist() for one in numbers]
-    values = zip(modes.names, modes.sources, modes.channels, *lists, modes.flags, strict=True)
-    rows = _rows("modes", [(*log, *one) for one in values])
+    columns = [np.asarray(one).tolist() for one in modes.to_columns().values()]
+    rows = _rows("modes", [(*log, *one) for one in zip(*columns, strict=True)])
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
@@ -204,38 +198,15 @@ def track_rows(
     track: Track, smoothed: Smoothed | None = None, *, epochs: Iterable[int] | None = None
 ) -> list[Row]:
     """Return a track, one row per epoch (of `epochs`) and mode, with columns of smoothed values."""
-    drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
-    columns = _mode_columns(track, drift_std)
-    later = {} if smoothed is None else _mode_columns(smoothed, smoothed.drift_std)
+    columns, m = track.to_columns(), len(track.modes)
+    if smoothed is not None:
+        later = mode_columns(smoothed)
+        columns |= {f"{name}_smoothed": values for name, values in later.items()}
     return [
-        {
-            "stage": track.stage,
-            "recorded_at": _iso(track.recorded_at[k]),
-            "travel_km": track.travel[k] / _KM,
-            "mode": mode,
-            **{name: values[k, i] for name, values in columns.items()},
-            "nis": track.nis[k],
-            "nis_dof": track.nis_dof[k],
-            "noise_scale": track.noise_scale[k].max(),
-            "widening": track.widening[k],
-            **{f"{name}_smoothed": values[k, i] for name, values in later.items()},
-        }
+        {name: values[m * k + i] for name, values in columns.items()}
         for k in (range(len(track.logs)) if epochs is None else epochs)
-        for i, mode in enumerate(track.modes)
+        for i in range(m)
     ]
-
-
-def _mode_columns(track: Track | Smoothed, drift_std: FloatArray) -> dict[str, FloatArray]:
-    """Return the columns of all modes, shape ``(n_epochs, n_modes)`` each."""
-    frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
-    return {
-        "frequency_hz": frequency,
-        "frequency_std_hz": frequency * track.ln_frequency_std,
-        "damping_ratio": damping,
-        "damping_ratio_std": damping * track.ln_damping_std,
-        "drift": track.drift,
-        "drift_std": drift_std,
-    }
 
 
 def track_cov_rows(track: Track) -> list[Row]:

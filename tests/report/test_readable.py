@@ -51,7 +51,8 @@ CUT = """() => {
 # Exponents of powers of ten are left out: they have 70 % of the 10 points of all other text.
 TINY = """(least) => [...document.querySelectorAll("figure svg text")]
   .map((text) => [text, text.getScreenCTM()])
-  .map(([text, way]) => [text, parseFloat(getComputedStyle(text).fontSize), Math.hypot(way.a, way.b)])
+  .map(([text, way]) => [text, getComputedStyle(text).fontSize, Math.hypot(way.a, way.b)])
+  .map(([text, size, scale]) => [text, parseFloat(size), scale])
   .filter(([text, points, scale]) => points > 7 && points * scale < least)
   .map(([text, points, scale]) => `${text.textContent}: ${(points * scale).toFixed(1)} px`)"""
 PALE = """(least) => {
