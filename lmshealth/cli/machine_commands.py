@@ -12,7 +12,7 @@ from numpy.linalg import LinAlgError
 
 from lmshealth._files import write_draws, write_text
 from lmshealth.cli import options, views
-from lmshealth.cli.terminal import print_errors, print_notes, progress_bars
+from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer_together
@@ -138,7 +138,7 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     if bool(given["others"]) != bool(given["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
-    with progress_bars() as progress:
+    with progress_bars(PATIENCE) as progress:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
@@ -160,6 +160,7 @@ def _infer_machines(
         mapper = partial(_counting_map, "together", progress)
         return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
     found, lost = [], []
+    _expect_known_modes(table, machines, stage)
     for drifts in machines:
         seed = seed_of(given["seed"], drifts.stage, stage.digest)
         try:
@@ -185,6 +186,17 @@ def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
     found, notes = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
     print_notes(f"{table}: {note}" for note in notes)
     return found
+
+
+def _expect_known_modes(table: Path, machines: list[Drifts], stage: Stage) -> None:
+    """Refuse modes that are none of the description; else health would do without them."""
+    known = [mode.name for mode in stage.modes]
+    strange = sorted({mode for one in machines for mode in one.modes} - set(known))
+    if strange:
+        raise BadTable(
+            f"{table}: modes {strange} are none of {stage.name}, which has {known}; rename them, "
+            "or leave their rows out"
+        )
 
 
 def _single(table: Path, machines: list[Drifts]) -> Drifts:
@@ -234,7 +246,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     for history, refused in machines:
         missing = missing_mode_notices(history, refused)
         print_notes(f"{history.stage}: {notice.what}" for notice in missing)
-    with progress_bars() as progress:
+    with progress_bars(PATIENCE) as progress:
+        progress("prognosing", 0, len(machines))
         found, lost = _prognose_machines([history for history, _ in machines], given, progress)
     rows = []
     for prognosis, _ in found:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shutil
 import sys
 import time
@@ -26,9 +27,36 @@ if TYPE_CHECKING:  # so that --help does not import pandas and scipy
 
 # Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
 _WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000
+PATIENCE = 2.0  # seconds without a progress bar
 _REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
 # Names up to this length are not split in a table that is too wide.
 _NAME = 16
+
+
+_logger = logging.getLogger(__name__)
+_PRINTED = {"printed": True}  # records that are on the terminal already
+
+
+def quiet() -> bool:
+    """Return whether ``--quiet`` is set."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(__name__))
+
+
+def start_log(context: click.Context, handler: logging.Handler, level: int) -> None:
+    """Send records of the package to a handler until the command ends."""
+    logger = logging.getLogger("lmshealth")
+    handler.setLevel(level)
+    before = logger.level
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(handler)
+
+    def stop() -> None:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+        handler.close()
+
+    context.call_on_close(stop)
 
 
 def _columns() -> int | None:
@@ -46,12 +74,15 @@ def print_json(content: dict[str, list[Row]]) -> None:
 def print_notes(notes: Iterable[str]) -> None:
     """Print on standard error what the reader must take into account."""
     for note in notes:
-        click.echo(f"note: {note}", err=True)
+        _logger.info("note: %s", note, extra=_PRINTED)
+        if not quiet():
+            click.echo(f"note: {note}", err=True)
 
 
 def print_errors(errors: Iterable[str]) -> None:
     """Print on standard error what has no result, and why."""
     for error in errors:
+        _logger.info("%s", error, extra=_PRINTED)
         click.echo(f"lmshealth: {error}", err=True)
 
 
@@ -145,13 +176,16 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
         progress.TimeRemainingColumn(),
         console=Console(stderr=True),
-        disable=not sys.stderr.isatty(),
+        disable=quiet() or not sys.stderr.isatty(),
     ) as bars:
         tasks: dict[str, Any] = {}
 
         def report(what: str, done: int, total: int) -> None:
+            if done in (0, total) or done % max(total // 10, 1) == 0:
+                _logger.info("%s: %d of %d", what, done, total)
             if time.monotonic() < shown_from:
                 return
             if what not in tasks:

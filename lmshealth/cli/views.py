@@ -517,6 +517,8 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
             print_text(f"{one.identity}: {one.verdict}{in_brackets(one.probability)}. {one.why}")
+            if one.to_do:
+                print_text(f"  {one.to_do}")
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
             if one.life is not None:

@@ -405,7 +405,8 @@ def plot_log(ax: Axes, log: Log, channel: str) -> Axes:
     kind = next((one.kind for one in log.channels if one.name == channel), "acceleration")
     for one in log.channels:
         if one.name == channel or (not channel and one.kind == kind):
-            f, density = welch(one.values[start:stop], log.sample_rate, nperseg=min(_SEGMENT, stop - start))
+            segment = min(_SEGMENT, stop - start)
+            f, density = welch(one.values[start:stop], log.sample_rate, nperseg=segment)
             ax.plot(f[1:], density[1:], lw=0.8, label=plain_label(one.name))
     ax.set_yscale("log")
     ax.set_xlabel("frequency in Hz")
