@@ -51,11 +51,9 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     except msgspec.ValidationError as error:
         schema = type_info(kind)
         message = _explained(str(error), table, schema).lstrip(".: ")
-        others = [
-            f"{_short(one.lstrip('.'), _LONGEST_PLACE)}: missing" for one in _missing(schema, table)
-        ]
-        if message in others and len(others) > 1:
-            message = ", ".join(one.removesuffix(": missing") for one in others) + ": missing"
+        lacking = [_short(one.lstrip("."), _LONGEST_PLACE) for one in _missing(schema, table)]
+        if message.removesuffix(": missing") in lacking:
+            message = f"{', '.join(lacking)}: missing"
         raise ValueError(_short(message, _LONGEST_MESSAGE)) from error
 
 
@@ -103,10 +101,9 @@ def _known_keys(parts: list[StructType], own: dict[str, Any]) -> list[str]:
 def _missing(schema: Type, value: Any, path: str = "") -> Iterator[str]:
     """Yield the places of all required keys that a table lacks."""
     if isinstance(value, list):
-        for k, item in enumerate(value):
-            for part in schema.types if isinstance(schema, UnionType) else (schema,):
-                if isinstance(part, VarTupleType):
-                    yield from _missing(part.item_type, item, f"{path}[{k}]")
+        lists = [part for part in _branches(schema) if isinstance(part, VarTupleType)]
+        for k, item in enumerate(value if lists else ()):
+            yield from _missing(lists[0].item_type, item, f"{path}[{k}]")
     if not isinstance(value, dict):
         return
     parts = [one for one in _branches(schema) if isinstance(one, StructType)]

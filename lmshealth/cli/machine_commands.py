@@ -27,7 +27,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
 from lmshealth.report.tables import Row
-from lmshealth.stage.description import Decision, load_stage
+from lmshealth.stage.description import Decision, Stage, load_stage
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
