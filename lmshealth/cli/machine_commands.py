@@ -27,7 +27,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
 from lmshealth.report.tables import Row
-from lmshealth.stage.description import Decision, Stage, load_stage
+from lmshealth.stage.description import Decision, load_stage
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
@@ -160,8 +160,13 @@ def _infer_machines(
         mapper = partial(_counting_map, "together", progress)
         return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
     found, lost = [], []
-    _expect_known_modes(table, machines, stage)
+    known = {mode.name for mode in stage.modes}
     for drifts in machines:
+        strange = sorted(set(drifts.modes) - known)
+        if strange and known & set(drifts.modes):  # else health would silently do without them
+            why = f"modes {strange} are none of {stage.name}, which has {sorted(known)}"
+            lost.append(f"{drifts.stage}: {why}; rename them, or leave their rows out")
+            continue
         seed = seed_of(given["seed"], drifts.stage, stage.digest)
         try:
             epochs = epochs_to_infer(drifts, stage, given["epochs"])
@@ -186,17 +191,6 @@ def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
     found, notes = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
     print_notes(f"{table}: {note}" for note in notes)
     return found
-
-
-def _expect_known_modes(table: Path, machines: list[Drifts], stage: Stage) -> None:
-    """Refuse modes that are none of the description; else health would do without them."""
-    known = [mode.name for mode in stage.modes]
-    strange = sorted({mode for one in machines for mode in one.modes} - set(known))
-    if strange:
-        raise BadTable(
-            f"{table}: modes {strange} are none of {stage.name}, which has {known}; rename them, "
-            "or leave their rows out"
-        )
 
 
 def _single(table: Path, machines: list[Drifts]) -> Drifts:

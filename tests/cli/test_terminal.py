@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-from lmshealth.cli import terminal
+from lmshealth.cli import options, terminal
 from lmshealth.cli.terminal import print_json, print_refused, print_text, progress_bars
 
 NAN = float("nan")
@@ -89,3 +92,41 @@ def test_a_table_is_as_wide_as_its_terminal_and_never_cut(
     assert len(lines) == 2 if columns is None else len(lines) > 2
     if columns in (80, 200):
         assert columns - 20 < max(map(len, out.splitlines())) <= columns
+
+
+def test_a_log_file_has_events_notes_and_errors_and_ends_with_its_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Events carry their time; what is printed anyway is not printed twice; quiet hides notes."""
+
+    @options.command("none")
+    def talk() -> None:
+        with progress_bars() as report:
+            for k in range(101):
+                report("fitting", k, 100)
+        terminal.print_notes(["beware"])
+        terminal.print_errors(["it failed"])
+
+    file = tmp_path / "log.txt"
+    talk(["-v", "--log-file", str(file)], standalone_mode=False)
+    shown, text = capsys.readouterr().err, file.read_text(encoding="utf-8")
+    assert text.count("fitting: ") == shown.count("fitting: ") == 11
+    assert text.count("beware") == text.count("it failed") == 1
+    assert shown.count("beware") == shown.count("it failed") == 1
+    assert all(line[:2] == "20" for line in text.splitlines())
+    talk(["--quiet"], standalone_mode=False)
+    assert capsys.readouterr().err == "lmshealth: it failed\n"
+    assert file.read_text(encoding="utf-8") == text
+    assert logging.getLogger("lmshealth").handlers == []
+
+
+@pytest.mark.slow
+def test_a_closed_pipe_ends_without_a_word() -> None:
+    """As `| head` closes it."""
+    words = [sys.executable, "-m", "lmshealth", "stage", "lms-y", "--format", "json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words, **pipes) as started:
+        assert started.stdout is not None and started.stderr is not None
+        started.stdout.close()
+        assert started.stderr.read() == b""
+    assert started.returncode == 1

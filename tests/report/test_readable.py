@@ -135,7 +135,7 @@ def test_faults_are_found(browser: Any, make: Maker, tmp_path: Path) -> None:
     page, _ = watch(browser, path, "light", 390)
     first = "document.querySelector('figure svg text')"
     page.evaluate(f"{first}.setAttribute('transform', 'translate(3000 50)')")
-    page.evaluate(f"{first}.style.fontSize = '8px'")
+    page.evaluate(f"{first}.style.fontSize = '7.5px'")
     page.evaluate("document.querySelector('.why').style.color = '#aaa'")
     page.evaluate("document.querySelector('.to-do').style.whiteSpace = 'nowrap'")
     assert len(page.evaluate(CUT)) == 2
