@@ -6,9 +6,12 @@ raw samples to the service date. All quantities are in SI units.
 
 from importlib import import_module
 from importlib.metadata import version
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+from lmshealth._result import Result as _Result
 
 if TYPE_CHECKING:
+    from lmshealth.analysis import analyse as analyse
     from lmshealth.batch.assess import assess as assess
     from lmshealth.batch.run import Settings as Settings
     from lmshealth.batch.run import run as run
@@ -37,6 +40,7 @@ _HOMES = {
     "LmshealthError": "errors",
     "LogEstimates": "tracking.history",
     "Settings": "batch.run",
+    "analyse": "analysis",
     "assess": "batch.assess",
     "build_history": "tracking.history",
     "decide": "prognosis.maintenance_decision",
@@ -56,6 +60,14 @@ _HOMES = {
 }
 
 __all__ = [*_HOMES]
+
+
+def _draw(result: _Result, what: str, ax: Any) -> Any:
+    return import_module(f"{__name__}.report.figures").draw(result, what, ax)
+
+
+# Drawing is above all results, and imported when one is drawn first.
+_Result.draw = staticmethod(_draw)
 
 if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 

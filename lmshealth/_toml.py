@@ -2,7 +2,7 @@
 
 import re
 import tomllib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from functools import reduce
 from operator import getitem
 from typing import Any, TypeVar
@@ -49,7 +49,11 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        message = _explained(str(error), table, type_info(kind)).lstrip(".: ")
+        schema = type_info(kind)
+        message = _explained(str(error), table, schema).lstrip(".: ")
+        lacking = [_short(one.lstrip("."), _LONGEST_PLACE) for one in _missing(schema, table)]
+        if message.removesuffix(": missing") in lacking:
+            message = f"{', '.join(lacking)}: missing"
         raise ValueError(_short(message, _LONGEST_MESSAGE)) from error
 
 
@@ -92,6 +96,25 @@ def _known_keys(parts: list[StructType], own: dict[str, Any]) -> list[str]:
     selected = (part for part in parts if part.tag_field and part.tag == own.get(part.tag_field))
     part = next(selected, parts[0])
     return [*filter(None, [part.tag_field]), *(field.encode_name for field in part.fields)]
+
+
+def _missing(schema: Type, value: Any, path: str = "") -> Iterator[str]:
+    """Yield the places of all required keys that a table lacks."""
+    if isinstance(value, list):
+        lists = [part for part in _branches(schema) if isinstance(part, VarTupleType)]
+        for k, item in enumerate(value if lists else ()):
+            yield from _missing(lists[0].item_type, item, f"{path}[{k}]")
+    if not isinstance(value, dict):
+        return
+    parts = [one for one in _branches(schema) if isinstance(one, StructType)]
+    if len(parts) > 1:
+        parts = [one for one in parts if one.tag_field and one.tag == value.get(one.tag_field)]
+    for field in parts[0].fields if parts else ():
+        place = f"{path}.{field.encode_name}"
+        if field.encode_name in value:
+            yield from _missing(field.type, value[field.encode_name], place)
+        elif field.required:
+            yield place
 
 
 def _structs(schema: Type, keys: list[Any]) -> list[StructType]:

@@ -48,6 +48,7 @@ def assessed(folder: Path) -> str:
     day = lmshealth.decide(prognosis, stage.description.decision).by
     told: str = lmshealth.judge(stage, history, health, track).why
     assessment = lmshealth.assess(readings, stage, epochs=5)
+    told = lmshealth.analyse(folder, stage).judgement.why
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
     reveal_type(  # noqa: F821

@@ -8,11 +8,15 @@ from datetime import UTC, datetime
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
+from lmshealth.report.tables import COLUMNS
 from lmshealth.tracking.history import History, Series
+from lmshealth.tracking.track import track
+from tests.lives import make_health, make_prognosis
 from tests.signals import make_log
 
 
@@ -124,3 +128,57 @@ def test_bad_log_survives_the_way_back_from_a_worker() -> None:
     error = pickle.loads(pickle.dumps(BadLog("a.h5", "corrupt", "cut off")))
     assert (error.log, error.reason, error.detail) == ("a.h5", "corrupt", "cut off")
     assert str(error) == "a.h5: corrupt: cut off"
+
+
+def test_results_are_short_in_print_and_long_as_tables() -> None:
+    """At most eight lines of text, HTML with names escaped, one row per log, mode or limit."""
+    rng = np.random.default_rng(1)
+    log = make_log({"acc_x": rng.standard_normal(1000), "acc_y": rng.standard_normal(1000)}, 500.0)
+    lives = history()
+    followed = track(lives)
+    for result, rows, columns in (
+        (log, 1000, "time_s acc_x_m_s2 acc_y_m_s2"),
+        (two_modes(), 2, "mode source channel frequency_hz"),
+        (lives, 3, "stage log recorded_at travel_km mode source frequency_hz"),
+        (followed, 3, COLUMNS["track"]),
+        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), 2, COLUMNS["health"]),
+        (make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4)), 2, "parameter limit"),
+    ):
+        assert 1 <= len(repr(result).splitlines()) <= 8
+        assert "array(" not in repr(result) and len(repr(result)) < 1500
+        table = result.to_frame()
+        assert len(table) == rows
+        assert list(table)[: len(columns.split())] == columns.split()
+    named = replace(lives, stage="<script>")
+    assert "&lt;script&gt;" in named._repr_html_() and "<script>" not in named._repr_html_()
+    np.testing.assert_allclose(lives.to_frame()["frequency_hz"], 100.0)
+    np.testing.assert_allclose(lives.to_frame()["frequency_std_hz"], 0.1)
+    many = replace(
+        lives,
+        modes=tuple("abcdefgh"),
+        series=tuple(Series(mode, "acc") for mode in "abcdefgh"),
+        ln_frequency=np.full((3, 8), 4.6),
+        ln_damping=np.full((3, 8), -4.0),
+        cov=np.tile(1e-6 * np.eye(16), (3, 1, 1)),
+    )
+    assert repr(many).splitlines()[-1] == "… and 3 more"
+
+
+def test_results_are_plotted_by_name() -> None:
+    """Every result draws itself in given Axes; a name that it lacks is refused with its own."""
+    rng = np.random.default_rng(2)
+    lives = history()
+    results = (
+        (make_log({"acc_x": rng.standard_normal(1000)}, 500.0), "acc_x", "frequency in Hz"),
+        (two_modes(), "", "natural frequency in Hz"),
+        (lives, "roll", "odometer in km"),
+        (track(lives), "roll", "odometer in km"),
+        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), "guide_preload", "odometer in km"),
+        (make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4)), "any", "travel from now"),
+    )
+    for result, what, label in results:
+        ax = Figure().add_subplot()
+        assert result.plot(what, ax) is ax
+        assert ax.get_xlabel().startswith(label) and ax.has_data()
+    with pytest.raises(BadQuestion, match=r"nothing is called 'rol'; there are \['roll'\]"):
+        lives.plot("rol")

@@ -49,6 +49,10 @@ class _Tree(Struct, forbid_unknown_fields=True):
             'name = "a"\n[[part]]\nkind = "branch"\n[[part.leaves]]\nkind = "leaf"\n',
             "part[0].leaves[0].size: missing",
         ),
+        (
+            '[[part]]\nkind = "leaf"\n[[part]]\nkind = "branch"\n[[part.leaves]]\nkind = "leaf"',
+            "name, part[0].size, part[1].leaves[0].size: missing",
+        ),
         ("name = ", "no TOML: Invalid value (at end of document)"),
         ("name = 1\nname = 2", "no TOML: "),
         ("# a\nname = [\n1,\n}\n]\nx = 2", "no TOML: Invalid value (at line 4, column 1)"),

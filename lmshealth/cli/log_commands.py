@@ -36,7 +36,6 @@ _NO_BAND = (
     "Without a band or a description close modes may be merged or missed; select them with --band "
     "LOW HIGH. The mode names are valid for this call only."
 )
-_PATIENCE = 3.0  # seconds without a progress bar
 _FORMAT = options.format_option("table", "csv", "json")
 _PLOT = click.option(
     "--plot",
@@ -89,7 +88,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
     def estimate(log: Log) -> LogEstimates:
-        with terminal.progress_bars(_PATIENCE) as report:
+        with terminal.progress_bars(terminal.PATIENCE) as report:
             reading = _read_modes(log, given, report)
         shapes, mac = tables.shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes

@@ -12,7 +12,7 @@ from numpy.linalg import LinAlgError
 
 from lmshealth._files import write_draws, write_text
 from lmshealth.cli import options, views
-from lmshealth.cli.terminal import print_errors, print_notes, progress_bars
+from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer_together
@@ -138,7 +138,7 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     if bool(given["others"]) != bool(given["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
-    with progress_bars() as progress:
+    with progress_bars(PATIENCE) as progress:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
@@ -160,7 +160,13 @@ def _infer_machines(
         mapper = partial(_counting_map, "together", progress)
         return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
     found, lost = [], []
+    known = {mode.name for mode in stage.modes}
     for drifts in machines:
+        strange = sorted(set(drifts.modes) - known)
+        if strange and known & set(drifts.modes):  # else health would silently do without them
+            why = f"modes {strange} are none of {stage.name}, which has {sorted(known)}"
+            lost.append(f"{drifts.stage}: {why}; rename them, or leave their rows out")
+            continue
         seed = seed_of(given["seed"], drifts.stage, stage.digest)
         try:
             epochs = epochs_to_infer(drifts, stage, given["epochs"])
@@ -234,7 +240,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     for history, refused in machines:
         missing = missing_mode_notices(history, refused)
         print_notes(f"{history.stage}: {notice.what}" for notice in missing)
-    with progress_bars() as progress:
+    with progress_bars(PATIENCE) as progress:
+        progress("prognosing", 0, len(machines))
         found, lost = _prognose_machines([history for history, _ in machines], given, progress)
     rows = []
     for prognosis, _ in found:

@@ -56,6 +56,8 @@ class _Group(click.Group):
             return super().invoke(ctx)
         except LmshealthError as error:
             print_errors([str(error)])
+        except BrokenPipeError:
+            raise  # of `| head`: click ends without a word
         except OSError as error:
             print_errors([f"{error.filename or 'output'}: {error.strerror}"])
         except KeyboardInterrupt:

@@ -1,11 +1,12 @@
 """Options that several commands share, and the types of their values."""
 
+import logging
 import math
 import os
 import shlex
 from collections.abc import Callable
 from datetime import date, datetime
-from functools import partial
+from functools import partial, reduce
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ import click
 from loky import cpu_count
 
 from lmshealth.batch.constants import NOTIFY
+from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import ColumnMap, load_columns
 from lmshealth.io.constants import MAX_MEMORY
@@ -207,8 +209,50 @@ def band_option(text: str) -> Callable[[Any], Any]:
     )
 
 
+def _log(ctx: click.Context, option: click.Parameter, given: Any) -> None:
+    """Begin to log to standard error (``-v``), or to a file."""
+    if not given:
+        return
+    if option.name == "verbose":
+        handler: logging.Handler = logging.StreamHandler()
+        handler.addFilter(lambda record: not hasattr(record, "printed"))
+    else:
+        handler = logging.FileHandler(given, encoding="utf-8")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
+    terminal.start_log(ctx, handler, logging.INFO)
+
+
+_OUTPUT = (
+    click.option(
+        *("-q", "--quiet"),
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=lambda ctx, option, given: ctx.meta.update({terminal.__name__: given}),
+        help="Print results and errors only: no notes and no progress.",
+    ),
+    click.option(
+        *("-v", "--verbose"),
+        is_flag=True,
+        is_eager=True,
+        expose_value=False,
+        callback=_log,
+        help="Print a line per event on standard error, with its time.",
+    ),
+    click.option(
+        "--log-file",
+        type=OUT,
+        is_eager=True,
+        expose_value=False,
+        callback=_log,
+        help="Append events, notes and errors to a file.",
+    ),
+)
+
+
 def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
     """Return the decorator of a command; the examples are the end of its help."""
     # click does not wrap a paragraph that begins with a backspace.
     lines = ["\b", "Examples:", *(f"    lmshealth {example}" for example in examples)]
-    return click.command(epilog="\n".join(lines))
+    made = click.command(epilog="\n".join(lines))
+    return lambda function: made(reduce(lambda inner, option: option(inner), _OUTPUT, function))

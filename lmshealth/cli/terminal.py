@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import logging
+import shutil
 import sys
 import time
 from collections import Counter
@@ -23,10 +25,43 @@ from lmshealth.report.text import fixed, number, percent, plain
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.report.tables import Row
 
-_WIDTH = 78
+# Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
+_WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000
+PATIENCE = 2.0  # seconds without a progress bar
 _REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
 # Names up to this length are not split in a table that is too wide.
 _NAME = 16
+
+
+_logger = logging.getLogger(__name__)
+_PRINTED = {"printed": True}  # records that are on the terminal already
+
+
+def quiet() -> bool:
+    """Return whether ``--quiet`` is set."""
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.meta.get(__name__))
+
+
+def start_log(context: click.Context, handler: logging.Handler, level: int) -> None:
+    """Send records of the package to a handler until the command ends."""
+    logger = logging.getLogger("lmshealth")
+    handler.setLevel(level)
+    before = logger.level
+    logger.setLevel(logging.DEBUG)
+    logger.addHandler(handler)
+
+    def stop() -> None:
+        logger.removeHandler(handler)
+        logger.setLevel(before)
+        handler.close()
+
+    context.call_on_close(stop)
+
+
+def _columns() -> int | None:
+    """Return the width of the terminal; None for a pipe or a file."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
 
 
 def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
@@ -39,21 +74,25 @@ def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
 def print_notes(notes: Iterable[str]) -> None:
     """Print on standard error what the reader must take into account."""
     for note in notes:
-        click.echo(f"note: {note}", err=True)
+        _logger.info("note: %s", note, extra=_PRINTED)
+        if not quiet():
+            click.echo(f"note: {note}", err=True)
 
 
 def print_errors(errors: Iterable[str]) -> None:
     """Print on standard error what has no result, and why."""
     for error in errors:
+        _logger.info("%s", error, extra=_PRINTED)
         click.echo(f"lmshealth: {error}", err=True)
 
 
 def print_text(text: str, mark: str = "") -> None:
     """Print text in lines that fit, indented below the mark."""
+    width = min((_columns() or _WIDTH + 2) - 2, _WIDEST)
     for paragraph in (mark + text).split("\n"):
         lines = wrap(
             paragraph,
-            _WIDTH,
+            width,
             subsequent_indent=" " * len(mark),
             break_long_words=False,
             break_on_hyphens=False,
@@ -92,7 +131,10 @@ def cells(columns: str, rows: Iterable[Row]) -> list[dict[str, str]]:
 
 
 def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:
-    """Print rows under their keys: texts left-aligned, then numbers right-aligned."""
+    """Print rows under their keys: texts left-aligned, then numbers right-aligned.
+
+    On a terminal texts are wrapped to its width; in a pipe every row is one line.
+    """
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
     for place, name in enumerate(rows[0]):
         if place < n_texts:
@@ -101,12 +143,18 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
             least = min(max(map(len, words), default=0), _NAME) if place < n_texts - 1 else None
             table.add_column(name, overflow="fold", min_width=least)
         else:
-            table.add_column(name, justify="right", no_wrap=True)
+            longest = max((len(plain(row[name])) for row in rows), default=0)
+            least = max(longest, *map(len, name.split() or [""]), 1)
+            table.add_column(name, justify="right", min_width=least)
     for row in rows:
         table.add_row(*map(plain, row.values()))
     click.echo(plain(title))
     # Brackets in the cells are not markup.
-    Console(markup=False, emoji=False, highlight=False).print(table)
+    console = Console(markup=False, emoji=False, highlight=False, width=_columns() or _UNLIMITED)
+    # A table that does not fit is wrapped by the terminal, not cut.
+    free = console.options.update(max_width=_UNLIMITED)
+    console.width = max(console.width, console.measure(table, options=free).minimum)
+    console.print(table)
 
 
 def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
@@ -128,13 +176,16 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
+        progress.TimeElapsedColumn(),
         progress.TimeRemainingColumn(),
         console=Console(stderr=True),
-        disable=not sys.stderr.isatty(),
+        disable=quiet() or not sys.stderr.isatty(),
     ) as bars:
         tasks: dict[str, Any] = {}
 
         def report(what: str, done: int, total: int) -> None:
+            if done in (0, total) or done % max(total // 10, 1) == 0:
+                _logger.info("%s: %d of %d", what, done, total)
             if time.monotonic() < shown_from:
                 return
             if what not in tasks:

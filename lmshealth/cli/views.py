@@ -11,25 +11,29 @@ from lmshealth.cli.terminal import cells, print_refused, print_table, print_text
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
-from lmshealth.report.assessment import Life, ParameterHealth, Summary
+from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, Summary
 from lmshealth.report.tables import Row, health_rows, track_rows
 from lmshealth.report.text import (
     GAP,
     change,
+    count,
     day,
     fixed,
     in_brackets,
     interval,
+    km,
     number,
     percent,
     probability,
     probability_range,
     signed,
     spell,
+    time_left,
+    travel_left,
+    whole_km,
 )
 from lmshealth.tracking.track import Track
 
-_KM = 1000.0
 _MATRIX = 6  # columns of a matrix that fit on a terminal
 _HINDRANCES = {
     "too-short": ("log too short", "its modes cannot be identified."),
@@ -92,15 +96,17 @@ _COVERAGE = (
     "prior outside {outside:.1%}"
 )
 _IDENTIFIABILITY = (
-    "parameter {parameter} | prior {prior_std_ln:.1%} | logs {logs_std_ln:.1%} | "
-    "endless logs {endless_logs_std_ln:.1%} | informed {informed:.1%} | {answer}"
+    "parameter {parameter} | prior {prior_std_ln:.1%} | change {change_std_ln:.1%} | "
+    "value {logs_std_ln:.1%} | endless {endless_logs_std_ln:.1%} | "
+    "informed {informed:.1%} | {answer}"
 )
 _PLAN = (
     "s per log {seconds_per_log:g} | logs {n_logs} | power, 1 log {power_of_one_log:.1%} | "
-    "loss, 1 log {smallest_loss_of_one_log:.1%} | loss, N logs {smallest_loss:.1%}"
+    "loss, 1 log {smallest_loss_of_one_log:.1%} | loss, N logs {smallest_loss:.1%} | "
+    "std of value {value_std_ln:.1%}"
 )
 _TRACK = (
-    "mode {mode} | frequency Hz {frequency_hz:.3f} ± {frequency_std_hz:.3f} | drift {drift} | "
+    "mode {mode} | frequency Hz {frequency_hz:.2f} ± {frequency_std_hz:.2f} | drift {drift} | "
     "damping ratio {damping}"
 )
 _HEALTH = (
@@ -352,10 +358,12 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         print_table("Health parameters", cells(_COVERAGE, parameters))
         print_table("Standard deviation of the parameters", cells(_IDENTIFIABILITY, parameters))
         print_text(
-            f"logs: {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the "
-            "baseline, averaged over the priors (Cramér-Rao bound). map error: of ln f. drift std: "
-            "of the drift of ln f between these two groups. informed: expected share of the prior "
-            "variance of the ln parameter that the logs remove; identifiable from 50 % on.\n"
+            f"By {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline "
+            "(Cramér-Rao bound). change: a small one since the baseline, where the map's error has "
+            "no effect, as in `lmshealth plan`. value: anywhere in the prior, with the map's "
+            "error. endless: by unlimited logs. map error: of ln f. drift std: of the drift of "
+            "ln f between these two groups. informed: expected share of the prior variance of "
+            "the ln parameter that the logs remove; identifiable from 50 % on.\n"
         )
         _print_sensitivities(content)
     for row in content["findings"]:
@@ -398,7 +406,10 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
         print_text(": ".join(_HINDRANCES[kind]))
     print_text(
         "Lower bound. Logs now and at the baseline have equal length; loss: the smallest that is "
-        "detected.\nNot included: temperature, scatter between logs, errors of the map."
+        "detected, a small change since the baseline, where the map's error has no effect. std of "
+        "value: of the parameter by as many logs as the baseline has, anywhere in its prior, with "
+        "the map's error, as in `lmshealth stage`.\n"
+        "Not included: temperature, scatter between logs."
     )
 
 
@@ -411,7 +422,7 @@ def print_track(track: Track) -> None:
     for row in track_rows(track, epochs=[len(track.logs) - 1]):
         damping = f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
         damping = damping if row["damping_ratio"] >= 0 else "–"
-        rows.append(row | {"drift": change(row["drift"], row["drift_std"], 3), "damping": damping})
+        rows.append(row | {"drift": change(row["drift"], row["drift_std"]), "damping": damping})
     title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
     print_table(title, cells(_TRACK, rows))
     events = [
@@ -506,6 +517,8 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
             print_text(f"{one.identity}: {one.verdict}{in_brackets(one.probability)}. {one.why}")
+            if one.to_do:
+                print_text(f"  {one.to_do}")
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
             if one.life is not None:
@@ -516,16 +529,16 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
             "stage": one.identity,
             "verdict": one.verdict + in_brackets(one.probability),
             "health": "\n".join(map(_parameter, one.health)),
-            "km left": _travel_left(one.life),
+            "remaining life": _travel_left(one.life),
             "service": service_text(one.service),
         }
         for one in summaries[: constants.TERMINAL_ROWS]
     ]
-    n = "1 stage" if len(summaries) == 1 else f"{len(summaries)} stages, most urgent first"
-    title = f"{n} (medians with 90 % intervals)"
+    n = count(len(summaries), "stage")
+    title = f"{n}, most urgent first (medians with 90 % intervals)"
     print_table(title, shown, 5)
     if rest := len(summaries) - len(shown):
-        click.echo(f"{rest} more stages; verdict.csv and prognosis.csv list all.")
+        click.echo(f"{count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
 
 
 def _parameter(one: ParameterHealth) -> str:
@@ -537,10 +550,7 @@ def _parameter(one: ParameterHealth) -> str:
 def _travel_left(life: Life | None) -> str:
     if life is None:
         return "–"
-    low, middle, high = (
-        f"beyond {_km(life.horizon)}" if math.isinf(metres) else _km(metres)
-        for metres in (life.any.travel[k] for k in (0, 3, 6))
-    )
+    low, middle, high = (travel_left(life.any.travel[k], life.horizon) for k in (0, 3, 6))
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
@@ -561,10 +571,10 @@ def print_life(
     blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
     same = _same_as_any(blocks)
     title = (
-        f"{life.stage}: remaining life after {day(life.recorded_at)}, at {_km(life.travel)} km "
-        f"(horizon {_km(life.horizon)} km)"
+        f"{life.stage}: remaining life after {day(life.recorded_at)}, at {whole_km(life.travel)} "
+        f"(horizon {km(life.horizon)})"
     )
-    heads = ("until", "probability %", "km", "hours", "days", "date")
+    heads = ("until", "probability %", "travel", "time", "date")
     rows = [row for block in (blocks if same is None else blocks[:-1]) for row in block]
     print_table(title, [dict(zip_longest(heads, row, fillvalue="")) for row in rows])
     if same is not None:
@@ -573,7 +583,7 @@ def print_life(
         laws = []
         for law in life.laws:
             if law.parameter == name and law.probability >= constants.LAW_SHOWN:
-                begin = f" from {_km(law.begin)} km after the baseline" if law.begin else ""
+                begin = f" from {km(law.begin)} after the baseline" if law.begin else ""
                 laws.append(f"{law.kind}{begin} {probability(law.probability)}")
         print_text(f"Law of {spell(name)}: {', '.join(laws)}.")
     if life.undetermined:
@@ -589,15 +599,15 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], constants.RUL_LEVELS
-    text = "any limit" if one.parameter == "any" else f"{spell(one.parameter)} below {one.limit:g}"
+    text = "any limit" if one.parameter == "any" else _below(one)
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):
             share = share if level == levels[-1] else f"{share} to {100 * levels[-1]:.0f}"
-            yield text, share, f"beyond {_km(life.horizon)}", "–", "–", "–"
+            yield text, share, travel_left(travel, life.horizon), "–", "–"
             break
         calendar = "out of range" if when is None else when.isoformat()
-        yield text, share, _km(travel), f"{24 * days:,.0f}", f"{days:,.1f}", calendar
+        yield text, share, travel_left(travel, life.horizon), time_left(days), calendar
         text = ""
     yield (f"  already: {probability(one.already_past)}",)
     yield (f"  beyond horizon: {probability(one.beyond_horizon)}",)
@@ -605,6 +615,10 @@ def _limit_cells(
         asked, bounds = before
         chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
         yield (f"  before {asked}: {chance}",)
+
+
+def _below(one: LimitLife) -> str:
+    return f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
 
 
 def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
@@ -622,7 +636,7 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
     yield f"Service: {service_text(service)} ({rule})."
     risk = probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":
-        yield f"No service is needed within {_km(life.horizon)} km."
+        yield f"No service is needed within {km(life.horizon)}."
     elif service.by is None:
         yield "The usage is too low for a calendar date."
     elif service.kind == "now":
@@ -630,13 +644,9 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
     elif not service.max_risk or risk != percent(service.max_risk):
         yield f"Probability that a limit is reached before that day, at most: {risk}."
     if service.inspect_by is not None:
-        every = _km(service.inspect_every)
-        often = f", then every {every} km" if math.isfinite(service.inspect_every) else ""
+        every = service.inspect_every
+        often = f", then every {whole_km(every)}" if math.isfinite(every) else ""
         yield f"Inspect (record a log) by {service.inspect_by}{often}."
     if service.planned is not None:
         planned = probability_range(service.planned_risk)
         yield f"Before the service planned for {service.planned}: {planned}."
-
-
-def _km(metres: float) -> str:
-    return f"{metres / _KM:,.0f}"

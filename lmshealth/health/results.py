@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pandas as pd
 
 from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._result import Result
 from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 
@@ -27,8 +27,8 @@ CHECKS = (
 )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Health:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Health(Result):
     """Posterior of the health parameters per epoch, in their units.
 
     Arrays have the shape ``(n_epochs, n_parameters)`` where none is stated.
@@ -117,8 +117,19 @@ class Health:
         """Return quantiles at the last epoch, shape ``(..., n_parameters)``."""
         return np.asarray(np.quantile(self.samples[-1], level, axis=0))
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return the table of ``health.csv``: one row per epoch and parameter."""
+    def title(self) -> str:
+        """Return machine, number of epochs, and the last one."""
+        n = len(self.recorded_at)
+        last = f"; posterior at {self.recorded_at[-1].date()}" if n else ""
+        return f"Health of {self.stage}: {n} epochs{last}"
+
+    def digest_columns(self) -> dict[str, Any]:
+        """Return quantiles and diagnostics of the last epoch."""
+        names = ("parameter", "median", "q05", "q95", "informed", "converged", "identifiable")
+        return {name: self.to_columns()[name][-len(self.parameters) :] for name in names}
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return the columns of ``health.csv``, one row per epoch and parameter."""
         n, p = len(self.recorded_at), len(self.parameters)
         quantiles = self.quantile(np.array(list(QUANTILES.values())))
         columns: dict[str, FloatArray | BoolArray] = {
@@ -134,15 +145,13 @@ class Health:
         columns |= {name: getattr(self, name) for name in ("informed", *CHECKS)}
         names = enumerate(self.parameters)
         columns |= {f"correlation_{name}": self.correlation[:, :, j] for j, name in names}
-        return pd.DataFrame(
-            {
-                "stage": self.stage,
-                "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], p),
-                "travel_km": np.repeat(self.travel / 1000, p),
-                "parameter": np.tile(self.parameters, n),
-                **{name: values.ravel() for name, values in columns.items()},
-            }
-        )
+        return {
+            "stage": np.repeat(self.stage, n * p),
+            "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], p),
+            "travel_km": np.repeat(self.travel / 1000, p),
+            "parameter": np.tile(self.parameters, n),
+            **{name: values.ravel() for name, values in columns.items()},
+        }
 
     def to_arviz(self) -> DataTree:
         """Return the draws, with the ensembles as chains, and the diagnostics for ArviZ.

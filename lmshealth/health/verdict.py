@@ -19,7 +19,9 @@ from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History, LogEstimates
 from lmshealth.tracking.track import Event, Track
 
-_WITHOUT_LOSS = ("healthy", "step", "not-enough-data")
+# Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.
+NO_HEALTH = ("alarm", "no-alarm", "not-enough-data")
+_WITHOUT_LOSS = ("healthy", "step", *NO_HEALTH)
 
 
 def verdict_of(words: tuple[str, ...]) -> str:
@@ -39,12 +41,18 @@ def degraded_words(verdict: str) -> tuple[str, ...]:
     return () if verdict in _WITHOUT_LOSS else tuple(verdict.split("+"))
 
 
+_NO_PARAMETER = (
+    "The stage description has no [[parameter]]: the modes are tracked, and no health parameter is "
+    "inferred."
+)
+
+
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """State of a stage at its last log with its probability, and sentences that explain it.
 
-    The verdict is ``healthy``, ``step``, ``not-enough-data``, or what `verdict_of` returns for the
-    degraded parameters; the probability is NaN for ``not-enough-data``.
+    The verdict is ``healthy``, ``step``, one of `NO_HEALTH`, whose probability is NaN, or what
+    `verdict_of` returns for the degraded parameters.
     """
 
     stage: str
@@ -86,7 +94,8 @@ def judge(
         ``step`` after an undeclared step of the modes since the baseline. ``not-enough-data``
         if there are fewer logs than a baseline needs, if the sampler did not converge, if no state
         of the parameters explains the drifts, or if no parameter is informed; ``why`` then reports
-        alarms. Otherwise the most probable set of degraded parameters.
+        alarms. ``alarm`` or ``no-alarm`` of tracked modes if the description has no parameter.
+        Otherwise the most probable set of degraded parameters.
 
     Examples
     --------
@@ -109,18 +118,22 @@ def judge(
         return replace(found, why=f"{found.why} {doubt}".rstrip())
     reason = doubt or _reason_for_no_verdict(stage, history, health)
     if reason or health is None:
-        why = " ".join((*_alarm_sentences(track, history.baseline), reason))
-        return Verdict(history.stage, history.recorded_at[-1], "not-enough-data", float("nan"), why)
+        alarms = [*_alarm_sentences(track, history.baseline)]
+        word, why = "not-enough-data", " ".join((*alarms, reason))
+        enough = len(history.logs) - history.baseline >= stage.description.baseline.logs
+        if track is not None and not stage.parameters and (alarms or enough):
+            word = "alarm" if alarms else "no-alarm"
+        return Verdict(history.stage, history.recorded_at[-1], word, float("nan"), why)
     return _judge_posterior(stage, history, health)
 
 
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
     if not stage.parameters:
-        found = "The stage description has no [[parameter]]"
-        return f"{found}: the modes are tracked, and no health parameter is inferred."
+        return _NO_PARAMETER
     if n_logs < needed:
-        return f"{n_logs} usable logs since the baseline began; it needs {needed}."
+        logs = "log" if n_logs == 1 else "logs"
+        return f"{n_logs} usable {logs} since the baseline began; it needs {needed}."
     if health is None:
         return "The logs do not contain enough information for the health parameters."
     if not health.converged[-1]:

@@ -2,14 +2,16 @@
 
 from dataclasses import dataclass, field
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from lmshealth._arrays import freeze
+from lmshealth._result import Result
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
+_SUFFIXES = {"displacement": "m", "acceleration": "m_s2", "current": "a"}
 SI_UNITS = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
 
 
@@ -75,8 +77,8 @@ class Channel:
             freeze(self, ("values", self.values.size))
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Log:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Log(Result):
     """One recording of one stage, in SI units."""
 
     name: str  # path as the user gave it
@@ -96,3 +98,24 @@ class Log:
         if len(sizes) > 1:
             raise ValueError(f"channels have lengths {sorted(sizes)}, needed one length")
         freeze(self)
+
+    def title(self) -> str:
+        """Return name, duration, rate, machine, moment and odometer."""
+        own, n = self.metadata, max((one.values.size for one in self.channels), default=0)
+        parts = [f"Log {self.name}: {n / self.sample_rate:.6g} s at {self.sample_rate:g} Hz"]
+        parts += [str(part) for part in (own.stage, own.recorded_at) if part is not None]
+        return ", ".join(parts) + ("" if own.travel is None else f", {own.travel / 1000:g} km")
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return time in s and all samples in SI units; a long log may not fit into memory."""
+        n = max((one.values.size for one in self.channels), default=0)
+        samples = {f"{c.name}_{_SUFFIXES[c.kind]}": c.values[:n] for c in self.channels}
+        if self.reference_velocity is not None:
+            samples["reference_velocity_m_s"] = self.reference_velocity[:n]
+        return {"time_s": np.arange(n) / self.sample_rate, **samples}
+
+    def digest_columns(self) -> dict[str, Any]:
+        """Return the channels."""
+        names = [one.name for one in self.channels]
+        kinds = [one.kind for one in self.channels]
+        return {"channel": names, "kind": kinds, "unit": [SI_UNITS[kind] for kind in kinds]}

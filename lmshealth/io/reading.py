@@ -18,7 +18,7 @@ from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
-from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
+from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
@@ -182,7 +182,8 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     hint = f"; read with {', '.join(content.guessed)}" if content.guessed else ""
     left_out = {refusal.channel for refusal in content.refused}
     if absent := sorted(set(columns.columns.values()) - set(content.columns) - left_out):
-        raise Unusable("columns", f"the column map needs {listed(absent)}; {there}{hint}")
+        near = nearest(absent, content.present)
+        raise Unusable("columns", f"the column map needs {listed(absent)}; there: {near}{hint}")
     series = []
     for source in tuple(content.columns):
         # Taken out: a log of hundreds of channels is in memory once.

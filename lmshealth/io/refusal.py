@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Iterable
 from pathlib import Path
 
+_NEAREST = 3
 _MOST_LISTED = 12
 
 
@@ -36,6 +37,20 @@ def listed(names: Iterable[str]) -> str:
     )
     more = len(all_names) - _MOST_LISTED
     return (text or "nothing") + (f" and {more} more" if more > 0 else "")
+
+
+def nearest(sought: Iterable[str], names: Iterable[str]) -> str:
+    """List for a message the three names most like those sought, or the first dozen of names."""
+    from difflib import get_close_matches
+
+    there = {name.casefold(): name for name in names}
+    near = [
+        there[key] for one in sought for key in get_close_matches(one.casefold(), there, _NEAREST)
+    ]
+    more = len(there) - len(set(near))
+    if not near:
+        return listed(there.values())
+    return listed(dict.fromkeys(near)) + (f" (most like it, of {len(there)})" if more else "")
 
 
 def repeated(names: Iterable[str]) -> list[str]:

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from lmshealth._arrays import FloatArray, freeze
+from lmshealth._result import Result
 from lmshealth.io.log import Refusal
 from lmshealth.signal.spectral_lines import Line
 
@@ -28,8 +29,8 @@ class Rejection(NamedTuple):
     frequency: float | None = None  # in Hz, at which it was found or sought
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Modes:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Modes(Result):
     """Modal estimates of one log with their joint covariance; arrays of shape ``(n_modes,)``."""
 
     names: tuple[str, ...]  # unique per source; empty where there is none
@@ -68,6 +69,33 @@ class Modes:
             raise ValueError(f"mode names are not unique per source: {self.names}")
         shapes = "shapes", n, len(self.shape_channels)
         freeze(self, (" ".join(_ARRAYS), n), ("cov", 2 * n, 2 * n), shapes)
+
+    def title(self) -> str:
+        """Return the number of modes, lines and refusals."""
+        n, lines, refused = len(self.names), len(self.lines), len(self.refused)
+        return f"Modes of one log: {n}; {lines} spectral lines, {refused} refused"
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return the columns of ``modes.csv`` that a log has by itself, one row per mode."""
+        return {
+            "mode": list(self.names),
+            "source": list(self.sources),
+            "channel": list(self.channels),
+            "frequency_hz": self.frequency,
+            "frequency_std_hz": self.frequency_std,
+            "damping_ratio": self.damping_ratio,
+            "damping_ratio_std": self.damping_ratio_std,
+            "correlation_f_zeta": self.correlation,
+            "snr": self.snr,
+            "dispersion": self.dispersion,
+            "excitation_mm_s2": self.excitation / 1e-3,
+            "flags": list(self.flags),
+        }
+
+    def digest_columns(self) -> dict[str, Any]:
+        """Return the columns without those of the fit."""
+        left_out = ("source", "correlation_f_zeta", "dispersion", "excitation_mm_s2")
+        return {k: v for k, v in self.to_columns().items() if k not in left_out}
 
     @property
     def estimate(self) -> FloatArray:

@@ -2,10 +2,12 @@
 
 from dataclasses import dataclass
 from datetime import datetime
+from typing import Any
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray, freeze
+from lmshealth._result import Result
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,8 +37,8 @@ class ModeError:
     probability: float
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Prognosis:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Prognosis(Result):
     """Remaining useful life of one machine, of which `n` health parameters have a limit."""
 
     stage: str  # identity of the machine
@@ -82,6 +84,26 @@ class Prognosis:
             ("health", self.health.shape[0], n - 1),
             ("curve_quantiles", 5, self.curve_travel.size, n - 1),
         )
+
+    def title(self) -> str:
+        """Return machine, moment, odometer and horizon."""
+        at = f"{self.recorded_at.date()} at {self.travel / 1000:.6g} km"
+        horizon = f"{self.horizon / 1000:.6g} km"
+        return f"Prognosis of {self.stage} on {at}: remaining travel in km, at most {horizon}"
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return quantiles of the remaining travel, infinite beyond the horizon, of each limit."""
+        left = np.maximum(self.censored(), 0.0) / 1000
+        levels = (0.05, 0.25, 0.5, 0.75, 0.95)
+        quantiles = np.quantile(left, levels, axis=0, method="inverted_cdf")
+        pairs = zip(levels, quantiles, strict=True)
+        return {
+            "parameter": list(self.parameters),
+            "limit": self.limits,
+            **{f"rul_km_q{100 * level:02.0f}": own for level, own in pairs},
+            "probability_already_past": self.already_past(),
+            "probability_beyond_horizon": self.beyond_horizon(),
+        }
 
     def censored(self) -> FloatArray:
         """Return `remaining` with infinity beyond the horizon."""

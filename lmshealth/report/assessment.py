@@ -9,13 +9,19 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
-from lmshealth.health.verdict import Verdict, degraded_below, degraded_words, undeclared_events
+from lmshealth.health.verdict import (
+    NO_HEALTH,
+    Verdict,
+    degraded_below,
+    degraded_words,
+    undeclared_events,
+)
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report import constants
-from lmshealth.report.text import quantiles, spell
+from lmshealth.report.text import km, quantiles, spell
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History, LogEstimates
@@ -67,7 +73,7 @@ class Assessment:
     @property
     def alarmed(self) -> tuple[str, ...]:
         """Modes with an alarm since the baseline, when no verdict explains it."""
-        if self.judgement.verdict != "not-enough-data":
+        if self.judgement.verdict not in NO_HEALTH:
             return ()
         alarms = undeclared_events(self.track, self.history.baseline, "alarm")
         return tuple(dict.fromkeys(event.mode for event in alarms))
@@ -110,7 +116,7 @@ class Assessment:
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: days until the service; without a verdict before safe machines."""
         identity, verdict = self.judgement.stage, self.judgement.verdict
-        if verdict == "not-enough-data":
+        if verdict in NO_HEALTH:
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
@@ -134,6 +140,8 @@ class ParameterHealth:
     below_limit: float  # probability of being below the limit; NaN without one
     baseline: float = 1.0  # baseline, unit: baseline value with its unit; "" for a pure fraction
     unit: str = ""
+    # Odometer in m, low, median and high of some epochs, in order; empty if not determined.
+    course: tuple[tuple[float, ...], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -196,13 +204,14 @@ class Summary:
     health: tuple[ParameterHealth, ...]
     life: Life | None
     service: Service
+    to_do: str = ""  # the next step in a sentence
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
-    states: dict[str, State] = {"healthy": "good", "not-enough-data": "open"}
+    states: dict[str, State] = {"healthy": "good", **dict.fromkeys(NO_HEALTH, "open")}
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
         file=file,
@@ -221,6 +230,7 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         health=tuple(_parameters(assessment)),
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
+        to_do=_next_step(assessment, service, state),
     )
 
 
@@ -260,6 +270,22 @@ def summarise_life(
     )
 
 
+def first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
+    """Return the parameter whose limit is most probably reached first, and its probability.
+
+    None with a single limit, or when no draw reaches one before the horizon.
+    """
+    if prognosis is None or len(prognosis.limits) < 3:
+        return None
+    parts = prognosis.censored()[:, :-1]
+    ending = np.isfinite(parts).any(axis=1)
+    if not ending.any():
+        return None
+    shares = np.bincount(parts[ending].argmin(axis=1), minlength=parts.shape[1]) / ending.sum()
+    k = int(shares.argmax())
+    return prognosis.parameters[k], float(shares[k])
+
+
 def limit_of(spec: ParameterSpec) -> float | None:
     """Return the limit of a parameter as a fraction of its baseline; None without one."""
     return None if spec.limit is None else spec.limit.below / spec.baseline
@@ -269,6 +295,8 @@ def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
     """Return a verdict in words, with the parameters as the description names them."""
     texts = {
         "healthy": "healthy",
+        "alarm": "alarm of the modes",
+        "no-alarm": "modes tracked, no alarm",
         "not-enough-data": "not enough data for a verdict",
         "step": "sudden change without a known cause",
     }
@@ -282,10 +310,41 @@ def _headline(assessment: Assessment) -> str:
     verdict, parameters = assessment.judgement.verdict, assessment.stage.parameters
     if assessment.alarmed:
         return f"Alarm: unexplained change of {' and '.join(map(spell, assessment.alarmed))}"
-    if not parameters and verdict == "not-enough-data":
-        return "Modes tracked; no health parameter described"
     text = verdict_text(verdict, parameters)
     return text[0].upper() + text[1:]
+
+
+# Work that restores a parameter; of any other: work on it.
+_WORK = {"preload": "a preload adjustment", "mount": "a tightening of the mount"}
+
+
+def _next_step(assessment: Assessment, service: Service, state: State) -> str:
+    """Return what to do next in a sentence."""
+    prognosis, verdict = assessment.prognosis, assessment.judgement.verdict
+    if assessment.alarmed or verdict == "step":
+        what = "Inspect guide and mount now, and look for work, loads or tunings that the logs lack"
+        return f"{what}; then record a log."
+    if prognosis is None or service.kind == "unknown":
+        return "" if state == "good" else "Record further logs; the reasons are below."
+    first = first_limit(prognosis)
+    name = first[0] if first else prognosis.parameters[0]
+    words = {spec.name: spec.word for spec in assessment.stage.parameters}
+    work = _WORK.get(words.get(name, ""), f"work on {spell(name)}")
+    every = service.inspect_every / float(np.median(prognosis.usage))
+    if service.kind == "now":
+        return f"Do {work} now, before the machine travels on, and record logs for a new baseline."
+    if service.kind == "by" and service.by is not None:
+        return f"Order and plan {work} before {service.by.isoformat()}; until then {_often(every)}."
+    return f"No service is needed within {km(prognosis.horizon)}; record {_often(every)}."
+
+
+def _often(days: float) -> str:
+    """Return how often to record a log."""
+    if days < 2:
+        return "a log a day"
+    if days < 14:
+        return "a log a week" if 7 <= days < 8 else f"a log every {days:.0f} days"
+    return f"a log every {int(min(days, 182) // 7)} weeks"
 
 
 def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
@@ -297,9 +356,16 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
         below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
+        determined = bool(health.publishable_parameters()[k])
+        rows = np.linspace(0, len(health.travel) - 1, constants.COURSE_POINTS).round().astype(int)
+        rows = np.unique(rows[health.converged[rows]])
+        bands = np.quantile(health.samples[rows, :, k], constants.LEVELS, axis=1)
+        # Without an odometer the epochs are at equal distances.
+        at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
+        course = np.stack([at[rows], *bands], axis=1).round(4)
         yield ParameterHealth(
             name=name,
-            determined=bool(health.publishable_parameters()[k]),
+            determined=determined,
             converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
             low=low,
@@ -309,6 +375,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             below_limit=below,
             baseline=specs[name].baseline,
             unit=specs[name].unit,
+            course=tuple(map(tuple, course.tolist())) if determined else (),
         )
 
 

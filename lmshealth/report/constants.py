@@ -31,6 +31,12 @@ FLEET_BAR = 1.5
 MANY_MACHINES = 10
 # Refused logs shown per reason; up to this many refusals are shown unfolded.
 REFUSED_SHOWN, REFUSED_UNFOLDED = 50, 12
+# Bins of the histogram of remaining travel in km, between passed and beyond the horizon.
+LIFE_EDGES = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
+# Weeks by which a service may be late, of which the page has the risk.
+POSTPONED_WEEKS = (0, 1, 2, 4, 8)
+# Epochs, at most, in a small picture of health over travel.
+COURSE_POINTS = 24
 # Months of the calendar of services.
 CALENDAR_MONTHS = 12
 # Titles that appear under the pointer, per figure.

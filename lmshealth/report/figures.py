@@ -18,7 +18,11 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from lmshealth._arrays import FloatArray
+from lmshealth._result import Result
+from lmshealth.errors import BadQuestion
 from lmshealth.health.results import Health
+from lmshealth.io.log import SI_UNITS, Log
+from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants
@@ -38,7 +42,7 @@ _NAMED = {INK: "ink", MUTED: "muted", GRID: "line", PAPER: "card"}
 _NAMED |= {BLUE: "blue", RED: "red", GREEN: "green"}
 _STYLE: dict[str, Any] = {
     "font.sans-serif": ["DejaVu Sans"],  # comes with matplotlib: the same layout everywhere
-    "font.size": 9,
+    "font.size": 10,
     "text.usetex": False,
     "axes.edgecolor": MUTED,
     "axes.facecolor": "none",
@@ -49,7 +53,7 @@ _STYLE: dict[str, Any] = {
     "grid.color": GRID,
     "grid.linewidth": 0.6,
     "hatch.linewidth": 0.6,
-    "legend.fontsize": 8,
+    "legend.fontsize": 10,
     "legend.frameon": False,
     "svg.fonttype": "none",
     **dict.fromkeys(("xtick.color", "ytick.color"), MUTED),
@@ -61,8 +65,9 @@ _KM = 1000.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
 _GRID_POINTS = 72
-SIZE = (4.8, 2.8)  # of a figure in inches
-ROOM = 72  # characters that fit on a line of its legend
+_SEGMENT = 8192  # samples in a segment of a quick spectrum
+SIZE = (4.5, 2.8)  # of a figure in inches: its text is readable on a phone
+ROOM = 46  # characters that fit on a line of its legend
 
 
 def svg(draw: Callable[[Axes], object], *, salt: str, size: tuple[float, float] = SIZE) -> str:
@@ -272,7 +277,7 @@ def plot_life(
     ax.set_ylabel("% of baseline")
     odometer(ax)
     if not shown:
-        ax.set_xlabel(f"odometer in km (horizon at {end:.0f} km, not shown)")
+        ax.set_xlabel(f"odometer in km (horizon at {whole_km(_KM * end)}, not shown)")
     return ax
 
 
@@ -308,6 +313,7 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
+    grouped(ax)
     ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
     ax.set_ylabel("probability in %")
     return legend(ax)
@@ -391,6 +397,76 @@ def _regions(ax: Axes, draws: FloatArray) -> None:
     ax.plot([0.04] * 2, [low[1], high[1]], "_-", color=INK, lw=1.4, ms=8, transform=up, label=name)
 
 
+def plot_log(ax: Axes, log: Log, channel: str) -> Axes:
+    """Plot the power spectral density of a channel, or of all accelerations, by Welch's method."""
+    from scipy.signal import welch
+
+    start, stop = max(log.pieces, key=lambda piece: piece[1] - piece[0])
+    kind = next((one.kind for one in log.channels if one.name == channel), "acceleration")
+    for one in log.channels:
+        if one.name == channel or (not channel and one.kind == kind):
+            segment = min(_SEGMENT, stop - start)
+            f, density = welch(one.values[start:stop], log.sample_rate, nperseg=segment)
+            ax.plot(f[1:], density[1:], lw=0.8, label=plain_label(one.name))
+    ax.set_yscale("log")
+    ax.set_xlabel("frequency in Hz")
+    ax.set_ylabel(f"PSD in ({SI_UNITS[kind]})²/Hz")
+    return legend(ax)
+
+
+def plot_modes(ax: Axes, modes: Modes) -> Axes:
+    """Plot damping ratios over natural frequencies, ± one standard deviation, with their names."""
+    f, damping = modes.frequency, 100 * modes.damping_ratio
+    style: Any = {"xerr": modes.frequency_std, "yerr": 100 * modes.damping_ratio_std, "fmt": "o"}
+    ax.errorbar(f, damping, color=BLUE, ms=4, **style)
+    for name, x, y in zip(modes.names, f, damping, strict=True):
+        ax.annotate(_spell(name), (x, y), xytext=(4, 4), textcoords="offset points")
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("natural frequency in Hz")
+    ax.set_ylabel("damping ratio in %")
+    return ax
+
+
+def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
+    """Plot a result, or a channel, mode or parameter of it, in Axes or a new figure of pyplot.
+
+    Health is drawn in % of 1: that of parameters with units by `Health.relative_to`.
+    """
+    import matplotlib
+    from matplotlib import pyplot
+
+    names = _parts(result)
+    if what and what not in names:
+        raise BadQuestion(f"{result.title()}: nothing is called {what!r}; there are {names}")
+    style: Any = _STYLE | {"axes.facecolor": PAPER}
+    with matplotlib.rc_context(style):
+        ax = ax or pyplot.figure(figsize=SIZE, layout="constrained").add_subplot()
+        match result:
+            case Log():
+                return plot_log(ax, result, what)
+            case Modes():
+                return plot_modes(ax, result)
+            case History():
+                return plot_frequencies(ax, result, None, what or names[0])
+            case Track():
+                return plot_track(ax, result, what or names[0])
+            case Health():
+                return plot_health(ax, result, what or names[0], None)
+            case Prognosis() if what not in ("", "any"):
+                return plot_life(ax, result, what)
+            case Prognosis():
+                return plot_survival(ax, result)
+    raise TypeError(f"a {type(result).__name__} has no plot")
+
+
+def _parts(result: Any) -> list[str]:
+    """Return the names of the parts of a result that can be plotted."""
+    if isinstance(result, Log):
+        return [one.name for one in result.channels]
+    found = next((getattr(result, n) for n in ("parameters", "modes") if hasattr(result, n)), ())
+    return list(found)
+
+
 def _density(ax: Axes, draws: FloatArray) -> None:
     """Draw the density of one column with its 50 and 90 % intervals."""
     from scipy.ndimage import gaussian_filter1d
@@ -414,8 +490,15 @@ def _density(ax: Axes, draws: FloatArray) -> None:
 
 def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
     """Label the odometer axis and add the legend."""
+    grouped(ax)
     ax.set_xlabel("odometer in km")
     return legend(ax, room=room)
+
+
+def grouped(ax: Axes) -> None:
+    """Group the thousands at the horizontal axis, as the text of the page does."""
+    ax.locator_params(axis="x", nbins=6)
+    ax.xaxis.set_major_formatter(lambda value, _: f"{value:,g}".replace(",", GAP))
 
 
 def legend(ax: Axes, *, room: int = ROOM) -> Axes:
@@ -451,6 +534,8 @@ _WORDS = {
     "sensor": "sensor changed",
     "reset": "guide or mount serviced",
 }
+# Height of the axes above which a label is below its line.
+_TOP = 0.88
 # On images; not from the palette, which changes on dark pages.
 _WHITE, _BLACK = "#ffffff", "#000000"
 
@@ -464,20 +549,26 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
     for column in history.columns(mode):
         _logs(ax, history, column, history.ln_frequency[:, column], (1.0, "Hz"))
     if track is not None and mode in track.modes:
-        k = track.modes.index(mode)
-        level = track.ln_frequency[:, k]
-        _filtered(ax, track.travel, level, track.ln_frequency_std[:, k], 1.0)
-        _baselines(ax, history, track, k)
-        names = dict(_WORDS)  # each kind has one entry in the legend
-        for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
-            style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
-            name, x = names.pop(kind, None), track.travel[first] / _KM
-            ax.axvline(x, lw=1.0, label=name, zorder=1, **style)
+        plot_track(ax, track, mode)
+        _baselines(ax, history, track, track.modes.index(mode))
     # Show at least 1 % of the frequency, so that noise does not appear as a change.
     low, high = ax.get_ylim()
     middle = (low + high) / 2
     if high - low < 0.01 * middle:
         ax.set_ylim(0.995 * middle, 1.005 * middle)
+    ax.set_ylabel("natural frequency in Hz")
+    return odometer(ax)
+
+
+def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
+    """Plot the filtered natural frequency of a mode with its 95 % band, and the steps."""
+    k = track.modes.index(mode)
+    _filtered(ax, track.travel, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
+    names = dict(_WORDS)  # each kind has one entry in the legend
+    for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
+        style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
+        name, x = names.pop(kind, None), track.travel[first] / _KM
+        ax.axvline(x, lw=1.0, label=name, zorder=1, **style)
     ax.set_ylabel("natural frequency in Hz")
     return odometer(ax)
 
@@ -547,15 +638,15 @@ def plot_waterfall(
     bar.outline.set_visible(False)
     _column_hints(ax, sides, waterfall, history)
     _waterfall_lines(ax, waterfall, history)
-    if track is not None:
-        for k in range(len(track.modes)):
-            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.grid(visible=False)
     ax.set_ylim(waterfall.edges[0], waterfall.edges[-1])
     if waterfall.edges[-1] > _WIDE * waterfall.edges[0]:
         ax.set_yscale("log")
+    if track is not None:
+        for k in range(len(track.modes)):
+            _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.set_ylabel("frequency in Hz")
-    return odometer(ax, room=54)  # next to the colour bar
+    return odometer(ax, room=36)  # next to the colour bar
 
 
 def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Axes:
@@ -582,7 +673,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     hints(ax, x, before, texts)
     ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
     ax.set_ylabel("change of frequency in %")
-    return legend(ax)
+    return legend(ax, room=35)
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
@@ -696,13 +787,16 @@ def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None
     x = track.travel / _KM
     name = None if k else "tracked modes, 95 % band"
     ax.fill_between(x, np.exp(level - reach), np.exp(level + reach), fc=_WHITE, alpha=0.4, lw=0)
-    ax.plot(x, np.exp(level), color=_WHITE, lw=0.7, path_effects=_halo(1.5), label=name)
+    ax.plot(x, np.exp(level), color=_WHITE, lw=1.0, path_effects=_halo(2.6), label=name)
     if np.isfinite(level).any():
         first = int(np.argmax(np.isfinite(level)))
-        style: Any = {"color": _WHITE, "size": 8, "clip_on": True, "path_effects": _halo(1.8)}
+        style: Any = {"color": _WHITE, "size": 9.5, "path_effects": _halo(2.2)}
         place = (x[first], np.exp(level[first]))
+        # Below the line where there is no room above it.
+        share = ax.transAxes.inverted().transform(ax.transData.transform(place))[1]
+        offset, side = ((3, -4), "top") if share > _TOP else ((3, 4), "bottom")
         name = _spell(track.modes[k])
-        ax.annotate(name, place, xytext=(2, 3), textcoords="offset points", **style)
+        ax.annotate(name, place, xytext=offset, textcoords="offset points", va=side, **style)
 
 
 def _halo(width: float) -> list[Any]:

@@ -10,11 +10,15 @@ from datetime import date, datetime, timedelta
 from importlib import resources
 from pathlib import Path
 
+import numpy as np
+
 from lmshealth._files import write_text
 from lmshealth.io.log import Refusal
 from lmshealth.report import constants
 from lmshealth.report.assessment import Summary
+from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.report.rendering import render
+from lmshealth.report.text import number
 
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
@@ -82,6 +86,7 @@ def write_index(
         states=Counter(one.state for one in ranked),
         kinds=Counter(one.service.kind for one in ranked),
         months=_months(ranked, newest) if script else [],
+        lives=_lives(ranked) if script else [],
         newest=newest,
         refused=by_reason,
         fold=len(refused) > constants.REFUSED_UNFOLDED,
@@ -91,6 +96,15 @@ def write_index(
     path = folder / "index.html"
     write_text(path, text)
     return path
+
+
+def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
+    """Count machines by their median remaining travel; the last bin is beyond the horizon."""
+    left = [one.life.any.travel[len(RUL_LEVELS) // 2] / 1000 for one in summaries if one.life]
+    edges = [0.0, *constants.LIFE_EDGES, np.inf]
+    labels = ["passed", *(f"to {number(edge)}" for edge in edges[1:-1]), "more", "beyond"]
+    places = Counter(int(np.searchsorted(edges, km)) + (km == np.inf) for km in left)
+    return [(label, places[k]) for k, label in enumerate(labels)] if left else []
 
 
 def _months(summaries: Sequence[Summary], newest: date) -> list[Month]:

@@ -141,7 +141,7 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     for axis, name in zip(0.2 * extent * _ISOMETRIC, "xyz", strict=True):
         ax.plot(*np.c_[corner, corner + axis], color=figures.MUTED, lw=0.8)
         u, v = corner + 1.3 * axis
-        ax.text(u, v, name, color=figures.MUTED, size=7, ha="center", va="center")
+        ax.text(u, v, name, color=figures.MUTED, size=8, ha="center", va="center")
     ax.update_datalim(end)
     ax.margins(0.12)
     ax.set_aspect("equal", anchor="N")
@@ -149,7 +149,7 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     title = spell(shapes.names[i])
     if np.isfinite(shapes.complexity[i]):
         title += f", MPC {shapes.complexity[i]:.2f}"
-    ax.set_title(figures.plain_label(title), size=8.5)
+    ax.set_title(figures.plain_label(title), size=9)
     return ax
 
 
@@ -205,13 +205,13 @@ def plot_spectra(
         _plot_search(panels, part)
     if sought:
         _name_panel(panels[-1], "order of the\nsubspace model")
-    figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=9)
+    figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=10)
     _annotate(figure, panels, (summary.low, summary.high), modes, stage)
     return figure
 
 
 def _name_panel(ax: Axes, name: str) -> None:
-    ax.text(1.01, 0.5, name, transform=ax.transAxes, va="center", size=8.5)
+    ax.text(1.01, 0.5, name, transform=ax.transAxes, va="center", size=9)
 
 
 def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
@@ -406,7 +406,7 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     points = ax.transData.transform([(f, bottom) for f, _, _ in labels])
     places = ax.transAxes.inverted().transform(points)[:, 0]
     moved = isotonic_regression(places - steps).x.clip(0, None) + steps
-    style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 8}
+    style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 9}
     across, ends = ax.get_xaxis_transform(), ("axes fraction", "offset points")
     for (f, text, colour), x in zip(labels, moved.tolist(), strict=True):
         text = figures.plain_label(text.replace("\n", "  ") if upright else text)

@@ -7,7 +7,7 @@ import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date, datetime
 from functools import partial
 from itertools import combinations
 from operator import attrgetter
@@ -19,10 +19,10 @@ from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
-from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.prognosis.maintenance_decision import Service, day_after, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, Summary, limit_of, summarise
+from lmshealth.report.assessment import Assessment, Summary, first_limit, limit_of, summarise
 from lmshealth.report.changes import changes
 from lmshealth.report.log_figures import plot_spectra, spectra_size
 from lmshealth.report.notices import notices
@@ -37,7 +37,7 @@ from lmshealth.tracking.track import Effect, Track
 
 Item = TypeVar("Item")
 
-_SIZES = {"waterfall": (4.8, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
+_SIZES = {"waterfall": (4.5, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,8 @@ def make_page(
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
-        "first_limit": _first_limit(assessment.prognosis),
+        "postponed": list(_postponed(assessment.prognosis, service)),
+        "first_limit": first_limit(assessment.prognosis),
         "before": before,
         "news": before and [*changes(before, summary, parameters)],
         **_track_content(assessment),
@@ -112,20 +113,15 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
     return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
 
 
-def _first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
-    """Return the parameter whose limit is most probably reached first, and its probability.
-
-    None with a single limit, or when no draw reaches one before the horizon.
-    """
-    if prognosis is None or len(prognosis.limits) < 3:
-        return None
-    parts = prognosis.censored()[:, :-1]
-    ending = np.isfinite(parts).any(axis=1)
-    if not ending.any():
-        return None
-    shares = np.bincount(parts[ending].argmin(axis=1), minlength=parts.shape[1]) / ending.sum()
-    k = int(shares.argmax())
-    return prognosis.parameters[k], float(shares[k])
+def _postponed(
+    prognosis: Prognosis | None, service: Service
+) -> Iterator[tuple[date, int, tuple[float, float]]]:
+    """Yield days of a postponed service, weeks late, and bounds of the risk until then."""
+    for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
+        assert prognosis is not None and service.by is not None
+        if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
+            reached = probability_before(prognosis, day)
+            yield day, weeks, (float(reached.at_least[-1]), float(reached.at_most[-1]))
 
 
 def _track_content(assessment: Assessment) -> dict[str, Any]:

@@ -13,7 +13,16 @@ from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
 
 _FILTERS = (
-    *(text.change, text.fixed, text.interval, text.km, text.law, text.moment, text.number),
+    *(
+        text.change,
+        text.count,
+        text.fixed,
+        text.interval,
+        text.km,
+        text.law,
+        text.moment,
+        text.number,
+    ),
     *(text.percent, text.probability, text.probability_range, text.signed, text.spell),
     *(text.time_left, text.travel_left, text.whole_km),
 )

@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
@@ -27,7 +26,7 @@ from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.smoother import Smoothed
-from lmshealth.tracking.track import Track
+from lmshealth.tracking.track import Track, mode_columns
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
@@ -72,7 +71,7 @@ LOG_COLUMNS = {
     "h2_phase_rad hv_gain hv_phase_rad fit_gain fit_phase_rad",
     "detect": "parameter loss power false_alarm n_baseline seconds_for_one_log",
     "plan": "parameter loss seconds_per_log n_logs hindrance power_of_one_log "
-    "smallest_loss_of_one_log smallest_loss",
+    "smallest_loss_of_one_log smallest_loss value_std_ln",
     "fit": "log input output method note period_s n_averages n_lines low_hz high_hz mean_coherence "
     "chi_square distortion colour",
     "harmonics": "log channel frequency_hz amplitude_um phase_rad above_floor",
@@ -84,7 +83,7 @@ LOG_COLUMNS = {
     "map_at_limits_hz surrogate_error_ln_f logs_reach_ln_f",
     "stage_parameters": "parameter baseline limit limit_on_map map_low map_high prior_q005 "
     "prior_q05 prior_q95 prior_q995 prior_below_map prior_above_map prior_std_ln logs_std_ln "
-    "endless_logs_std_ln exact_map_std_ln others_known_std_ln informed verdict",
+    "endless_logs_std_ln exact_map_std_ln others_known_std_ln change_std_ln informed verdict",
     "sensitivities": "mode parameter at_baseline at_limits",
     "correlations": "parameter_a parameter_b correlation",
 }
@@ -146,13 +145,8 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         metadata.servo_id,
         None if error is None else error / _MICRO,
     )
-    numbers = (
-        *(modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std),
-        *(modes.correlation, modes.snr, modes.dispersion, modes.excitation / _MILLI),
-    )
-    lists = [one.tolist() for one in numbers]
-    values = zip(modes.names, modes.sources, modes.channels, *lists, modes.flags, strict=True)
-    rows = _rows("modes", [(*log, *one) for one in values])
+    columns = [np.asarray(one).tolist() for one in modes.to_columns().values()]
+    rows = _rows("modes", [(*log, *one) for one in zip(*columns, strict=True)])
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
@@ -205,38 +199,15 @@ def track_rows(
     track: Track, smoothed: Smoothed | None = None, *, epochs: Iterable[int] | None = None
 ) -> list[Row]:
     """Return a track, one row per epoch (of `epochs`) and mode, with columns of smoothed values."""
-    drift_std = np.sqrt(np.einsum("kii->ki", track.drift_cov))
-    columns = _mode_columns(track, drift_std)
-    later = {} if smoothed is None else _mode_columns(smoothed, smoothed.drift_std)
+    columns, m = track.to_columns(), len(track.modes)
+    if smoothed is not None:
+        later = mode_columns(smoothed)
+        columns |= {f"{name}_smoothed": values for name, values in later.items()}
     return [
-        {
-            "stage": track.stage,
-            "recorded_at": _iso(track.recorded_at[k]),
-            "travel_km": track.travel[k] / _KM,
-            "mode": mode,
-            **{name: values[k, i] for name, values in columns.items()},
-            "nis": track.nis[k],
-            "nis_dof": track.nis_dof[k],
-            "noise_scale": track.noise_scale[k].max(),
-            "widening": track.widening[k],
-            **{f"{name}_smoothed": values[k, i] for name, values in later.items()},
-        }
+        {name: values[m * k + i] for name, values in columns.items()}
         for k in (range(len(track.logs)) if epochs is None else epochs)
-        for i, mode in enumerate(track.modes)
+        for i in range(m)
     ]
-
-
-def _mode_columns(track: Track | Smoothed, drift_std: FloatArray) -> dict[str, FloatArray]:
-    """Return the columns of all modes, shape ``(n_epochs, n_modes)`` each."""
-    frequency, damping = np.exp(track.ln_frequency), np.exp(track.ln_damping)
-    return {
-        "frequency_hz": frequency,
-        "frequency_std_hz": frequency * track.ln_frequency_std,
-        "damping_ratio": damping,
-        "damping_ratio_std": damping * track.ln_damping_std,
-        "drift": track.drift,
-        "drift_std": drift_std,
-    }
 
 
 def track_cov_rows(track: Track) -> list[Row]:
@@ -429,7 +400,7 @@ def stage_rows(examined: StageCheck, found: Sequence[Diagnostic]) -> dict[str, l
         values = (
             *(one.name, one.spec.baseline, *limits, one.low, one.high),
             *(*one.quantiles, one.below, one.above, one.prior_std, one.usual_std),
-            *(one.endless_std, one.exact_map_std, one.known_std),
+            *(one.endless_std, one.exact_map_std, one.known_std, one.change_std),
             *(one.variance_removed(one.usual_std), one.verdict),
         )
         parameters.append(values)

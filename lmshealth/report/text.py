@@ -59,6 +59,11 @@ def number(value: Number, digits: int = 3) -> str:
     return f"{rounded:,.0f}".replace(",", GAP).replace("-", "−")
 
 
+def count(n: int, noun: str) -> str:
+    """Return a number with its noun, in the plural unless it is 1."""
+    return f"{n:,} {noun}{'' if n == 1 else 's'}".replace(",", GAP)
+
+
 def fixed(value: Number, digits: int) -> str:
     """Format a number with fixed decimals; NaN is a dash."""
     return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")

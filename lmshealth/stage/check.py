@@ -67,6 +67,7 @@ class ParameterCheck(ReadOnly):
     # were the other parameters known: also that of the combination.
     exact_map_std: float
     known_std: float
+    change_std: float  # of a small change since the baseline, as `lmshealth plan` has it
     # Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     exponents: FloatArray
 
@@ -168,11 +169,9 @@ def _check_parameters(
 ) -> Iterator[ParameterCheck]:
     """Yield the checks of all parameters; ``noise`` is that of typical logs, ``(n_modes,)``."""
     unlimited = information.precision(information.limiting_variance())
-    exact_map = replace(information, model_std=0.0)
-    usual, endless, exact = (
-        np.sqrt(np.diag(np.linalg.inv(precision)))
-        for precision in (information.precision(noise), unlimited, exact_map.precision(noise))
-    )
+    usual, exact = information.std(noise), information.std(noise, exact_map=True)
+    endless = information.std(information.limiting_variance())
+    change = information.change_std(noise)
     for j, spec in enumerate(specs):
         low, high = np.exp([modal_map.low[j], modal_map.high[j]]).tolist()
         below, upto = spec.prior.probability(np.array([low, high])).tolist()
@@ -188,6 +187,7 @@ def _check_parameters(
             usual_std=float(usual[j]),
             endless_std=float(endless[j]),
             exact_map_std=float(exact[j]),
+            change_std=float(change[j]),
             known_std=float(1 / np.sqrt(unlimited[j, j])),
             exponents=unlimited[j] / unlimited[j, j],
         )

@@ -54,25 +54,29 @@ class Identifiability:
         kept = tuple(self.modes[k] for k in rows)
         return replace(self, modes=kept, slopes=self.slopes[rows], leave_out=self.leave_out[rows])
 
-    def std(self, parameter: int, noise: FloatArray) -> float:
-        """Return the standard deviation of one ln parameter by an exact map.
-
-        With V = C + S_o Λ_o S_oᵀ, the other parameters known by their priors, this is
-        1 / √(s_jᵀ V⁻¹ s_j); ``noise`` is the diagonal of C, shape ``(n_modes,)``.
-        """
-        own, others = self.slopes[:, parameter], np.delete(self.slopes, parameter, axis=1)
-        cov = np.diag(noise) + (others * np.delete(self.prior, parameter)) @ others.T
-        information = float(own @ np.linalg.solve(cov, own))
-        return float(1 / np.sqrt(information)) if information > 0 else np.inf
-
-    def precision(self, noise: FloatArray) -> FloatArray:
+    def precision(self, noise: FloatArray, *, exact_map: bool = False) -> FloatArray:
         """Return the posterior precision of all ln parameters, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
 
-        With variances of the drifts ``(n_modes,)``; shape ``(n_parameters, n_parameters)``.
+        For variances of the drifts, ``(n_modes,)``; shape ``(n_parameters, n_parameters)``. The
+        error of the map grows with the drifts: E is that of parameters anywhere in their priors,
+        and 0 by an exact map, or for a change close to the baseline.
         """
         error = self.model_std**2 * self.slopes**2 @ self.prior + self.leave_out**2
-        weighted = self.slopes / (noise + error)[:, None]
+        weighted = self.slopes / (noise + (0.0 if exact_map else error))[:, None]
         return np.asarray(np.diag(1 / self.prior) + self.slopes.T @ weighted)
+
+    def std(self, noise: FloatArray, *, exact_map: bool = False) -> FloatArray:
+        """Return the posterior standard deviations of the ln parameters, as `precision` does."""
+        return np.sqrt(np.diag(np.linalg.inv(self.precision(noise, exact_map=exact_map))))
+
+    def change_std(self, noise: FloatArray) -> FloatArray:
+        """Return the standard deviations of small changes of the ln parameters.
+
+        Each has no prior of its own; the others have theirs. Shape ``(n_parameters,)``.
+        """
+        information = self.std(noise, exact_map=True) ** -2 - 1 / self.prior
+        with np.errstate(divide="ignore"):
+            return np.asarray(np.maximum(information, 0.0) ** -0.5)
 
 
 def identifiable_parameters(

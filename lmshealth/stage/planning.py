@@ -3,6 +3,7 @@
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -30,6 +31,9 @@ class Effort:
     # as the baseline has.
     smallest_loss: float = np.nan
     smallest_loss_many: float = np.nan
+    # Standard deviation of the ln parameter anywhere in its prior, by as many logs as the baseline
+    # has, with the error of the map: as `lmshealth stage` has it.
+    value_std: float = np.nan
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,7 +104,7 @@ def plan(
     size = -np.log1p(-loss)
 
     def power_of_one(duration: float) -> float:
-        return test.power(size, information.std(j, information.drift_variance(duration, 1)))
+        return test.power(size, _change_std(information, j, duration, 1))
 
     seconds = range(max(1, int(np.ceil(information.least_duration))), constants.LONGEST_LOG + 1)
     place = bisect_left(seconds, power, key=power_of_one)
@@ -149,7 +153,7 @@ def _index(stage: Stage, parameter: str, loss: float) -> int:
 
 def _expect_identifiable(stage: Stage, information: Identifiability, j: int) -> None:
     """Refuse a parameter that even unlimited logs do not inform."""
-    left = np.linalg.inv(information.precision(information.limiting_variance()))[j, j]
+    left = information.std(information.limiting_variance())[j] ** 2
     if left < (1 - constants.INFORMED) * information.prior[j]:
         return
     name = information.parameters[j]
@@ -171,8 +175,7 @@ def _effort(
     if duration < information.least_duration:
         return Effort(duration, None, "too-short")
 
-    def std(n_logs: int, n_baseline: int | None = None) -> float:
-        return information.std(j, information.drift_variance(duration, n_logs, n_baseline))
+    std = partial(_change_std, information, j, duration)
 
     counts = range(1, constants.MOST_LOGS + 1)
     place = bisect_left(counts, test.required, key=lambda n: test.power(size, std(n)))
@@ -181,5 +184,14 @@ def _effort(
         best = test.power(size, std(constants.MOST_LOGS, constants.MOST_LOGS))
         hindrance = "baseline" if best >= test.required else "parameters"
     n_logs = None if hindrance else counts[place]
-    losses = [test.smallest_loss(std(n)) for n in (1, information.n_baseline)]
-    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), *losses)
+    one, many = (test.smallest_loss(std(n)) for n in (1, information.n_baseline))
+    noise = information.drift_variance(duration, information.n_baseline)
+    value_std = float(information.std(noise)[j])
+    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), one, many, value_std)
+
+
+def _change_std(
+    information: Identifiability, j: int, duration: float, n_logs: int, baseline: int | None = None
+) -> float:
+    noise = information.drift_variance(duration, n_logs, baseline)
+    return float(information.change_std(noise)[j])

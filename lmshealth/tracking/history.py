@@ -5,11 +5,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise
-from typing import Literal, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 
 from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
+from lmshealth._result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.modes import Modes
@@ -66,8 +67,8 @@ class Step(ReadOnly):
         return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class History:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class History(Result):
     """All modal estimates of one stage, in the order of recording."""
 
     stage: str  # identity of the machine
@@ -121,6 +122,48 @@ class History:
                 f"{self.logs[k]}: {one.mode} by {one.source} has an estimate of variance "
                 f"{variance[k, row]:g}, or without covariances; needed are positive ones"
             )
+
+    def title(self) -> str:
+        """Return machine, number of logs, and their time and travel."""
+        ends = (
+            ""
+            if not self.logs
+            else (f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}")
+        )
+        if self.logs and self.has_odometer:
+            ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
+        return f"History of {self.stage}: {len(self.logs)} logs{ends}"
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return the estimates, one row per log and series; NaN where a mode was not found."""
+        n, r = len(self.logs), len(self.series)
+        std = np.sqrt(np.einsum("kii->ki", self.cov))
+        frequency, damping = np.exp(self.ln_frequency), np.exp(self.ln_damping)
+        return {
+            "stage": self.stage,
+            "log": np.repeat(np.array(self.logs, dtype=object), r),
+            "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], r),
+            "travel_km": np.repeat(self.travel / 1000, r),
+            **{name: np.repeat(values, r) for name, values in self.covariates.items()},
+            "mode": np.tile([one.mode for one in self.series], n),
+            "source": np.tile([one.source for one in self.series], n),
+            "frequency_hz": frequency.ravel(),
+            "frequency_std_hz": (frequency * std[:, :r]).ravel(),
+            "damping_ratio": damping.ravel(),
+            "damping_ratio_std": (damping * std[:, r:]).ravel(),
+        }
+
+    def digest_columns(self) -> dict[str, Any]:
+        """Return number of estimates, first and last frequency of each series."""
+        found = [own[np.isfinite(own)] for own in np.exp(self.ln_frequency).T]
+        ends = np.array([(own[0], own[-1]) if own.size else (np.nan,) * 2 for own in found])
+        return {
+            "mode": [one.mode for one in self.series],
+            "source": [one.source for one in self.series],
+            "logs": [own.size for own in found],
+            "first_hz": ends.reshape(-1, 2)[:, 0],
+            "last_hz": ends.reshape(-1, 2)[:, 1],
+        }
 
     @property
     def baseline(self) -> int:

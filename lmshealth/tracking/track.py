@@ -7,13 +7,14 @@ are filtered again from the checkpoint before it. No epoch uses later logs; `smo
 
 from dataclasses import dataclass, replace
 from datetime import datetime
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
 from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
@@ -105,8 +106,8 @@ class Consistency:
         return "above" if self.nis > 1 else "below"
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Track:
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Track(Result):
     """Filtered modes of a machine over its life: no epoch uses later logs."""
 
     stage: str  # identity of the machine
@@ -148,6 +149,37 @@ class Track:
             ("travel nis nis_dof widening", n),
         )
 
+    def title(self) -> str:
+        """Return machine, number of epochs and events, and the last epoch."""
+        last = f"; modes at {self.recorded_at[-1].date()}" if self.recorded_at else ""
+        events = f"{len(self.steps)} steps, {len(self.alarms)} alarms"
+        return f"Track of {self.stage}: {len(self.logs)} epochs, {events}{last}"
+
+    @property
+    def drift_std(self) -> FloatArray:
+        """Standard deviation of the drift, shape ``(n_epochs, n_modes)``."""
+        return np.asarray(np.sqrt(np.einsum("kii->ki", self.drift_cov)))
+
+    def to_columns(self) -> dict[str, Any]:
+        """Return the columns of ``track.csv``, one row per epoch and mode."""
+        n, m = len(self.logs), len(self.modes)
+        return {
+            "stage": np.repeat(self.stage, n * m),
+            "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], m),
+            "travel_km": np.repeat(self.travel / 1000, m),
+            "mode": np.tile(self.modes, n),
+            **mode_columns(self),
+            "nis": np.repeat(self.nis, m),
+            "nis_dof": np.repeat(self.nis_dof, m),
+            "noise_scale": np.repeat(self.noise_scale.max(axis=1, initial=0.0), m),
+            "widening": np.repeat(self.widening, m),
+        }
+
+    def digest_columns(self) -> dict[str, Any]:
+        """Return the modes at the last epoch."""
+        names = ("mode", *mode_columns(self))
+        return {name: self.to_columns()[name][-len(self.modes) :] for name in names}
+
     @property
     def alarms(self) -> tuple[Event, ...]:
         """Damage alarms."""
@@ -156,6 +188,20 @@ class Track:
     def consistency(self) -> Consistency:
         """Test the filter by its innovations."""
         return consistency(self.nis, self.nis_dof, self.innovations)
+
+
+def mode_columns(values: Any) -> dict[str, FloatArray]:
+    """Return the columns of modes of a track, filtered or smoothed, one row per epoch and mode."""
+    frequency, damping = np.exp(values.ln_frequency), np.exp(values.ln_damping)
+    columns = {
+        "frequency_hz": frequency,
+        "frequency_std_hz": frequency * values.ln_frequency_std,
+        "damping_ratio": damping,
+        "damping_ratio_std": damping * values.ln_damping_std,
+        "drift": values.drift,
+        "drift_std": values.drift_std,
+    }
+    return {name: own.ravel() for name, own in columns.items()}
 
 
 def lagged_products(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:

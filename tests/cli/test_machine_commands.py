@@ -246,6 +246,11 @@ def test_a_machine_without_drifts_is_reported_and_the_others_are_inferred(
     table[table["stage"] == "AX-2"].to_csv(drifts, index=False)
     result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")
     assert result.exit_code == 1
+    # One misspelt mode would be left out without a word.
+    table[table["stage"] == "AX-2"].replace("pitch2", "pitch").to_csv(drifts, index=False)
+    result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")
+    assert result.exit_code == 1
+    assert "AX-2: modes ['roll2'] are none of" in result.stderr
     assert not (tmp_path / "none.csv").exists()
 
 

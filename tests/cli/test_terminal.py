@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import math
+import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
+from lmshealth.cli import options, terminal
 from lmshealth.cli.terminal import print_json, print_refused, print_text, progress_bars
 
 NAN = float("nan")
@@ -55,8 +59,11 @@ def test_prose_is_wrapped_between_words(capsys: pytest.CaptureFixture[str]) -> N
     assert any("2026-03-01" in line for line in lines)
 
 
-def test_names_in_a_wide_table_are_not_torn(capsys: pytest.CaptureFixture[str]) -> None:
+def test_names_in_a_wide_table_are_not_torn(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The last column gives way; folders are left out unless two logs have one name."""
+    monkeypatch.setattr(terminal, "_columns", lambda: 80)
     row = {"log": "far/away/on/a/disk/log-0001.h5", "channel": "acc_pitch", "mode": "roll",
            "reason": "not-excited", "detail": "no " * 40}  # fmt: skip
     print_refused([row])
@@ -69,3 +76,57 @@ def test_names_in_a_wide_table_are_not_torn(capsys: pytest.CaptureFixture[str]) 
     print_refused([row | {"log": f"{k}/log.h5"} for k in "ab"])
     out = capsys.readouterr().out
     assert "a/log.h5" in out and "b/log.h5" in out
+
+
+@pytest.mark.parametrize("columns", [None, 12, 80, 200])
+def test_a_table_is_as_wide_as_its_terminal_and_never_cut(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None
+) -> None:
+    """In a pipe every row is one line; on a terminal only texts are wrapped, numbers stay whole."""
+    monkeypatch.setattr(terminal, "_columns", lambda: columns)
+    row = {"mode": "roll", "detail": "no resonance " * 30, "loss, 5 logs": "1 234 567.8"}
+    terminal.print_table("Title", [row, row | {"mode": "pitch"}], 2)
+    out = capsys.readouterr().out
+    assert "…" not in out and out.count("1 234 567.8") == 2
+    lines = [line for line in out.splitlines() if "resonance" in line]
+    assert len(lines) == 2 if columns is None else len(lines) > 2
+    if columns in (80, 200):
+        assert columns - 20 < max(map(len, out.splitlines())) <= columns
+
+
+def test_a_log_file_has_events_notes_and_errors_and_ends_with_its_command(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Events carry their time; what is printed anyway is not printed twice; quiet hides notes."""
+
+    @options.command("none")
+    def talk() -> None:
+        with progress_bars() as report:
+            for k in range(101):
+                report("fitting", k, 100)
+        terminal.print_notes(["beware"])
+        terminal.print_errors(["it failed"])
+
+    file = tmp_path / "log.txt"
+    talk(["-v", "--log-file", str(file)], standalone_mode=False)
+    shown, text = capsys.readouterr().err, file.read_text(encoding="utf-8")
+    assert text.count("fitting: ") == shown.count("fitting: ") == 11
+    assert text.count("beware") == text.count("it failed") == 1
+    assert shown.count("beware") == shown.count("it failed") == 1
+    assert all(line[:2] == "20" for line in text.splitlines())
+    talk(["--quiet"], standalone_mode=False)
+    assert capsys.readouterr().err == "lmshealth: it failed\n"
+    assert file.read_text(encoding="utf-8") == text
+    assert logging.getLogger("lmshealth").handlers == []
+
+
+@pytest.mark.slow
+def test_a_closed_pipe_ends_without_a_word() -> None:
+    """As `| head` closes it."""
+    words = [sys.executable, "-m", "lmshealth", "stage", "lms-y", "--format", "json"]
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
+    with subprocess.Popen(words, **pipes) as started:
+        assert started.stdout is not None and started.stderr is not None
+        started.stdout.close()
+        assert started.stderr.read() == b""
+    assert started.returncode == 1

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from lmshealth.cli import terminal
 from lmshealth.cli.views import (
     print_error,
     print_frf,
@@ -278,7 +279,7 @@ def test_the_shipped_descriptions_fit_eighty_columns(
     out = checked(load_stage(name), capsys)
     assert max(len(line) for line in out.splitlines()) <= 80
     assert all(out.count(word) >= 4 for word in ("guide_preload", "mount_stiffness"))
-    heads = ("map error", "prior outside", "endless logs", "Sensitivity", "Correlation")
+    heads = ("map error", "prior outside", "endless", "Sensitivity", "Correlation")
     assert all(head in out for head in heads)
     assert "+ guide_preload is identifiable" in out
     assert ("! mount_stiffness is not identifiable" in out) == (name == "lms-x")
@@ -304,8 +305,11 @@ def test_without_health_only_modes_are_shown(
     assert "No [[parameter]]" in out
 
 
-def test_plans_are_one_table_each_with_reasons(capsys: pytest.CaptureFixture[str]) -> None:
+def test_plans_are_one_table_each_with_reasons(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A number of logs or what hinders, dashes for what is not known, what stands for what."""
+    monkeypatch.setattr(terminal, "_columns", lambda: 80)
     asked = {
         "parameter": "p", "loss": 0.05, "power": 0.9, "false_alarm": 0.01, "n_baseline": 7,
         "seconds_for_one_log": 42,
@@ -313,10 +317,12 @@ def test_plans_are_one_table_each_with_reasons(capsys: pytest.CaptureFixture[str
     row = {
         "parameter": "p", "loss": 0.05, "seconds_per_log": 60.0, "n_logs": 3, "hindrance": "",
         "power_of_one_log": 0.5, "smallest_loss_of_one_log": 0.04, "smallest_loss": 0.02,
+        "value_std_ln": 0.03,
     }  # fmt: skip
     short = row | {
         "seconds_per_log": 0.1, "n_logs": None, "hindrance": "too-short",
         "power_of_one_log": NAN, "smallest_loss_of_one_log": NAN, "smallest_loss": NAN,
+        "value_std_ln": NAN,
     }  # fmt: skip
     weak = row | {"loss": 0.01, "n_logs": None, "hindrance": "baseline"}
     print_plans([asked, asked | {"loss": 0.01, "seconds_for_one_log": None}], [row, short, weak])
@@ -324,8 +330,8 @@ def test_plans_are_one_table_each_with_reasons(capsys: pytest.CaptureFixture[str
     first, second = shown.split("p: to detect a loss of 1.0 %")
     assert "loss of 5.0 % with power 0.9, false-alarm probability 0.01" in first
     assert "loss, 7 logs" in first
-    assert "60 3 50.0 % 4.0 % 2.0 %" in " ".join(first.split())
-    assert "0.1 log too short – – –" in " ".join(first.split())
+    assert "60 3 50.0 % 4.0 % 2.0 % 3.0 %" in " ".join(first.split())
+    assert "0.1 log too short – – – –" in " ".join(first.split())
     assert "from 42 s on" in first
     assert "baseline too short" in second
     assert "A single log of up to an hour is not enough" in second
@@ -410,16 +416,15 @@ def print_fleet(assessments: Sequence[Assessment]) -> None:
 
 
 def test_the_numbers_are_those_of_the_table(printed: Printed) -> None:
-    """A line per level with km, hours, days and the date; of one limit "any" is one line."""
+    """A line per level with km, days and the date, as on the page; of one limit one "any"."""
     life = make_prognosis(np.linspace(1e5, 1e6, 1001), np.full(1001, 1e4))
     text = shown(life, Decision(next_service=date(2026, 4, 1)), printed, date(2026, 4, 1))
     row = prognosis_rows(summarise_life(life, STAGE), decide(life, Decision()))[0]
     line = next(line for line in text.splitlines() if " 50 " in line).split()
     days = row["rul_days_q50"]
     day = (START + timedelta(days=days)).date().isoformat()
-    km, hours = row["rul_km_q50"], row["rul_hours_q50"]
-    assert line[-5:] == ["50", f"{km:,.0f}", f"{hours:,.0f}", f"{days:,.1f}", day]
-    assert "guide preload below 0.6" in text and "any limit" not in text
+    assert line[-6:] == ["50", f"{row['rul_km_q50']:.0f}", "km", f"{days:.0f}", "days", day]
+    assert "guide preload below 60 %" in text and "any limit" not in text
     assert "already: below 1 %" in text and "before 2026-04-01: 23 %" in text
     service = decide(life, Decision())
     assert f"Service: by {service.by} (accepted risk 5 %)" in text
@@ -430,16 +435,16 @@ def test_quantiles_beyond_the_horizon_have_no_number(printed: Printed) -> None:
     """Censored levels have no number; for a passed limit the service is now."""
     life = make_prognosis(np.r_[np.full(40, 1e6), np.full(60, np.inf)], np.full(100, 1e4))
     text = shown(life, Decision(), printed)
-    line = next(line.split() for line in text.splitlines() if " beyond 10,000 " in line)
-    assert line == ["50", "to", "95", "beyond", "10,000", "–", "–", "–"]
-    assert text.count("beyond 10,000 ") == 1
+    line = next(line.split() for line in text.splitlines() if " beyond 10 000 " in line)
+    assert line == ["50", "to", "95", "beyond", "10", "000", "km", "–", "–"]
+    assert text.count("beyond 10 000 ") == 1
     assert "beyond horizon: 60 %" in text and "inf" not in text and "nan" not in text
     late = make_prognosis(np.r_[np.full(90, -1e6), np.full(10, np.inf)], np.full(100, 1e4))
     text = shown(late, Decision(cost_ratio=9.0), printed)
     assert "Service: now (least cost, where a failure costs 9 times a service)" in text
     assert "already been reached, at most: 90 %" in text
     text = shown(make_prognosis(np.full(9, np.inf), np.full(9, 1e4)), Decision(), printed)
-    assert "no service needed yet" in text and "No service is needed within 10,000 km" in text
+    assert "no service needed yet" in text and "No service is needed within 10 000 km" in text
     idle = make_prognosis(np.full(9, 9e6), np.full(9, 1.0))
     text = shown(idle, Decision(), printed)
     assert "no date" in text and "out of range" in text and "too low for a calendar" in text
@@ -469,7 +474,7 @@ def test_any_limit_is_not_printed_twice(printed: Printed, other: float) -> None:
     )
     text = shown(life, Decision(), printed)
     alone = other > 1e6
-    assert ("Any limit: the same as guide preload below 0.6." in text) is alone
+    assert ("Any limit: the same as guide preload below 60 %." in text) is alone
     assert (" any limit " in text) is not alone
 
 
@@ -513,8 +518,11 @@ def test_a_few_machines_are_printed_in_full(
     assert f"Service: by {bad.service().by}" in text
 
 
-def test_many_machines_have_a_row_each(make: Callable[..., Assessment], printed: Printed) -> None:
+def test_many_machines_have_a_row_each(
+    make: Callable[..., Assessment], printed: Printed, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Twenty rows, the most urgent first, the rest counted; nothing runs off the terminal."""
+    monkeypatch.setattr(terminal, "_columns", lambda: 80)
     good, bad = make("good", wear_km=400000, floor=0.98), make("worst")
     fleet = [replace(good, judgement=replace(good.judgement, stage=f"M{k}")) for k in range(21)]
     print_fleet([*fleet, bad])

@@ -182,6 +182,21 @@ def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> Non
         assert "no [[parameter]]" in found.why
 
 
+@pytest.mark.parametrize(("n_logs", "alarm", "word"), [
+    (8, True, "alarm"), (8, False, "no-alarm"), (2, True, "alarm"), (2, False, "not-enough-data"),
+])  # fmt: skip
+def test_frequencies_alone_have_alarms_as_verdict(
+    tmp_path: Path, n_logs: int, alarm: bool, word: str
+) -> None:
+    """A description of modes asks for no health: an alarm does not stand beside missing data."""
+    stage = make_stage(tmp_path, ())
+    track = make_track(np.zeros((n_logs, 2)), np.tile(1e-6 * np.eye(2), (n_logs, 1, 1)))
+    event = Event("alarm", 1, "roll", "", -0.02, 0.001, 9.0, False, 1)
+    found = judge(stage, logs(n_logs), None, replace(track, events=(event,) * alarm))
+    assert (found.verdict, np.isnan(found.probability)) == (word, True)
+    assert found.why.startswith("Alarm since") == alarm
+
+
 def test_an_alarm_without_a_verdict_is_reported(stage: Stage) -> None:
     """Mode, drift and date of an alarm come first; those before the baseline do not count."""
     drift = np.zeros((8, 2))

@@ -6,7 +6,7 @@ import pytest
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io.column_map import load_columns, parse_column, role_of
 from lmshealth.io.reading import read_log
-from lmshealth.io.refusal import Unusable
+from lmshealth.io.refusal import Unusable, nearest
 
 GOOD = """
 sample_rate_hz = 2000
@@ -55,6 +55,10 @@ def test_absent_source(make, tmp_path):
     with pytest.raises(BadLog, match="needs PE; there: time_s, delta_e_um") as caught:
         read_log(make(), columns=load_columns(tmp_path / "map.toml"))
     assert caught.value.reason == "columns"
+    names = [f"AI {k}" for k in range(200)] + ["PositionError", "PE(0)", "PE(1)"]
+    assert nearest(["positionerorr"], names) == "PositionError (most like it, of 203)"
+    assert set(nearest(["PE(2)"], names).split(" (most")[0].split(", ")) == {"PE(0)", "PE(1)"}
+    assert nearest(["zzzz"], names).endswith("and 191 more")
 
 
 @pytest.mark.parametrize(

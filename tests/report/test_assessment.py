@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.report.assessment import Summary, summarise, summarise_life
-from lmshealth.report.machine_page import _first_limit
+from lmshealth.report.assessment import Summary, first_limit, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
 from lmshealth.tracking.track import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
@@ -31,6 +30,7 @@ def summary(assessment: Assessment) -> Summary:
         ("both", "Loss of guide preload and mount stiffness", "bad"),
         ("step", "Sudden change without a known cause", "bad"),
         ("not-enough-data", "Not enough data for a verdict", "open"),
+        ("no-alarm", "Modes tracked, no alarm", "open"),
     ],
 )
 def test_every_verdict_has_a_headline(make: Maker, verdict: str, headline: str, state: str) -> None:
@@ -63,12 +63,9 @@ def test_a_description_without_parameters_has_no_verdict(make: Maker) -> None:
     assessment = make()
     description = structs.replace(assessment.stage.description, parameter=())
     stage = replace(assessment.stage, description=description)
-    judgement = replace(assessment.judgement, verdict="not-enough-data")
+    judgement = replace(assessment.judgement, verdict="no-alarm")
     found = summary(replace(assessment, stage=stage, health=None, judgement=judgement))
-    assert (found.headline, found.state) == (
-        "Modes tracked; no health parameter described",
-        "open",
-    )
+    assert (found.headline, found.state) == ("Modes tracked, no alarm", "open")
 
 
 def test_health_is_that_of_the_draws(make: Maker) -> None:
@@ -102,9 +99,9 @@ def test_the_first_limit_is_named(make: Maker) -> None:
     mount[: n // 4] = 3e5
     draws = np.stack([preload, mount, np.minimum(preload, mount)], axis=1)
     share = 1 - (n // 4) / n
-    assert _first_limit(replace(prognosis, remaining=draws)) == ("guide_preload", share)
-    assert _first_limit(replace(prognosis, remaining=np.full((n, 3), np.inf))) is None
-    assert _first_limit(None) is None
+    assert first_limit(replace(prognosis, remaining=draws)) == ("guide_preload", share)
+    assert first_limit(replace(prognosis, remaining=np.full((n, 3), np.inf))) is None
+    assert first_limit(None) is None
 
 
 def test_censored_and_negative_lives(make: Maker) -> None:

@@ -19,6 +19,7 @@ from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
+from lmshealth.report.text import plain
 from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Decision
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -180,7 +181,7 @@ def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis, health
     """A horizon far behind the limit is named instead of squeezing the picture."""
     plots.plot_life(ax, prognosis, "guide_preload", health=health)
     assert {"now", "limit 60 %", "law", "epochs, 90 %", "limit reached"} <= set(labels(ax))
-    assert "horizon at 21720 km" in ax.get_xlabel()
+    assert "horizon at 21 720 km" in plain(ax.get_xlabel())
     near = Figure().add_subplot()
     plots.plot_life(near, replace(prognosis, horizon=3e6), "mount_stiffness")
     assert "horizon" in labels(near)

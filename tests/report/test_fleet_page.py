@@ -16,6 +16,7 @@ import pytest
 from lmshealth._serialize import pack, unpack
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
+from lmshealth.report.text import GAP
 from studies.scale.rows import TODAY, make_refused, make_rows
 from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
 
@@ -68,7 +69,7 @@ def test_files_are_safe_and_never_twice_the_same(identities: list[str], files: l
 
 def bars(page: Page) -> dict[str, int]:
     """Return the calendar of services: what stands over each month, now first."""
-    part = page.source[page.source.index('<ol class="months">') :]
+    part = page.source[page.source.index('<ol class="months">') :].partition("</ol>")[0]
     found = re.findall(r'<b>(\d*)</b>.*?<span class="label">(\w+)', part)
     return {label: int(count or 0) for count, label in found}
 
@@ -88,6 +89,20 @@ def test_services_are_counted_by_month(tmp_path: Path) -> None:
         f"{len(dates) - sum(counts.values())} are due after these months, {kinds.count('later')} "
         f"need no service within the horizon, {kinds.count('unknown')} have no date"
     ) in words(page)
+
+
+def test_remaining_lives_are_counted_in_bins(tmp_path: Path) -> None:
+    """Every machine with a life is in one bin; the last is beyond the horizon."""
+    rows = make_rows(400)
+    source = Page(write_index(tmp_path, rows, ())).source
+    part = source[source.index('id="lives"') :].partition("</ol>")[0]
+    pairs = re.findall(r'<b>(\d*)</b>.*?<span class="label">([^<]+)', part)
+    counts = {label: int(count or 0) for count, label in pairs}
+    left = [row.life.any.travel[3] / 1000 for row in rows if row.life]
+    assert sum(counts.values()) == len(left) > 100
+    assert counts["beyond"] == sum(np.isinf(left))
+    assert counts["passed"] == sum(km <= 0 for km in left)
+    assert counts[f"to 1{GAP}000"] == sum(500 < km <= 1000 for km in left)
 
 
 def test_no_date_can_break_the_calendar(tmp_path: Path) -> None:
@@ -224,6 +239,30 @@ def test_filters_are_restored_on_return(browser: Any, fleet: Path) -> None:
     assert page.title() == "other"
     page.go_back()
     assert seen_rows(page) == ["Führung 12"]
+
+
+@pytest.mark.slow
+def test_filters_survive_a_reload_in_the_address(browser: Any, fleet: Path) -> None:
+    """Words, state, date and order are in the fragment, which asks nobody and can be sent."""
+    page, seen = watch(browser, fleet)
+    page.get_by_label("Loss or change").check(force=True)
+    page.get_by_label("Service before").fill("2027-04-01")
+    head = page.get_by_role("columnheader", name="Guide preload").get_by_role("button")
+    head.click()
+    head.click()
+    shown, address = seen_rows(page), page.url
+    assert 0 < len(shown) < N
+    assert "#state=bad&before=2027-04-01&order=-2" in address
+    page.reload()
+    assert (seen_rows(page), page.url) == (shown, address)
+    other, also = watch(browser, fleet)
+    other.goto(address)
+    assert seen_rows(other) == shown
+    other.evaluate("location.hash = ''")
+    other.wait_for_function("!document.querySelector('tbody tr[hidden]')")
+    page.get_by_role("button", name="Show all").click()
+    assert page.url == fleet.as_uri() + "#" and len(seen_rows(page)) == N
+    assert seen == also == []
 
 
 @pytest.mark.slow

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import UTC, datetime, timedelta
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,13 +21,14 @@ from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
+from lmshealth.prognosis.maintenance_decision import probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.assessment import summarise as summarise_machine
 from lmshealth.report.fleet_page import write_index
 from lmshealth.report.machine_page import make_page
-from lmshealth.report.text import GAP
+from lmshealth.report.text import GAP, plain
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.covariate_effects import find_covariate_effects
@@ -78,6 +79,15 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
     assert f"By {by.isoformat()}" in first and "accepted risk of 5 %" in first
     assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
     assert "service planned for 2027-03-01" in first
+    plan = f"Order and plan a preload adjustment before {by.isoformat()}; until then a log"
+    assert plan in first.replace("\u2011", "-")
+    assert "Guide preload over 1 600 km: 1" in plain(first) and "limit of 60 %" in plain(first)
+    late = [probability_before(assessment.prognosis, by + timedelta(7 * k)) for k in (1, 8)]
+    assert assessment.prognosis is not None
+    for weeks, risk in zip(("1 week", "8 weeks"), late, strict=True):
+        day = (by + timedelta(7 * int(weeks[0]))).isoformat()
+        shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]
+        assert shown == pytest.approx(100 * float(risk.at_most[-1]), abs=1.5)
     assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
 
 
@@ -402,7 +412,7 @@ def test_use_of_the_logs_is_counted(make: Maker, tmp_path: Path) -> None:
     text = words(one(tmp_path, replace(assessment, track=track)))
     part = text[text.index("Data used") : text.index("Fit of the laws")]
     assert "based on 40 logs of this machine" in part
-    assert "2 parts were refused: 1 × not excited, 1 × gap." in part
+    assert "2 parts refused: 1 × not excited, 1 × gap." in part
     assert "roll 39 of 40 (98 %) none 1 × not excited" in part
     assert "pitch 40 of 40 (100 %) 2 –" in part
     assert "logs/0007.csv mode roll by acc, channel acc_feed not excited" in part

@@ -67,10 +67,12 @@ def test_with_an_exact_map_both_deviations_agree(tmp_path: Path) -> None:
     """Generalised least squares with the prior added equals the joint precision."""
     exact = identifiability_of(make_stage(tmp_path, model_std=0.0))
     noise = exact.drift_variance(60.0, 5)
-    joint = np.linalg.inv(exact.precision(noise))
-    for j in range(2):
-        alone = 1 / (1 / exact.prior[j] + exact.std(j, noise) ** -2)
-        assert joint[j, j] == pytest.approx(alone, rel=1e-6)
+    for j, found in enumerate(exact.change_std(noise)):
+        own, others = exact.slopes[:, j], np.delete(exact.slopes, j, axis=1)
+        cov = np.diag(noise) + (others * np.delete(exact.prior, j)) @ others.T
+        assert found == pytest.approx((own @ np.linalg.solve(cov, own)) ** -0.5, rel=1e-9)
+        alone = 1 / (1 / exact.prior[j] + found**-2)
+        assert exact.std(noise)[j] ** 2 == pytest.approx(alone, rel=1e-6)
 
 
 @pytest.mark.parametrize(("model_std", "covered"), [(0.3, True), (0.0, False)])

@@ -11,6 +11,8 @@ from msgspec import structs
 from scipy.stats import norm
 
 from lmshealth.errors import BadQuestion, BadStage, OutsideMap
+from lmshealth.stage.check import check_stage
+from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.planning import Plan, plan
@@ -185,3 +187,14 @@ def test_questions_without_an_answer_are_refused(one: Stage, tmp_path: Path) -> 
     bare = load_stage(str(write_archive_stage(tmp_path, health=False)))
     with pytest.raises(BadStage, match=r"no \[map\]"):
         plan(bare, "guide_preload", 0.05)
+
+
+@pytest.mark.parametrize("name", ["guide_preload", "mount_stiffness"])
+def test_a_plan_and_a_check_agree_about_the_same_logs(two: Stage, name: str) -> None:
+    """Of as many logs as the baseline both have one deviation of the value, and one of a change."""
+    (checked,) = (one for one in check_stage(two).parameters if one.name == name)
+    (effort,) = plan(two, name, 0.05, durations=(TYPICAL_DURATION,)).efforts
+    assert effort.value_std == checked.usual_std
+    change = float(-np.log1p(-effort.smallest_loss_many) / LEVELS)
+    assert change == pytest.approx(checked.change_std, rel=1e-9)
+    assert checked.change_std < 0.5 * checked.usual_std  # the map's error is 5 % here

@@ -31,8 +31,13 @@
     }
     const sorted = table.querySelector("[aria-sort]");
     const way = sorted ? `by ${names[heads.indexOf(sorted)].toLowerCase()}, ${sorted.ariaSort}` : "most urgent first";
-    count.textContent = `${shown} of ${rows.length} stages, ${way}`;
+    count.textContent = `${shown} of ${rows.length} stage${rows.length === 1 ? "" : "s"}, ${way}`;
     all.hidden = shown === rows.length && !sorted;
+    // The address keeps what is shown: it survives a reload, and can be sent.
+    const kept = { find: find.value, state, before: before.value };
+    if (sorted) kept.order = `${sorted.ariaSort === "descending" ? "-" : ""}${order.value}`;
+    const fragment = new URLSearchParams(Object.entries(kept).filter(([, value]) => value)).toString();
+    if (fragment !== location.hash.slice(1)) history.replaceState(null, "", `#${fragment}`);
   };
 
   const compare = (a, b) => (typeof a === "number" ? a - b || 0 : alphabet.compare(a, b));
@@ -78,7 +83,17 @@
     find.focus();
   });
   document.querySelector(".tools").hidden = false;
-  // Coming back from the page of a stage, the browser has filled in the fields.
-  addEventListener("pageshow", () => sort(Number(order.value)));
-  sort(-1);
+  const restore = () => {
+    const kept = new URLSearchParams(location.hash.slice(1));
+    find.value = kept.get("find") ?? "";
+    before.value = kept.get("before") ?? "";
+    (states.find((one) => one.value === kept.get("state")) ?? states[0]).checked = true;
+    const by_column = kept.get("order") ?? "";
+    const column = Math.abs(Number(by_column));
+    if (by_column && column < heads.length) sort(column, by_column.startsWith("-"));
+    else sort(-1);
+  };
+  // The browser fills in fields after this script, and an address may be changed by hand.
+  for (const event of ["pageshow", "hashchange"]) addEventListener(event, restore);
+  restore();
 })();
