@@ -313,4 +313,5 @@ def _is_text(head: bytes) -> bool:
 
 
 CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)
-CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)
+_GZIPPED = (".csv.gz", ".txt.gz", ".tsv.gz", ".dat.gz", ".asc.gz", ".lvm.gz")
+CSV_GZ = Format("gzipped CSV", _GZIPPED, lambda head: head.startswith(_GZIP_MAGIC), _load)

@@ -76,7 +76,7 @@ def encoding_of(head: bytes) -> str:
         return marked
     # Without a mark: Latin letters in two bytes each, of which one is zero.
     for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if len(head) > 3 and head[first::2].count(0) > 0.9 * len(head[first::2]):
+        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
             return name
     try:
         codecs.getincrementaldecoder("utf-8-sig")().decode(head)
@@ -236,12 +236,13 @@ def _names(
     # Names differ; a line of the names that the column map has needs no other sign.
     mapped = set(columns.columns.values())
     own = [one for one in heads if mapped and mapped <= set(one[1])]
+    stated = bool(own)
     own += [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
     where, names = (own or heads)[0]
     if n and len(names) < n:
         raise corrupt(f"row 1 has {n} fields, the line of names {len(names)}")
     k = heads.index((where, names))
-    if not mapped and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
+    if not stated and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
         k, (where, names) = k + 1, heads[k + 1]
     units = heads[k - 1][1] if k else [""]
     if len(units) != len(names) or not all(map(_is_unit, units)):
