@@ -136,7 +136,8 @@ def read_sep005(
         times = [one.time for one in read if one.time is not None]
         if any(not np.array_equal(times[0], time) for time in times):
             raise Unusable("time", "channels have different times; needed the same of all")
-        samples |= {"time_s": as_samples(time) for time in times[:1]}
+        if times:
+            samples["time_s"] = as_samples(times[0])
         starts = sorted({one.start for one in read} - {""})
         if len(starts) > 1:
             raise Unusable("time", f"start_timestamp differs: {listed(starts)}; needed the same")

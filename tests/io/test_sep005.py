@@ -84,7 +84,7 @@ def test_what_is_no_sep005(channel, why):
 
 
 def test_channels_that_contradict_each_other():
-    """Two starts, or two columns of times, are refused; so is a record with a gap on its way out."""
+    """Two starts or two columns of times are refused; so is a record with a gap on its way out."""
     other = {**CHANNEL, "name": "b", "data": X[1]}
     stamps = [{"start_timestamp": f"2026-01-0{day} 08:00:00"} for day in (1, 2)]
     with pytest.raises(BadLog, match="start_timestamp differs"):

@@ -24,12 +24,13 @@ from lmshealth.io.formats.content import Content, Format, check_size, not_numeri
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose, present
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io.refusal import Unusable, corrupt, visible
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
+_LABVIEW = b"LabVIEW Measurement"
 # First bytes and lines from which the dialect is found.
 _HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
@@ -127,8 +128,12 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
 
     What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
     """
-    encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
+    head = stream.read(_HEAD_BYTES)
+    encoding = columns.csv.encoding or encoding_of(head)
     stream.seek(0)
+    if head.startswith(_LABVIEW):
+        with _one_segment(stream, stored) as whole:
+            return _parsed(Text(whole, stored), encoding, columns)
     if encoding.startswith(("utf-16", "utf-32")):
         with _recoded(stream, stored, encoding) as recoded:
             return _parsed(Text(recoded, 4 * stored), encoding, columns)
@@ -151,6 +156,38 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
         samples = _numbers(text, chosen.columns, dialect, times)
         samples |= {name: _since_first(samples[name]) for name in times}
     return Content(samples, metadata, names, chosen.refused, guessed)
+
+
+def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
+    """Copy a LabVIEW measurement without the headers of its later segments.
+
+    `Unusable` (``format``) for segments without X values, which place them in time, or of other
+    channels.
+    """
+    file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+    names, size = b"", 0
+    kept: dict[bytes, bytes] = {}
+    try:
+        for number, line in enumerate(iter(partial(stream.readline, constants.LONGEST_LINE), b"")):
+            key, _, rest = line.rstrip().partition(b"\t")
+            word = key[:1].isalpha() or key.startswith(b"*")
+            if names and (word or not line.strip()):
+                fixed = key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
+                if fixed and (kept.get(key) != rest or kept.get(b"X_Columns") != b"One"):
+                    found = f"line {number + 1}: a further segment with {visible(key.decode())}"
+                    needed = "needed X_Columns One, and the same channels in all segments"
+                    raise Unusable("format", f"{found} {visible(rest.decode('cp1252'))}; {needed}")
+                continue
+            if not names:
+                kept[key] = rest
+            names = names or (line if key == b"X_Value" else b"")
+            size += file.write(line)
+            check_size(size, stored)
+    except BaseException:
+        file.close()
+        raise
+    file.seek(0)
+    return file
 
 
 def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:
