@@ -24,7 +24,7 @@ from lmshealth.io.formats.content import Content, Format, check_size, not_numeri
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose, present
-from lmshealth.io.refusal import Unusable, corrupt, visible
+from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
@@ -161,26 +161,29 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
 def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
     """Copy a LabVIEW measurement without the headers of its later segments.
 
-    `Unusable` (``format``) for segments without X values, which place them in time, or of other
-    channels.
+    `Unusable` (``format``) for segments without X values, which place them in time, with or without
+    headers of their own, and for segments of other channels.
     """
     file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
-    names, size = b"", 0
     kept: dict[bytes, bytes] = {}
+    begun, size, left = False, 0, -1
     try:
         for number, line in enumerate(iter(partial(stream.readline, constants.LONGEST_LINE), b"")):
             key, _, rest = line.rstrip().partition(b"\t")
-            word = key[:1].isalpha() or key.startswith(b"*")
-            if names and (word or not line.strip()):
-                fixed = key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
-                if fixed and (kept.get(key) != rest or kept.get(b"X_Columns") != b"One"):
-                    found = f"line {number + 1}: a further segment with {visible(key.decode())}"
-                    needed = "needed X_Columns One, and the same channels in all segments"
-                    raise Unusable("format", f"{found} {visible(rest.decode('cp1252'))}; {needed}")
-                continue
-            if not names:
+            further = begun and (key[:1].isalpha() or key.startswith(b"*"))
+            timed = kept.get(b"X_Columns") == b"One"
+            if not begun:
                 kept[key] = rest
-            names = names or (line if key == b"X_Value" else b"")
+                if begun := key == b"X_Value":
+                    counts = [int(word) for word in kept.get(b"Samples", b"").split()]
+                    left = -1 if timed else max(counts, default=0)
+            elif not line.strip() or further:
+                fixed = further and key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
+                if fixed and (kept.get(key) != rest or not timed):
+                    raise _segment(number, f"{key.decode('cp1252')} {rest.decode('cp1252')}")
+                continue
+            elif (left := left - 1) == -1:
+                raise _segment(number, "more rows than Samples states")
             size += file.write(line)
             check_size(size, stored)
     except BaseException:
@@ -188,6 +191,11 @@ def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
         raise
     file.seek(0)
     return file
+
+
+def _segment(number: int, found: str) -> Unusable:
+    needed = "needed X_Columns One, and the same channels in all segments"
+    return Unusable("format", f"line {number + 1}: a further segment, {found}; {needed}")
 
 
 def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:

@@ -112,8 +112,10 @@ def response_functions(path: Path) -> list[Function]:
                 nodes[_field(pair, f"m_i{w}SigNodeUniqueInstanceID")] for w in ("Input", "Output")
             ]
             ids = [_field(node, "m_uNodeId") for node in used]
-            cross = next(e for e in used[1].iter("SigNodeCrossSpectrumInfo")
-                         if e.get("name") != _AUTO and _field(e, "m_uSignodeId") == ids[0])  # fmt: skip
+            crosses = (
+                e for e in used[1].iter("SigNodeCrossSpectrumInfo") if e.get("name") != _AUTO
+            )
+            cross = next(e for e in crosses if _field(e, "m_uSignodeId") == ids[0])
             auto = [next(e for e in node.iter() if e.get("name") == _AUTO) for node in used]
             frequency, values = _spectrum(cross)
             powers = [_spectrum(e)[1].real for e in auto]

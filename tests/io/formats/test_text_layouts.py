@@ -117,7 +117,10 @@ def test_labview_of_several_segments(tmp_path):
     assert log.sample_rate == 1000 and log.pieces == ((0, 200), (200, 400))
     np.testing.assert_allclose(log.channels[1].values, Y, atol=1e-12)
     path.write_text(LVM_HEAD.format("No") + lvm("No", ["\t1\t2"] * 3) + lvm("No", ["\t1\t2"]))
-    with pytest.raises(BadLog, match=r"line 17: a further segment .* needed X_Columns One"):
+    with pytest.raises(BadLog, match=r"line 17: a further segment.* needed X_Columns One"):
+        read_log(path)
+    path.write_text(LVM_HEAD.format("No") + lvm("No", ["\t1\t2"] * 401))
+    with pytest.raises(BadLog, match="line 413: a further segment, more rows than Samples"):
         read_log(path)
     path.write_text(LVM_HEAD.format("One") + parts[0] + parts[1].replace("pitch", "yaw"))
     with pytest.raises(BadLog, match="same channels in all"):
