@@ -106,7 +106,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
         delimiter, decimal = layout.delimiter or ",", layout.decimal or "."
         n_fields = len(fields_of(lines[begin], delimiter))
         found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
-    stated = layout.header is False or isinstance(layout.header, list)
+    numbered = columns.columns and all(map(str.isdecimal, columns.columns.values()))
+    stated = numbered or layout.header is False or isinstance(layout.header, list)
     heads = [] if stated else list(_heads(lines[: found.first], skip, found))
     if layout.delimiter is None and layout.decimal is None:
         title = next((line.strip() for line in reversed(lines[skip : found.first])), "")
@@ -127,7 +128,8 @@ def fields_of(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     try:
-        return next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])
+        text = [line.rstrip("\r\n")]
+        return next(csv.reader(text, delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error as error:
         raise corrupt(f"a line cannot be split: {error}") from error
 
@@ -154,7 +156,9 @@ def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[
             if k >= skip and line.strip() and not line.startswith("#")
         ]
         for decimal in layout.decimal or ".,":
-            if delimiter != decimal and (first := _first_row(split, _NUMBER[decimal])) is not None:
+            # Numbers with the delimiter in them are quoted.
+            fits = delimiter != decimal or any('"' in line for line in lines)
+            if fits and (first := _first_row(split, _NUMBER[decimal])) is not None:
                 k, fields = split[first]
                 judged = [_share(own, _NUMBER[decimal]) for _, own in split[first:][:_JUDGED]]
                 share = round(sum(judged) / len(judged), 2)

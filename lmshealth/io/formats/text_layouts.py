@@ -23,7 +23,8 @@ def twincat(lines: Sequence[str]) -> Dialect | None:
     start = next((k for k, line in enumerate(lines) if line.startswith("Starttime of export")), 0)
     if delimiter is None or not start:
         return None
-    keys = {key: fields_of(lines[k], delimiter) for key, k in at.items() if k > start}
+    below = {key: k for key, k in at.items() if k > start and key != "EOF"}
+    keys = {key: fields_of(lines[k], delimiter) for key, k in below.items()}
     interval = keys.get("SampleTime[ms]", [])
     if "Name" not in keys or len(interval) != len(keys["Name"]):
         raise corrupt("a TwinCAT Scope export without Name and SampleTime[ms] of each channel")

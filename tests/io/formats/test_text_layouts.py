@@ -76,6 +76,14 @@ def test_labview(tmp_path, decimal, own_x):
     np.testing.assert_allclose(log.channels[1].values, Y, atol=1e-12)
 
 
+def test_a_short_twincat_export_with_its_end(tmp_path):
+    """The mark of the end is no key of the header, also where it is among the first lines."""
+    lines = twincat("\t", ".").splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([*lines[:214], "EOF", ""]))
+    log = read_log(tmp_path / "log.csv")
+    np.testing.assert_allclose(log.channels[0].values, X[:200], atol=1e-12)
+
+
 def lvm(own_x: str, rows: list[str], delta: str = "0.001") -> str:
     """Write a measurement of two channels with the units g and m/s²."""
     cells = lambda *words: ("\t\t" if own_x == "Multi" else "\t").join(words)  # noqa: E731
