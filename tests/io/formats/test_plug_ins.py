@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 from dataclasses import replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
@@ -195,3 +196,15 @@ def test_a_folder_of_compressed_text_is_read(tmp_path):
         write(tmp_path / f"{k}{suffix}.gz", signals(), META)
     logs = find_logs(tmp_path).logs
     assert len(logs) == 6 and {read_log(path).sample_rate for path in logs} == {2000.0}
+
+
+def test_the_example_of_the_page_conforms(tmp_path, root):
+    """The plug-in of the README passes its own test, and fails it with another byte order."""
+    page = (root / "lmshealth" / "io" / "README.md").read_text(encoding="utf-8")
+    reader, test = re.findall(r"^```python\n(.*?)^```$", page, re.S | re.M)
+    names = {}
+    exec(reader + test, names)
+    names["test_format"](tmp_path)
+    exec(reader.replace("<f4", ">f4") + test, names)
+    with pytest.raises(AssertionError, match="differs"):
+        names["test_format"](tmp_path)

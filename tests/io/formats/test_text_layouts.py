@@ -79,7 +79,7 @@ def test_labview(tmp_path, decimal, own_x):
 def test_a_short_twincat_export_with_its_end(tmp_path):
     """The mark of the end is no key of the header, also where it is among the first lines."""
     lines = twincat("\t", ".").splitlines()
-    (tmp_path / "log.csv").write_text("\n".join([*lines[:214], "EOF", ""]))
+    (tmp_path / "log.csv").write_text("\n".join([*lines[:213], "EOF", ""]))
     log = read_log(tmp_path / "log.csv")
     np.testing.assert_allclose(log.channels[0].values, X[:200], atol=1e-12)
 
