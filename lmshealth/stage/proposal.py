@@ -5,6 +5,7 @@ Names and units decide first, the samples where neither does. Every guess has it
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -86,25 +87,25 @@ def propose(
 def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], list[Guess]]:
     """Read all columns as they are; those that hold no such series of numbers are left out."""
     content = load(path, ColumnMap(), max_memory)
-    left_out: set[str] = set()
+    left_out: list[str] = []
     read: dict[str, _Column] = {}
     for _ in range(_DEPTH):
         pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
         units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
-        for name in (name for name in units if name not in left_out | set(read)):
+        for name in (name for name in units if name not in [*left_out, *read]):
             key = "time_s" if _TIME.search(name) else "acc_probed"
             try:
                 found = load(path, ColumnMap(columns={key: name}), max_memory)
+                # A struct is opened by its name.
+                there = max(content.present, found.present, key=len)
+                content = replace(
+                    content, metadata=content.metadata | found.metadata, present=there
+                )
                 samples = found.columns[name]
                 values = np.asarray(samples[:_JUDGED], dtype=np.float64)
                 read[name] = _Column(name, units[name], values, samples.size)
-                content = found if found.metadata else content
-            except Unusable:
-                left_out.add(name)
-            except KeyError:
-                # A struct is opened by its name.
-                left_out.add(name)
-                content = found if len(found.present) > len(content.present) else content
+            except (Unusable, KeyError):
+                left_out.append(name)
     sizes = [one.size for one in read.values() if one.size > 1]
     size = max(sizes, key=lambda n: (sizes.count(n), n), default=0)
     others = [*left_out, *(one.name for one in read.values() if one.size != size)]

@@ -69,7 +69,10 @@ def test_the_remaining_quantities(tmp_path: Path) -> None:
 
 def test_structs_of_matlab_are_opened(tmp_path: Path) -> None:
     """Fields of structs are found by their names, and scalars are left out."""
-    scipy.io.savemat(tmp_path / "a.mat", {"e": {"t": TIME, "Acc": NOISE[0], "fs": 500.0}})
+    scipy.io.savemat(
+        tmp_path / "a.mat",
+        {"e": {"t": TIME, "Acc": NOISE[0], "fs": 500.0}, "stage": "A-1", "x": 1.0},
+    )
     text, guesses = propose(tmp_path / "a.mat")
     assert {g.source: g.target for g in guesses if g.target} == {
         "e.t": "time_s", "e.Acc": "acc_e_acc",
