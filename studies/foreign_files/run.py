@@ -1,21 +1,21 @@
 """Are files of other programs read right, or refused with what to set?
 
 Method
-    Each of 15 formats, frequency responses of SINUMERIK and SEP005 dictionaries are written by two
-    or three independent writers (`writers.py`: the layout by hand; and the library of the format,
-    or another way to write the layout), and read; every sample and the rate are compared in SI
-    units. Then files whose content has two readings or is no log: each must be refused with what
-    is there and what to set. Then 2,000 files of text in a dialect that is drawn (`dialects.py`:
-    delimiter, decimal mark, encoding, names and units, lines before them, blanks, groups of other
-    rates, numbers, times, line ends). What no reader can decide is not drawn: numbers with the
-    delimiter in them are quoted, and nothing between blanks is written as nan. A file is right
-    where the rate and all samples of both signals are, lost samples included; refused; or wrong. Control:
-    a reader that takes commas for marks between thousands, on files with decimal commas: the same
-    comparison must find its values wrong.
+    Each of 15 formats, frequency responses of SINUMERIK and SEP005 dictionaries are written by
+    two or three independent writers (`writers.py`: the layout by hand; and the library of the
+    format, or another way to write the layout), and read; every sample and the rate are
+    compared in SI units. Then files whose content has two readings or is no log: each must be
+    refused with what is there and what to set. Then 2,000 files of text in a dialect that is
+    drawn (`dialects.py`: delimiter, decimal mark, encoding, names and units, lines before them,
+    blanks, groups of other rates, numbers, times, line ends). What no reader can decide is not
+    drawn: numbers with the delimiter in them are quoted, and nothing between blanks is written
+    as nan. A file is right where the rate and all samples of both signals are, lost samples
+    included; refused; or wrong. Control: a reader that takes commas for marks between
+    thousands, on files with decimal commas: the same comparison must find its values wrong.
 Answer
-    456 files of 17 formats are read right. Of 2,000 dialects none is read with other values, 1,771
-    are read, 47 have marks between thousands and 182 are refused otherwise: units behind names
-    between blanks, moments between colons.
+    456 files of 17 formats are read right. Of 2,000 dialects none is read with other values,
+    1,771 are read, 47 have marks between thousands and 182 are refused otherwise: units behind
+    names between blanks, moments between colons.
 Run time
     Four minutes on one processor.
 """
