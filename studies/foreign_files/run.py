@@ -74,7 +74,7 @@ REFUSED: dict[str, tuple[str, str, tuple[str, ...]]] = {
 def main() -> None:
     """Run the study; ``--quick`` reads a part of the files and records nothing."""
     study = Study(__file__, __doc__)
-    n_each, n_fuzz = (2, 200) if study.quick else (N_EACH, N_FUZZ)
+    n_each, n_fuzz = (1, 100) if study.quick else (N_EACH, N_FUZZ)
     formats = {name: study.trials.once(judge_format, name, n_each) for name in (*WRITERS, *OTHERS)}
     refused = study.trials.once(judge_refusals)
     blocks = study.trials.collect(judge_dialects, [(k, BLOCK) for k in range(0, n_fuzz, BLOCK)])
