@@ -96,6 +96,7 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
         terminal.print_notes([f"{map_file}: column map, tried on {len(found)} logs"])
         _propose_manifest(sheet, {shown(path): path for path in logs}, found)
         _propose_stage(stage, first[0])
+        terminal.print_notes(_next_steps(first[0], map_file))
     _exit(ctx, found, lost)
 
 
@@ -127,6 +128,19 @@ def _propose_manifest(
     write_text(sheet, table.getvalue())
     why = "stage is the folder where the file names none; fill in what is empty, `run` needs it"
     terminal.print_notes([f"{sheet}: {why}"])
+
+
+def _next_steps(log: Log, map_file: Path) -> list[str]:
+    """Name the commands that read a log by its proposed map."""
+    by = {one.kind: one.name for one in reversed(log.channels)}
+    steps = [f"next: lmshealth modes {log.name} --columns {map_file}"]
+    if "current" in by:
+        output = by.get("acceleration", by.get("displacement"))
+        step = steps[0].replace(
+            "next: lmshealth modes", "or, where a current excites: lmshealth frf"
+        )
+        steps.append(f"{step} --input {by['current']} --output {output}")
+    return steps
 
 
 def _propose_stage(path: Path, log: Log) -> None:

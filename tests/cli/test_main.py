@@ -974,6 +974,7 @@ def test_init_proposes_what_modes_needs(tmp_path: Path) -> None:
     done = call("init", *logs, "--out", str(tmp_path))
     assert done.exit_code == 3 and "the column map needs Kanal 1" in done.stderr
     assert "its unit is g" in " ".join(done.stdout.split())
+    assert "next: lmshealth modes" in done.stderr
     header, row = (tmp_path / "manifest.csv").read_text().splitlines()
     assert header.startswith("file,stage") and row == f"a.txt,{tmp_path.name},,,"
     modes = call("modes", logs[0], "--columns", str(tmp_path / "map.toml"), "--format", "json")

@@ -131,7 +131,7 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     head = stream.read(_HEAD_BYTES)
     encoding = columns.csv.encoding or encoding_of(head)
     stream.seek(0)
-    if head.startswith(_LABVIEW):
+    if head.startswith(_LABVIEW) and _may_have_segments(stream, head):
         with _one_segment(stream, stored) as whole:
             return _parsed(Text(whole, stored), encoding, columns)
     if encoding.startswith(("utf-16", "utf-32")):
@@ -158,6 +158,20 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
     return Content(samples, metadata, names, chosen.refused, guessed)
 
 
+def _may_have_segments(stream: IO[bytes], head: bytes) -> bool:
+    """Return whether there are further headers, or more lines than samples; rewind the stream."""
+    n_head = head.count(b"\n", 0, head.find(b"\nX_Value") + 2)
+    samples = re.search(rb"^Samples([\t\d]*)", head, re.MULTILINE)
+    most = max(map(int, samples[1].split()), default=0) if samples else 0
+    n_lines = n_heads = 0
+    for block in iter(partial(stream.read, 1 << 20), b""):
+        n_lines += block.count(b"\n")
+        # A header that two blocks share has more lines than samples too.
+        n_heads += block.count(b"***End_of_Header***")
+    stream.seek(0)
+    return n_heads > 2 or n_lines > n_head + most + 1
+
+
 def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
     """Copy a LabVIEW measurement without the headers of its later segments.
 
@@ -176,7 +190,7 @@ def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
                 kept[key] = rest
                 if begun := key == b"X_Value":
                     counts = [int(word) for word in kept.get(b"Samples", b"").split()]
-                    left = -1 if timed else max(counts, default=0)
+                    left = -1 if timed else max(counts, default=-1)
             elif not line.strip() or further:
                 fixed = further and key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
                 if fixed and (kept.get(key) != rest or not timed):
