@@ -149,10 +149,11 @@ def _propose_stage(path: Path, log: Log) -> None:
     try:
         with terminal.progress_bars(_PATIENCE) as report:
             modes = read_ambient(log, channels=used, progress=report).modes
-        path.unlink(missing_ok=True)
+        if modes.frequency.size:
+            path.unlink(missing_ok=True)
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
     except (BadLog, BadStage) as why:
-        terminal.print_notes([f"{path} is not written: {why}"])
+        terminal.print_notes([f"{path.name}: {why}"])
 
 
 @options.command(
