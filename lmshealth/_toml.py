@@ -1,5 +1,6 @@
-"""Decode TOML into structs; every error names the key."""
+"""Decode TOML into structs, of which every error names the key; write strings of TOML."""
 
+import json
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -55,6 +56,11 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
         if message.removesuffix(": missing") in lacking:
             message = f"{', '.join(lacking)}: missing"
         raise ValueError(_short(message, _LONGEST_MESSAGE)) from error
+
+
+def quoted(text: str) -> str:
+    """Return a basic string of TOML."""
+    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
 def _short(text: str, most: int) -> str:

@@ -29,6 +29,7 @@ import lmshealth
 def assessed(folder: Path) -> str:
     stage = lmshealth.load_stage("lms-y")
     readings = []
+    copied = [lmshealth.read_sep005(lmshealth.read_log(path).to_sep005()) for path in [folder]]
     for path in folder.glob("*.h5"):
         try:
             log = lmshealth.read_log(path)
@@ -52,7 +53,10 @@ def assessed(folder: Path) -> str:
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
     reveal_type(  # noqa: F821
-        (refused, both, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
+        (
+            *(refused, copied, both, laws, day),
+            *(assessment.judgement.verdict, plan.duration_of_one, result),
+        )
     )
     return told
 """

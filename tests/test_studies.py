@@ -51,6 +51,13 @@ def recorded(root: Path, name: str) -> dict[str, Any]:
     return found
 
 
+def test_foreign_files(root: Path) -> None:
+    """Foreign files are read right or refused, and the comparison finds a reader that errs."""
+    answer = json.loads(run_study(root, "foreign_files"))
+    assert all(answer["passed"].values())
+    assert answer["control"]["wrong"] == answer["control"]["files"] > 0
+
+
 def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     """Real records give what is known of them; what is not met is known to be."""
     needs("data")

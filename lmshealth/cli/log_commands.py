@@ -1,5 +1,7 @@
-"""Commands that analyse single logs: modes, error, spectrum, frf."""
+"""Commands that read single logs: init, modes, error, spectrum, frf."""
 
+import csv
+import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -9,12 +11,16 @@ from typing import Any, TypeVar
 
 import click
 
+from lmshealth._files import write_text
+from lmshealth._toml import decode
 from lmshealth.cli import options, terminal, views
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadStage
+from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import format_name
-from lmshealth.io.log import Log, Refusal
+from lmshealth.io.log import Log, Metadata, Refusal
 from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import shown
 from lmshealth.modal.acceleration_survey import survey
 from lmshealth.modal.free_decay.identification import identify_decays
 from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
@@ -27,6 +33,7 @@ from lmshealth.report.tables import Row
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
+from lmshealth.stage.proposal import propose
 from lmshealth.stage.skeleton import searches, write_skeleton
 from lmshealth.tracking.history import LogEstimates
 
@@ -36,6 +43,7 @@ _NO_BAND = (
     "Without a band or a description close modes may be merged or missed; select them with --band "
     "LOW HIGH. The mode names are valid for this call only."
 )
+_TRIED = 2  # channels in which `init` looks for modes
 _FORMAT = options.format_option("table", "csv", "json")
 _PLOT = click.option(
     "--plot",
@@ -43,6 +51,108 @@ _PLOT = click.option(
     metavar="FILE",
     help="Draw what was measured in one log, with modes, lines and refusals: svg, png or html.",
 )
+
+
+@options.command("init logs/*.csv", "init export.txt --sample-rate 5000 --out machine-7")
+@options.LOGS
+@click.option(
+    "--out", type=options.FOLDER, default=Path(), metavar="FOLDER", help="Where to write the files."
+)
+@click.option(
+    "--sample-rate",
+    "rate",
+    type=options.Finite(0, min_open=True),
+    metavar="HZ",
+    help="Sample rate of logs that state neither times nor a rate.",
+)
+@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@options.MOST_MEMORY
+@click.pass_context
+def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any) -> None:
+    """Propose map.toml, manifest.csv and my-stage.toml from logs.
+
+    The column map is proposed from the first log, with the reason of each guess, and tried on all.
+    The description has the modes of the first log that is read. Check and edit all three.
+    """
+    logs = tuple(path for path in logs if path.name not in NOT_LOGS) or logs
+    map_file, sheet, stage = out / "map.toml", out / MANIFEST, out / "my-stage.toml"
+    there = [str(path) for path in (map_file, sheet, stage) if path.exists()]
+    if there and not given["overwrite"]:
+        raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
+    text, guesses = propose(logs[0], rate=given["rate"], max_memory=given["max_memory"])
+    rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
+    terminal.print_table(f"Columns of {logs[0]}", rows, 3)
+    ctx.params |= {"logs": logs, "columns": decode(text.encode(), ColumnMap)}
+    first: list[Log] = []
+
+    def tried(log: Log) -> tuple[str, Metadata]:
+        first[:] = first or [log]
+        return log.name, log.metadata
+
+    found, lost = _each(ctx, tried)
+    if found:
+        write_text(map_file, text)
+        terminal.print_notes([f"{map_file}: column map, tried on {len(found)} logs"])
+        _propose_manifest(sheet, {shown(path): path for path in logs}, found)
+        _propose_stage(stage, first[0])
+        terminal.print_notes(_next_steps(first[0], map_file))
+    _exit(ctx, found, lost)
+
+
+def _propose_manifest(
+    sheet: Path, paths: dict[str, Path], found: list[tuple[str, Metadata]]
+) -> None:
+    """Write a manifest with what the files state; a manifest names no file out of its folder."""
+    folder = sheet.absolute().parent
+    table = io.StringIO()
+    writer = csv.writer(table, lineterminator="\n")
+    writer.writerow(["file", "stage", "recorded_at", "travel_km", "temperature_c"])
+    for name, metadata in found:
+        path = paths[name].absolute()
+        if not path.is_relative_to(folder):
+            why = f"not written, {name} is not in its folder: choose --out with the logs in it"
+            terminal.print_notes([f"{sheet}: {why}"])
+            return
+        moment = metadata.recorded_at.isoformat() if metadata.recorded_at else ""
+        stage = metadata.stage or path.parent.name
+        writer.writerow(
+            [
+                path.relative_to(folder).as_posix(),
+                stage,
+                moment,
+                None if metadata.travel is None else metadata.travel / 1e3,
+                "",
+            ]
+        )
+    write_text(sheet, table.getvalue())
+    why = "stage is the folder where the file names none; fill in what is empty, `run` needs it"
+    terminal.print_notes([f"{sheet}: {why}"])
+
+
+def _next_steps(log: Log, map_file: Path) -> list[str]:
+    """Name the commands that read a log by its proposed map."""
+    by = {one.kind: one.name for one in reversed(log.channels)}
+    steps = [f"next: lmshealth modes {log.name} --columns {map_file}"]
+    if "current" in by:
+        output = by.get("acceleration", by.get("displacement"))
+        step = steps[0].replace(
+            "next: lmshealth modes", "or, where a current excites: lmshealth frf"
+        )
+        steps.append(f"{step} --input {by['current']} --output {output}")
+    return steps
+
+
+def _propose_stage(path: Path, log: Log) -> None:
+    """Write a description of the modes of a log, where it has some; few channels are quick."""
+    used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
+    try:
+        with terminal.progress_bars(terminal.PATIENCE) as report:
+            modes = read_ambient(log, channels=used, progress=report).modes
+        if modes.frequency.size:
+            path.unlink(missing_ok=True)
+        _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
+    except (BadLog, BadStage) as why:
+        terminal.print_notes([f"{path.name}: {why}"])
 
 
 @options.command(

@@ -19,6 +19,7 @@ _COMMANDS = {
     "error": ("log_commands", "Analyse the following error."),
     "frf": ("log_commands", "Measure a frequency response and identify its modes."),
     "infer": ("machine_commands", "Infer the health parameters from a track."),
+    "init": ("log_commands", "Propose column map, manifest and description from logs."),
     "modes": ("log_commands", "Identify the modes of single logs."),
     "plan": ("stage_commands", "Plan the logs that are needed to detect a loss."),
     "prognose": ("machine_commands", "Predict the remaining life and the service date."),

@@ -128,7 +128,7 @@ store_option = partial(
 _COLUMNS = click.option(
     "--columns", type=click.Path(), callback=_column_map, help="Column map of the export."
 )
-_MAX_MEMORY = click.option(
+MOST_MEMORY = click.option(
     "--max-memory",
     type=Finite(0, min_open=True),
     default=MAX_MEMORY / 1e9,
@@ -189,7 +189,7 @@ PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stag
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Add the options by which logs are read: --columns and --max-memory (bytes)."""
-    return _COLUMNS(_MAX_MEMORY(command))
+    return _COLUMNS(MOST_MEMORY(command))
 
 
 def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:

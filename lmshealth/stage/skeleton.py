@@ -1,13 +1,13 @@
 """Skeleton of a stage description, from modes that were identified without one."""
 
 import glob
-import json
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
+from lmshealth._toml import quoted
 from lmshealth.errors import BadStage
 from lmshealth.stage.description import ModeSpec
 
@@ -40,11 +40,6 @@ def write_skeleton(
     template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
     machines = glob.escape(stage) if stage else "*"
     given = {"name": path.stem, "source": source, "stage": machines, "modes": modes}
-    text = template.render(given, quoted=_quoted)
+    text = template.render(given, quoted=quoted)
     with path.open("x", encoding="utf-8") as file:
         file.write(text)
-
-
-def _quoted(text: str) -> str:
-    """Return a basic string of TOML."""
-    return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -997,3 +997,42 @@ def test_an_interrupt_has_its_status(
     result = call(command, *words)
     assert result.exit_code == 130
     assert ("run again to continue" in result.stderr) is kept
+
+
+# Proposals
+
+
+def test_init_proposes_what_modes_needs(tmp_path: Path) -> None:
+    """The three files are written, used as they are, and not overwritten unless it is asked for."""
+    rows = "\n".join(f"{k / 500:.3f};{v:.6f}".replace(".", ",") for k, v in enumerate(_noise()))
+    (tmp_path / "a.txt").write_text("Zeit [s];Kanal 1 [g]\n" + rows + "\n")
+    (tmp_path / "b.txt").write_text("Zeit [s];Anderer\n" + rows + "\n")
+    logs = [str(tmp_path / name) for name in ("a.txt", "b.txt")]
+    done = call("init", *logs, "--out", str(tmp_path))
+    assert done.exit_code == 3 and "the column map needs Kanal 1" in done.stderr
+    assert "its unit is g" in " ".join(done.stdout.split())
+    assert "next: lmshealth modes" in done.stderr
+    header, row = (tmp_path / "manifest.csv").read_text().splitlines()
+    assert header.startswith("file,stage") and row == f"a.txt,{tmp_path.name},,,"
+    modes = call("modes", logs[0], "--columns", str(tmp_path / "map.toml"), "--format", "json")
+    assert modes.exit_code == 0
+    found = json.loads(modes.stdout)["modes"]
+    assert any(abs(one["frequency_hz"] - 62) < 1 for one in found)
+    assert call("stage", str(tmp_path / "my-stage.toml")).exit_code == 0
+    again = call("init", logs[0], "--out", str(tmp_path))
+    assert again.exit_code == 2 and "map.toml" in again.stderr and "--overwrite" in again.stderr
+    (tmp_path / "map.toml").write_text("kept = 1")
+    (tmp_path / "c.txt").write_text("a;b\n1;2\n2;3\n")
+    failed = call("init", str(tmp_path / "c.txt"), "--out", str(tmp_path), "--overwrite")
+    assert failed.exit_code == 1 and (tmp_path / "map.toml").read_text() == "kept = 1"
+    assert call("init", logs[0], "--out", str(tmp_path), "--overwrite").exit_code == 0
+
+
+def test_init_names_no_log_out_of_the_folder(tmp_path: Path) -> None:
+    """A manifest of logs that lie elsewhere is not written, with the reason."""
+    rows = "\n".join(f"{v:.6f}" for v in _noise())
+    (tmp_path / "a.txt").write_text("acc\n" + rows + "\n")
+    out = tmp_path / "out"
+    done = call("init", str(tmp_path / "a.txt"), "--out", str(out), "--sample-rate", "500")
+    assert done.exit_code == 0 and "not in its folder" in done.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["map.toml", "my-stage.toml"]

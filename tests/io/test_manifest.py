@@ -16,12 +16,13 @@ def test_find_logs(tmp_path):
     (tmp_path / "sub").mkdir()
     (tmp_path / ".git").mkdir()
     names = ["b.csv", "a.H5", "sub/c.csv.gz", "sub/manifest.csv", "maintenance.csv", "truth.csv"]
-    for name in [*names, "notes.txt", "notes.txt.gz", "sub/x.dat", ".git/d.csv", "._b.csv"]:
+    for name in [*names, "notes.txt", "d.txt.gz", "sub/x.dat", ".git/d.csv", "._b.csv"]:
         (tmp_path / name).write_bytes(b"")
     found = find_logs(tmp_path)
     logs, refused = found
     assert (logs, refused) == (found.logs, found.refused)
-    assert [str(p.relative_to(tmp_path)) for p in found.logs] == ["a.H5", "b.csv", "sub/c.csv.gz"]
+    names = [str(p.relative_to(tmp_path)) for p in found.logs]
+    assert names == ["a.H5", "b.csv", "d.txt.gz", "sub/c.csv.gz"]
     assert found.refused == ()
 
 

@@ -30,6 +30,7 @@ from lmshealth.io.refusal import Unusable, corrupt
 _WARNINGS = threading.Lock()
 _GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
+_LABVIEW = b"LabVIEW Measurement"
 # First bytes and lines from which the dialect is found.
 _HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
@@ -127,8 +128,12 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
 
     What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
     """
-    encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
+    head = stream.read(_HEAD_BYTES)
+    encoding = columns.csv.encoding or encoding_of(head)
     stream.seek(0)
+    if head.startswith(_LABVIEW) and _may_have_segments(stream, head):
+        with _one_segment(stream, stored) as whole:
+            return _parsed(Text(whole, stored), encoding, columns)
     if encoding.startswith(("utf-16", "utf-32")):
         with _recoded(stream, stored, encoding) as recoded:
             return _parsed(Text(recoded, 4 * stored), encoding, columns)
@@ -151,6 +156,60 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
         samples = _numbers(text, chosen.columns, dialect, times)
         samples |= {name: _since_first(samples[name]) for name in times}
     return Content(samples, metadata, names, chosen.refused, guessed)
+
+
+def _may_have_segments(stream: IO[bytes], head: bytes) -> bool:
+    """Return whether there are further headers, or more lines than samples; rewind the stream."""
+    n_head = head.count(b"\n", 0, head.find(b"\nX_Value") + 2)
+    samples = re.search(rb"^Samples([\t\d]*)", head, re.MULTILINE)
+    most = max(map(int, samples[1].split()), default=0) if samples else 0
+    n_lines = n_heads = 0
+    for block in iter(partial(stream.read, 1 << 20), b""):
+        n_lines += block.count(b"\n")
+        # A header that two blocks share has more lines than samples too.
+        n_heads += block.count(b"***End_of_Header***")
+    stream.seek(0)
+    return n_heads > 2 or n_lines > n_head + most + 1
+
+
+def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
+    """Copy a LabVIEW measurement without the headers of its later segments.
+
+    `Unusable` (``format``) for segments without X values, which place them in time, with or without
+    headers of their own, and for segments of other channels.
+    """
+    file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+    kept: dict[bytes, bytes] = {}
+    begun, size, left = False, 0, -1
+    try:
+        for number, line in enumerate(iter(partial(stream.readline, constants.LONGEST_LINE), b"")):
+            key, _, rest = line.rstrip().partition(b"\t")
+            further = begun and (key[:1].isalpha() or key.startswith(b"*"))
+            timed = kept.get(b"X_Columns") == b"One"
+            if not begun:
+                kept[key] = rest
+                if begun := key == b"X_Value":
+                    counts = [int(word) for word in kept.get(b"Samples", b"").split()]
+                    left = -1 if timed else max(counts, default=-1)
+            elif not line.strip() or further:
+                fixed = further and key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
+                if fixed and (kept.get(key) != rest or not timed):
+                    raise _segment(number, f"{key.decode('cp1252')} {rest.decode('cp1252')}")
+                continue
+            elif (left := left - 1) == -1:
+                raise _segment(number, "more rows than Samples states")
+            size += file.write(line)
+            check_size(size, stored)
+    except BaseException:
+        file.close()
+        raise
+    file.seek(0)
+    return file
+
+
+def _segment(number: int, found: str) -> Unusable:
+    needed = "needed X_Columns One, and the same channels in all segments"
+    return Unusable("format", f"line {number + 1}: a further segment, {found}; {needed}")
 
 
 def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:
@@ -313,4 +372,5 @@ def _is_text(head: bytes) -> bool:
 
 
 CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)
-CSV_GZ = Format("gzipped CSV", (".csv.gz",), lambda head: head.startswith(_GZIP_MAGIC), _load)
+_GZIPPED = (".csv.gz", ".txt.gz", ".tsv.gz", ".dat.gz", ".asc.gz", ".lvm.gz")
+CSV_GZ = Format("gzipped CSV", _GZIPPED, lambda head: head.startswith(_GZIP_MAGIC), _load)

@@ -76,7 +76,7 @@ def encoding_of(head: bytes) -> str:
         return marked
     # Without a mark: Latin letters in two bytes each, of which one is zero.
     for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if len(head) > 3 and head[first::2].count(0) > 0.9 * len(head[first::2]):
+        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
             return name
     try:
         codecs.getincrementaldecoder("utf-8-sig")().decode(head)
@@ -106,7 +106,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
         delimiter, decimal = layout.delimiter or ",", layout.decimal or "."
         n_fields = len(fields_of(lines[begin], delimiter))
         found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
-    stated = layout.header is False or isinstance(layout.header, list)
+    numbered = columns.columns and all(map(str.isdecimal, columns.columns.values()))
+    stated = numbered or layout.header is False or isinstance(layout.header, list)
     heads = [] if stated else list(_heads(lines[: found.first], skip, found))
     if layout.delimiter is None and layout.decimal is None:
         title = next((line.strip() for line in reversed(lines[skip : found.first])), "")
@@ -127,7 +128,8 @@ def fields_of(line: str, delimiter: str) -> list[str]:
     if delimiter == " ":
         return line.split()
     try:
-        return next(csv.reader([line.rstrip("\r\n")], delimiter=delimiter), [])
+        text = [line.rstrip("\r\n")]
+        return next(csv.reader(text, delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error as error:
         raise corrupt(f"a line cannot be split: {error}") from error
 
@@ -154,7 +156,9 @@ def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[
             if k >= skip and line.strip() and not line.startswith("#")
         ]
         for decimal in layout.decimal or ".,":
-            if delimiter != decimal and (first := _first_row(split, _NUMBER[decimal])) is not None:
+            # Numbers with the delimiter in them are quoted.
+            fits = delimiter != decimal or any('"' in line for line in lines)
+            if fits and (first := _first_row(split, _NUMBER[decimal])) is not None:
                 k, fields = split[first]
                 judged = [_share(own, _NUMBER[decimal]) for _, own in split[first:][:_JUDGED]]
                 share = round(sum(judged) / len(judged), 2)
@@ -236,12 +240,13 @@ def _names(
     # Names differ; a line of the names that the column map has needs no other sign.
     mapped = set(columns.columns.values())
     own = [one for one in heads if mapped and mapped <= set(one[1])]
+    stated = bool(own)
     own += [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
     where, names = (own or heads)[0]
     if n and len(names) < n:
         raise corrupt(f"row 1 has {n} fields, the line of names {len(names)}")
     k = heads.index((where, names))
-    if not mapped and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
+    if not stated and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
         k, (where, names) = k + 1, heads[k + 1]
     units = heads[k - 1][1] if k else [""]
     if len(units) != len(names) or not all(map(_is_unit, units)):

@@ -1,8 +1,17 @@
-"""The registry of file formats: a new one is a module with a `Format`, and its name here."""
+"""The registry of file formats: those of the project, and those of plug-ins.
 
+A plug-in is a `Format` under the entry-point group ``lmshealth.formats`` of an installed package.
+"""
+
+import logging
+from functools import cache
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 
+import numpy as np
+
 from lmshealth.io import constants
+from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, load_by
 from lmshealth.io.formats.csv import CSV, CSV_GZ
@@ -19,23 +28,55 @@ from lmshealth.io.refusal import Unusable, corrupt, listed
 FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, RTX, TRACE, UFF, CSV)
 SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 # Exporters use them for delimited text, and people for notes: such files are read where they are
-# named, and not collected from folders.
+# named, and not collected from folders, unless they are compressed.
 TEXT_SUFFIXES = (".txt", ".tsv", ".dat", ".asc")
+GROUP = "lmshealth.formats"
 
 _HEAD = 4096
+_log = logging.getLogger(__name__)
+
+
+@cache
+def plug_ins() -> tuple[Format, ...]:
+    """Load the formats of plug-ins; one that cannot be used is logged as an error, once."""
+    formats: list[Format] = []
+    for point in entry_points(group=GROUP):
+        try:
+            formats.append(_loaded(point, [*FORMATS, *formats]))
+        except Exception as error:
+            # A broken plug-in must not keep the files of other formats from being read.
+            source = point.dist.name if point.dist else "an unknown distribution"
+            what = f"{type(error).__name__}: {error}"
+            _log.error("format %r of %s is not used: %s; update or uninstall it",
+                       point.name, source, what)  # fmt: skip
+    return tuple(formats)
+
+
+def _loaded(point: EntryPoint, others: list[Format]) -> Format:
+    form = point.load()
+    if not isinstance(form, Format):
+        raise TypeError(f"it is a {type(form).__name__}, needed a Format")
+    taken = {suffix for other in others for suffix in other.suffixes} | set(TEXT_SUFFIXES)
+    if not form.suffixes or any(suffix.endswith(tuple(taken)) for suffix in form.suffixes):
+        raise ValueError(
+            f"its suffixes are {listed(form.suffixes)}, needed some that are not taken"
+        )
+    return form
 
 
 def is_log(path: Path) -> bool:
     """Return whether a file of a folder has the suffix of a log."""
-    return path.name.lower().endswith(SUFFIXES)
+    name = path.name.lower()
+    return name.endswith(SUFFIXES) or any(name.endswith(form.suffixes) for form in plug_ins())
 
 
 def format_of(path: Path) -> Format | None:
     """Return the format of a file's suffix; None for an unregistered one."""
     name = path.name.lower()
-    if name.removesuffix(".gz").endswith(TEXT_SUFFIXES):
-        return CSV_GZ if name.endswith(".gz") else CSV
-    return next((form for form in FORMATS if name.endswith(form.suffixes)), None)
+    if name.endswith(TEXT_SUFFIXES):
+        return CSV
+    own = next((form for form in FORMATS if name.endswith(form.suffixes)), None)
+    return own or next((form for form in plug_ins() if name.endswith(form.suffixes)), None)
 
 
 def format_name(path: Path) -> str:
@@ -52,22 +93,48 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
     """
     form = confirm(path)
     if form.library:
-        return read_isolated(form, path, columns, max_memory)
-    return load_by(form.name, form.load, path, columns, max_memory)
+        content = read_isolated(form, path, columns, max_memory)
+    else:
+        content = load_by(form.name, form.load, path, columns, max_memory)
+    if form not in FORMATS and (fault := fault_of(content)):
+        raise Unusable("format", f"the plug-in for {form.name} returns {fault}; update it")
+    return content
+
+
+def fault_of(content: object) -> str:
+    """Return what of a content breaks the protocol of formats; empty where nothing does."""
+    if not isinstance(content, Content):
+        return f"a {type(content).__name__} in place of a Content"
+    for name, samples in content.columns.items():
+        array = (
+            isinstance(samples, np.ndarray) and samples.ndim == 1 and samples.dtype.kind in "fiu"
+        )
+        if not isinstance(name, str) or not (array or isinstance(samples, Stored)):
+            return f"column {name!r} that is no array of numbers of one dimension"
+    pairs = [*content.metadata.items()]
+    if wrong := next((key for key, text in pairs if not isinstance(text, str)), None):
+        return f"metadata {wrong!r} that are no text"
+    return ""
 
 
 def confirm(path: Path) -> Format:
     """Return the format of a file's suffix, which its first bytes must confirm."""
     form = format_of(path)
     if form is None:
-        known = (*SUFFIXES, *TEXT_SUFFIXES)
-        raise Unusable("format", f"unknown suffix; needed one of {listed(known)}")
+        known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
+        raise Unusable("format", f"unknown suffix; needed one of {', '.join(known)}")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if not head:
         raise Unusable("empty", "0 bytes; copy the file again")
-    if form.sniff(head):
-        return form
+    try:
+        if form.sniff(head):
+            return form
+    except Exception as error:
+        if form in FORMATS:
+            raise
+        detail = f"the plug-in for {form.name} fails ({type(error).__name__}: {error}); update it"
+        raise Unusable("format", detail) from error
     actual = next((other for other in FORMATS if other.sniff(head)), None)
     if actual is None:
         raise corrupt(f"does not start as {form.name} does")

@@ -10,7 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 from lmshealth.io.formats.dialect import Dialect, fields_of
 from lmshealth.io.formats.unit_channels import Described, rate_of
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io.refusal import corrupt
 
 _GCS_LINE = re.compile(r"#\s*([A-Z_]+\d*)\s*=\s*(.*\S)\s*")
 _FILETIME_EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
@@ -23,7 +23,8 @@ def twincat(lines: Sequence[str]) -> Dialect | None:
     start = next((k for k, line in enumerate(lines) if line.startswith("Starttime of export")), 0)
     if delimiter is None or not start:
         return None
-    keys = {key: fields_of(lines[k], delimiter) for key, k in at.items() if k > start}
+    below = {key: k for key, k in at.items() if k > start and key != "EOF"}
+    keys = {key: fields_of(lines[k], delimiter) for key, k in below.items()}
     interval = keys.get("SampleTime[ms]", [])
     if "Name" not in keys or len(interval) != len(keys["Name"]):
         raise corrupt("a TwinCAT Scope export without Name and SampleTime[ms] of each channel")
@@ -54,7 +55,7 @@ def twincat(lines: Sequence[str]) -> Dialect | None:
 
 
 def labview(lines: Sequence[str]) -> Dialect | None:
-    """LabVIEW measurement file (.lvm) with one header of a segment."""
+    """LabVIEW measurement file (.lvm); `csv` drops the headers of further segments."""
     if not lines or not lines[0].startswith("LabVIEW Measurement"):
         return None
     delimiter = "," if any(line.startswith("Separator,") for line in lines) else "\t"
@@ -65,16 +66,17 @@ def labview(lines: Sequence[str]) -> Dialect | None:
         raise corrupt("a LabVIEW measurement without a line X_Value that names the columns")
     decimal = (keys.get("Decimal_Separator") or ["."])[0]
     names = [name for name in rows[where] if name]
-    units, deltas = keys.get("Y_Unit_Label", []), keys.get("Delta_X", [])
-    rate = rate_of(_number((deltas or [""])[0]))
+    units, deltas, starts = (
+        [*keys.get(key, []), *[""] * len(names)] for key in ("Y_Unit_Label", "Delta_X", "X0")
+    )
     own_x = (keys.get("X_Columns") or ["One"])[0]
-    if own_x == "Multi":
-        raise Unusable("format", "X_Columns is Multi; export one column of X values, or none")
     channels = [Described("time", "s") if own_x == "One" else Described("X_Value", "")]
-    channels += [
-        Described(name, units[k] if k < len(units) else "", rate)
-        for k, name in enumerate(names[1:])
-    ]
+    for k, name in enumerate(names[1:]):
+        # Of several columns of X values each stands before its channel.
+        rate, start = rate_of(_number(deltas[k])), _number(starts[k]) or 0.0
+        if own_x == "Multi" and channels[-1].name == "X_Value":
+            channels[-1] = Described("time", "s", rate, start=start)
+        channels.append(Described(name, units[k], rate, start=start))
     return Dialect(delimiter, decimal, tuple(channels), where + 1)
 
 

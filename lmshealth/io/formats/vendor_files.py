@@ -1,18 +1,22 @@
-"""Files of measuring systems and controls: Renishaw laser (.rtx), SINUMERIK trace (.xml).
+"""Files of measuring systems and controls: Renishaw laser (.rtx), SINUMERIK trace and FRF (.xml).
 
-Neither states units: a column map names the channels. The layouts were taken from public readers.
+None states units: a column map names the channels. The layouts were taken from public readers, the
+convention of the cross spectrum from a public sample with its time series.
 """
 
+import re
 from collections.abc import Iterator
 from itertools import islice
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError, iterparse
+from xml.etree.ElementTree import Element, ParseError, iterparse, parse
 
 import numpy as np
 
+from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size
+from lmshealth.io.formats.uff import Function
 from lmshealth.io.formats.unit_channels import Described, choose
 from lmshealth.io.refusal import Unusable, corrupt
 
@@ -21,6 +25,9 @@ _RTX_HEADER = 1 << 16
 _ROWS = 1 << 14  # per block
 # A control writes its largest counts where a signal has no value.
 _NO_VALUE = 9.2e18
+# Digits of base 85 that the control writes, and its name of spectra of one signal.
+_DIGITS = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ!#$`()*+-/:;=?@[]^_{|}~"
+_AUTO = "m_autospectrumInfo"
 
 
 def _load_rtx(path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -56,7 +63,8 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         n_rows += len(rows)
         check_size(8 * n_rows * len(spools), path.stat().st_size)
     if not n_rows:
-        raise Unusable("columns", "the file has no records (rec) of a trace")
+        detail = "no records (rec) of a trace; measured responses are read by `lmshealth frf`"
+        raise Unusable("columns", detail)
     return Content({name: one.samples() for name, one in spools.items()}, {}, tuple(names))
 
 
@@ -78,6 +86,75 @@ def _name(element: Element) -> str:
     """Return the name of a signal: its description, else its path in the control."""
     described = element.attrib.get("description", "").removesuffix("(64 bit)").strip()
     return described or element.attrib.get("name", element.attrib.get("key", ""))
+
+
+def response_functions(path: Path) -> list[Function]:
+    """Read the responses of a servo tuning, or of a response test from its spectra (H1).
+
+    A trace has none. `Unusable` (``corrupt``) for numbers that are cut off or do not fit together.
+    """
+    try:
+        root = parse(path).getroot()
+        named = {what: [e for e in root.iter("FrequencyResponseFunction") if e.get("name") == what]
+                 for what in ("m_pPlant", "m_pMeasCoherence")}  # fmt: skip
+        plants, coherences = named.values()
+        functions = []
+        for k, plant in enumerate(plants):
+            name = "plant" if len(plants) == 1 else f"plant_{k + 1}"
+            functions.append(Function(name, "setpoint", *_spectrum(plant), False, ""))
+            if len(coherences) == len(plants):
+                functions.append(Function(name, "setpoint", *_spectrum(coherences[k]), True, ""))
+        nodes = {
+            _field(node, "m_iUniqueInstanceId"): node for node in root.iter("PlatformSignalNode")
+        }
+        for pair in root.iter("PrimaryFreqRespSigNodeData"):
+            used = [
+                nodes[_field(pair, f"m_i{w}SigNodeUniqueInstanceID")] for w in ("Input", "Output")
+            ]
+            ids = [_field(node, "m_uNodeId") for node in used]
+            crosses = (
+                e for e in used[1].iter("SigNodeCrossSpectrumInfo") if e.get("name") != _AUTO
+            )
+            cross = next(e for e in crosses if _field(e, "m_uSignodeId") == ids[0])
+            auto = [next(e for e in node.iter() if e.get("name") == _AUTO) for node in used]
+            frequency, values = _spectrum(cross)
+            powers = [_spectrum(e)[1].real for e in auto]
+            coherence = np.abs(values) ** 2 / (powers[0] * powers[1])
+            place = f"node_{ids[1]}", f"node_{ids[0]}", frequency
+            functions.append(Function(*place, values.conj() / powers[0], False, ""))
+            functions.append(Function(*place, coherence.astype(np.complex128), True, ""))
+        return functions
+    except (ParseError, ValueError, KeyError, StopIteration) as error:
+        raise corrupt(f"the responses cannot be read: {error!r}") from error
+
+
+def _field(element: Element, name: str) -> str:
+    """Return the text of a child by its name, empty where there is none."""
+    return next((child.text or "" for child in element if child.get("name") == name), "").strip()
+
+
+def _spectrum(element: Element) -> tuple[FloatArray, ComplexArray]:
+    """Read frequencies in Hz and complex values, ``(n_lines,)`` each."""
+    arrays = {
+        e.get("name"): _doubles(e.findtext("raw") or "") for e in element.iter("NumericArray")
+    }
+    frequency, values = arrays["m_FrequencyVector"], arrays["m_ValueVector"]
+    if values.size != 2 * frequency.size:
+        raise ValueError(f"{values.size} values at {frequency.size} frequencies")
+    return frequency, values.view(np.complex128)
+
+
+def _doubles(text: str) -> FloatArray:
+    """Decode float64 values of two words each: five digits of base 85, or a point for zero."""
+    text = "".join(text.split())
+    words = re.findall(r"\.|[^.]{5}", text)
+    if sum(map(len, words)) != len(text) or len(words) % 2:
+        raise ValueError("numbers are cut off")
+    numbers = [0 if word == "." else sum(85**k * _DIGITS.index(c) for k, c in enumerate(word[::-1]))
+               for word in words]  # fmt: skip
+    if max(numbers, default=0) >= 1 << 32:
+        raise ValueError("a word is no number of 32 bits")
+    return np.array(numbers, dtype=">u4").view(">f8").astype(np.float64)
 
 
 def _is_trace(head: bytes) -> bool:

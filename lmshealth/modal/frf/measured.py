@@ -1,4 +1,4 @@
-"""Frequency responses that an analyser has measured: UFF58 of function type 4, tables of lines.
+"""Frequency responses that others have measured: UFF58 of type 4, SINUMERIK, tables of lines.
 
 The README of the folder lists the columns of a table.
 """
@@ -17,6 +17,7 @@ from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.csv import CSV, CSV_GZ
 from lmshealth.io.formats.registry import confirm, format_name, load
 from lmshealth.io.formats.uff import UFF, Function, load_functions
+from lmshealth.io.formats.vendor_files import TRACE, response_functions
 from lmshealth.io.log import SI_UNITS, Metadata
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
@@ -25,7 +26,7 @@ from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import Ordinates
 from lmshealth.modal.frf.responses import Frf, average_noise
 
-FORMATS = (CSV.name, CSV_GZ.name, UFF.name)
+FORMATS = (CSV.name, CSV_GZ.name, UFF.name, TRACE.name)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
 _PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
@@ -76,6 +77,9 @@ def read_responses(
         if form == UFF.name:
             confirm(path)
             functions = load_functions(path, max_memory)
+        elif form == TRACE.name:
+            confirm(path)
+            functions = response_functions(path)
         else:
             own = _ResponseColumns(columns=given.columns, csv=given.csv)
             content = load(path, own, max_memory)

@@ -76,6 +76,68 @@ def test_labview(tmp_path, decimal, own_x):
     np.testing.assert_allclose(log.channels[1].values, Y, atol=1e-12)
 
 
+def test_a_short_twincat_export_with_its_end(tmp_path):
+    """The mark of the end is no key of the header, also where it is among the first lines."""
+    lines = twincat("\t", ".").splitlines()
+    (tmp_path / "log.csv").write_text("\n".join([*lines[:213], "EOF", ""]))
+    log = read_log(tmp_path / "log.csv")
+    np.testing.assert_allclose(log.channels[0].values, X[:200], atol=1e-12)
+
+
+def lvm(own_x: str, rows: list[str], delta: str = "0.001") -> str:
+    """Write a measurement of two channels with the units g and m/s²."""
+    cells = lambda *words: ("\t\t" if own_x == "Multi" else "\t").join(words)  # noqa: E731
+    names = cells("X_Value\tfeed", "X_Value\tpitch") if own_x == "Multi" else "X_Value\tfeed\tpitch"
+    names = names.replace("\t\t", "\t")
+    segment = [
+        "",
+        "Channels\t2",
+        f"Samples\t{cells('400', '400')}",
+        f"Y_Unit_Label\t{cells('g', 'm/s^2')}",
+        f"X0\t{cells('0', '0')}",
+        f"Delta_X\t{cells(delta, delta)}",
+        "***End_of_Header***",
+        f"{names}\tComment",
+    ]
+    return "\n".join([*segment, *rows, ""])  # fmt: skip
+
+
+LVM_HEAD = "LabVIEW Measurement\nSeparator\tTab\nX_Columns\t{}\n***End_of_Header***\n"
+
+
+def test_labview_with_several_columns_of_x(tmp_path):
+    """Each channel has the unit, the rate and the times that stand before it."""
+    rows = [f"{k / 1000}\t{X[k]:.6f}\t{k / 1000}\t{Y[k]:.6f}" for k in range(400)]
+    (tmp_path / "log.lvm").write_text(LVM_HEAD.format("Multi") + lvm("Multi", rows))
+    log = read_log(tmp_path / "log.lvm")
+    assert log.sample_rate == 1000 and [c.name for c in log.channels] == ["acc_feed", "acc_pitch"]
+    np.testing.assert_allclose(log.channels[0].values, 9.80665 * X, atol=1e-12)
+    np.testing.assert_allclose(log.channels[1].values, Y, atol=1e-12)
+
+
+def test_labview_of_several_segments(tmp_path):
+    """Segments with X values are one log, cut where time is missing; others are refused."""
+    rows = [f"{(k + 50 * (k >= 200)) / 1000}\t{X[k]:.6f}\t{Y[k]:.6f}" for k in range(400)]
+    parts = [lvm("One", rows[:200]), lvm("One", rows[200:])]
+    path = tmp_path / "log.lvm"
+    path.write_text(LVM_HEAD.format("One") + "".join(parts))
+    log = read_log(path)
+    assert log.sample_rate == 1000 and log.pieces == ((0, 200), (200, 400))
+    np.testing.assert_allclose(log.channels[1].values, Y, atol=1e-12)
+    path.write_text(LVM_HEAD.format("No") + lvm("No", ["\t1\t2"] * 3) + lvm("No", ["\t1\t2"]))
+    with pytest.raises(BadLog, match=r"line 17: a further segment.* needed X_Columns One"):
+        read_log(path)
+    path.write_text(LVM_HEAD.format("No") + lvm("No", ["\t1\t2"] * 401))
+    with pytest.raises(BadLog, match="line 413: a further segment, more rows than Samples"):
+        read_log(path)
+    path.write_text(LVM_HEAD.format("One") + parts[0] + parts[1].replace("pitch", "yaw"))
+    with pytest.raises(BadLog, match="same channels in all"):
+        read_log(path)
+    path.write_text(LVM_HEAD.format("One") + parts[0] + parts[0])
+    with pytest.raises(BadLog, match="time"):
+        read_log(path)
+
+
 def test_gcs_array(tmp_path):
     """A GCS array names its columns and its interval."""
     head = ["# REM PI GCS", "# VERSION = 1", "# TYPE = 1", "# SEPARATOR = 32", "# DIM = 2",

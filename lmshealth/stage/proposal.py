@@ -1,0 +1,212 @@
+"""Column map proposed from a log: which columns are times, following error, accelerations.
+
+Names and units decide first, the samples where neither does. Every guess has its reason.
+"""
+
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from lmshealth._arrays import FloatArray
+from lmshealth._toml import quoted
+from lmshealth.errors import BadLog
+from lmshealth.io import constants
+from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
+from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.registry import load
+from lmshealth.io.reading import content_digest
+from lmshealth.io.refusal import Unusable, listed, shown, visible
+
+# Words in the names of columns, in the languages of exporters.
+_TIME = re.compile(r"time|zeit|temps|tiempo|tempo|x_value|\bt\b|\.x\.data", re.IGNORECASE)
+_SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECASE)
+# By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
+_SIGNALS = {
+    "delta_e": ("follow|error|deviat|lag|delta|schlepp|regelabw|PE", "length", 1e-6, "m"),
+    "acc": ("acc|beschl|vibr", "acceleration", 1.0, "m/s²"),
+    "current": ("current|strom|courant|i_?q|ampere", "current", 1.0, "A"),
+}
+# Units in which sensors are recorded without conversion, and samples from which columns are judged.
+_RAW_UNITS = ("", "-", "counts", "V", "mV", "Volts")
+_JUDGED = 1 << 16
+# A vibration crosses its mean so often at least: in all, and as a share of its samples.
+_CROSSINGS = 50, 0.001
+# Columns that only oscillate of which so many are taken, those that do it slowest.
+_MOST_GUESSED = 3
+# Sample rates in Hz by which the unit of times without one is chosen.
+_RATES = {"s": (10.0, 2e5), "ms": (20.0, 2e5), "us": (20.0, 2e6)}
+_DEPTH = 3  # of structs in structs
+_UNIT = re.compile(r"(?P<name>.+) \[(?P<unit>[^\]]*)\]")
+
+
+class Guess(NamedTuple):
+    """What a column of a file is: its name in a log, empty where it is left out, and why."""
+
+    source: str
+    target: str
+    why: str
+    unit: str = ""  # TOML of its unit with a comment, where neither name nor file states one
+
+
+class _Column(NamedTuple):
+    name: str
+    unit: str
+    values: FloatArray  # the first samples, ``(n,)``
+    size: int
+
+
+def propose(
+    path: Path, *, rate: float | None = None, max_memory: float = constants.MAX_MEMORY
+) -> tuple[str, list[Guess]]:
+    """Propose the column map of a file, as TOML with comments; return all guesses too.
+
+    ``rate`` is the sample rate in Hz where the file has none. `BadLog` if the file cannot be read
+    or nothing in it may be a signal.
+    """
+    label = shown(path)
+    content_digest(path, name=label)
+    try:
+        content, columns, guesses = _columns(path, max_memory)
+        guesses = [*_guesses(columns), *guesses]
+        if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
+            found = "; ".join(f"{g.source}: {g.why}" for g in guesses) or "no columns"
+            detail = f"nothing looks like a following error or an acceleration ({found})"
+            raise Unusable("columns", f"{detail}; write a column map by hand")
+        timed = any(g.target.startswith("time") for g in guesses)
+        if not timed and rate is None and "sample_rate_hz" not in content.metadata:
+            raise Unusable("time", "no column of times and no sample rate; give --sample-rate HZ")
+    except Unusable as error:
+        raise BadLog(label, error.reason, error.detail) from error
+    return "\n".join(_lines(label, content, guesses, None if timed else rate)), guesses
+
+
+def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], list[Guess]]:
+    """Read all columns as they are; those that hold no such series of numbers are left out."""
+    content = load(path, ColumnMap(), max_memory)
+    left_out: list[str] = []
+    read: dict[str, _Column] = {}
+    for _ in range(_DEPTH):
+        pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
+        units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
+        for name in (name for name in units if name not in [*left_out, *read]):
+            key = "time_s" if _TIME.search(name) else "acc_probed"
+            try:
+                found = load(path, ColumnMap(columns={key: name}), max_memory)
+                # A struct is opened by its name.
+                there = max(content.present, found.present, key=len)
+                content = replace(
+                    content, metadata=content.metadata | found.metadata, present=there
+                )
+                samples = found.columns[name]
+                values = np.asarray(samples[:_JUDGED], dtype=np.float64)
+                read[name] = _Column(name, units[name], values, samples.size)
+            except (Unusable, KeyError):
+                left_out.append(name)
+    sizes = [one.size for one in read.values() if one.size > 1]
+    size = max(sizes, key=lambda n: (sizes.count(n), n), default=0)
+    others = [*left_out, *(one.name for one in read.values() if one.size != size)]
+    rest = [Guess(listed(others), "", f"text, or not {size} numbers")] if others else []
+    return content, [one for one in read.values() if one.size == size], rest
+
+
+def _guesses(columns: list[_Column]) -> list[Guess]:
+    """Guess what each column is; what only oscillates is taken where nothing else is a signal."""
+    guesses = [_time(one) or _by_name(one) for one in columns]
+    if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
+        n = {k: _crossings(columns[k].values) for k, g in enumerate(guesses) if not g.target}
+        least = max(_CROSSINGS[0], _CROSSINGS[1] * max((c.values.size for c in columns), default=0))
+        fits = [k for k in n if columns[k].unit in _RAW_UNITS and n[k] >= least]
+        for k in sorted(fits, key=n.__getitem__)[:_MOST_GUESSED]:
+            why = f"looks like an accelerometer: crosses its mean {n[k]} times"
+            guesses[k] = _signal("acc", columns[k], f"{why} in {columns[k].values.size} samples")
+    kept: set[str] = set()
+    for k, guess in enumerate(guesses):
+        what = guess.target.partition("_")[0] if guess.target.startswith("time") else guess.target
+        if what in kept:
+            guesses[k] = guess._replace(target="", why=f"{guess.why}, as another column")
+        kept |= {what} - {""}
+    return guesses
+
+
+def _time(one: _Column) -> Guess | None:
+    """Guess a column of times: its name or its unit says so, and it ascends."""
+    unit, steps = unit_key(one.unit, "time"), np.diff(one.values)
+    if not (_TIME.search(one.name) or unit) or steps.size < 1 or not (steps > 0).all():
+        return None
+    step = float(np.median(steps))
+    rates = {u: 1 / (step * parse_column(f"time_{u}").factor) for u in _RATES}
+    fits = (u for u, (low, high) in _RATES.items() if low <= rates[u] <= high)
+    taken = unit or next(fits, None)
+    if taken is None:
+        return None
+    how = f"in {one.unit}" if unit else f"in steps of {step:.6g}, taken as {taken}"
+    return Guess(one.name, f"time_{taken}", f"times {how}: {rates[taken]:.6g} Hz")
+
+
+def _by_name(one: _Column) -> Guess:
+    """Guess the quantity of a column from its name and unit."""
+    finite = one.values[np.isfinite(one.values)]
+    if not finite.size or np.ptp(finite) == 0:
+        return Guess(one.name, "", "constant")
+    if role_of(one.name) is not None:
+        return _signal(one.name, one, "named as in a log")
+    for what, dimension in (("position", "length"), ("velocity", "velocity")):
+        if (unit := unit_key(one.unit, dimension)) and _SET_POINT.search(one.name):
+            return Guess(one.name, f"reference_{what}_{unit}", f"set {what} in {one.unit}")
+    for prefix, (words, dimension, *_) in _SIGNALS.items():
+        known = unit_key(one.unit, dimension) is not None
+        word = re.search(rf"(?<![^\W\d_])({words})", one.name, re.IGNORECASE)
+        if known and prefix != "delta_e":
+            return _signal(prefix, one, f"its unit is {one.unit}")
+        if word and (known or one.unit in _RAW_UNITS):
+            return _signal(prefix, one, f"{word[0]!r} is in its name")
+    return Guess(one.name, "", "neither name nor unit is that of a signal")
+
+
+def _signal(prefix: str, one: _Column, why: str) -> Guess:
+    """Name a signal, with its unit or else the SI value of one."""
+    word = re.sub(r"\W+", "_", one.name).strip("_").lower().removeprefix(f"{prefix}_")
+    target = prefix if prefix == one.name else f"{prefix}_{word}"
+    try:
+        parse_column(target)
+        return Guess(one.name, target, why)
+    except Unusable:
+        quantity = next((key for key in _SIGNALS if target.startswith(key)), None)
+        if (unit := unit_key(one.unit)) is not None or quantity is None:
+            return Guess(one.name, f"{target}_{unit}" if unit else "", why)
+    *_, scale, si = _SIGNALS[quantity]
+    per = f"{scale:g} {si} per {one.unit or 'count'}"
+    assumed = f"{why}; no unit: {per} assumed, on which frequencies and damping do not depend"
+    return Guess(one.name, target, assumed, f"{scale!r}  # {visible(per)} is assumed: set it")
+
+
+def _crossings(values: FloatArray) -> int:
+    """Count crossings of the mean by values that are no switch or counter of few levels."""
+    values = values[np.isfinite(values)]
+    if np.unique(values).size < constants.FEWEST_LEVELS:
+        return 0
+    return int(np.count_nonzero(np.diff(values > values.mean())))
+
+
+def _lines(label: str, content: Content, guesses: list[Guess], rate: float | None) -> Iterator[str]:
+    """Write the column map."""
+    yield f"# Column map proposed by `lmshealth init` from {label}."
+    yield "# Check every line: what the file does not state is a guess, with its reason."
+    yield "# All keys: lmshealth/io/README.md, Column maps."
+    if rate is not None:
+        yield f"sample_rate_hz = {rate!r}  # from --sample-rate"
+    yield "\n[columns]"
+    for g in (g for g in guesses if g.target):
+        yield f"{quoted(g.target)} = {quoted(g.source)}  # {visible(g.why)}"
+    for g in (g for g in guesses if not g.target):
+        yield f"# not read: {quoted(g.source)}: {visible(g.why)}"
+    yield "\n[units]"
+    for g in (g for g in guesses if g.unit):
+        yield f"{quoted(g.target)} = {g.unit}"
+    if content.guessed:
+        yield f"\n[csv]  # found in the file: {listed(content.guessed)}"
+    yield ""

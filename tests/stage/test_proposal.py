@@ -1,0 +1,97 @@
+"""Column maps that are proposed from logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from lmshealth._toml import decode
+from lmshealth.errors import BadLog
+from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.reading import read_log
+from lmshealth.stage.proposal import propose
+
+RNG = np.random.default_rng(1)
+NOISE = RNG.normal(0, 1, (4, 2000)).round(4)
+TIME = np.arange(2000) / 500
+
+
+def write(path: Path, names: str, *columns: np.ndarray, before: str = "") -> Path:
+    """Write columns below a line of names."""
+    rows = [
+        ",".join(f"{v!r}" for v in row)
+        for row in zip(*map(np.ndarray.tolist, columns), strict=True)
+    ]
+    path.write_text("\n".join([f"{before}{names}", *rows, ""]), encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "target", "scale"),
+    [
+        ("AI 3 [g]", "acc_ai_3_g", 9.80665),
+        ("AI 3 [m/s²]", "acc_ai_3_m_s2", 1.0),
+        ("Beschleunigung X", "acc_beschleunigung_x", 1.0),
+        ("Following error [nm]", "delta_e_following_error_nm", 1e-9),
+        ("Schleppfehler", "delta_e_schleppfehler", 1e-6),
+        ("PE(0) [mm]", "delta_e_pe_0_mm", 1e-3),
+        ("sensor_b [V]", "acc_sensor_b", 1.0),
+        ("acc_feed_g", "acc_feed_g", 9.80665),
+    ],
+)
+def test_a_signal_is_found_and_read(tmp_path: Path, name: str, target: str, scale: float) -> None:
+    """A column is recognised by unit, name or oscillation, and the map reads it in SI units."""
+    slow = np.linspace(0, 3, 2000).round(4)
+    path = write(tmp_path / "a.csv", f"Time,{name},Temp [°C]", TIME, NOISE[0], slow)
+    text, guesses = propose(path)
+    assert {g.target for g in guesses} == {"time_s", target, ""}
+    assert all(g.why for g in guesses)
+    log = read_log(path, columns=decode(text.encode(), ColumnMap))
+    assert log.sample_rate == pytest.approx(500)
+    np.testing.assert_allclose(log.channels[0].values, scale * NOISE[0], rtol=1e-12)
+
+
+def test_the_remaining_quantities(tmp_path: Path) -> None:
+    """Set points, currents and further columns of times are recognised; a position is no error."""
+    names = "Zeit [ms],Acc_X,Soll [mm],I_q [A],Pos [mm],Timestamp"
+    columns = 1e3 * TIME, NOISE[0], TIME, NOISE[1], NOISE[2], TIME
+    text, guesses = propose(write(tmp_path / "a.csv", names, *columns))
+    found = {g.source: g.target for g in guesses}
+    assert found == {
+        "Zeit": "time_ms", "Acc_X": "acc_x", "Soll": "reference_position_mm",
+        "I_q": "current_i_q_a", "Pos": "", "Timestamp": "",
+    }  # fmt: skip
+    assert "assumed: set it" in text
+
+
+def test_structs_of_matlab_are_opened(tmp_path: Path) -> None:
+    """Fields of structs are found by their names, and scalars are left out."""
+    scipy.io.savemat(
+        tmp_path / "a.mat",
+        {"e": {"t": TIME, "Acc": NOISE[0], "fs": 500.0}, "stage": "A-1", "x": 1.0},
+    )
+    text, guesses = propose(tmp_path / "a.mat")
+    assert {g.source: g.target for g in guesses if g.target} == {
+        "e.t": "time_s", "e.Acc": "acc_e_acc",
+    }  # fmt: skip
+    assert read_log(tmp_path / "a.mat", columns=decode(text.encode(), ColumnMap)).sample_rate
+
+
+def test_a_rate_is_asked_for(tmp_path: Path) -> None:
+    """Without times a sample rate must be given; a counter is no time."""
+    path = write(tmp_path / "a.csv", "n,acc", np.arange(2000.0), NOISE[0])
+    with pytest.raises(BadLog, match="--sample-rate"):
+        propose(path)
+    text, _ = propose(path, rate=2000.0)
+    assert read_log(path, columns=decode(text.encode(), ColumnMap)).sample_rate == 2000
+
+
+def test_nothing_is_invented(tmp_path: Path) -> None:
+    """A file without anything that oscillates is refused with the reasons."""
+    path = write(tmp_path / "a.csv", "Time,Temp [°C],on", TIME, TIME, NOISE[0] > 0)
+    with pytest.raises(BadLog, match="nothing looks like") as refused:
+        propose(path)
+    assert "Temp" in str(refused.value)
