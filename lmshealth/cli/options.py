@@ -219,7 +219,7 @@ def _log(ctx: click.Context, option: click.Parameter, given: Any) -> None:
     else:
         handler = logging.FileHandler(given, encoding="utf-8")
     handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(message)s"))
-    terminal.start_log(ctx, handler, logging.INFO)
+    terminal.start_log(ctx, handler)
 
 
 _OUTPUT = (

@@ -43,20 +43,13 @@ def quiet() -> bool:
     return context is not None and bool(context.meta.get(__name__))
 
 
-def start_log(context: click.Context, handler: logging.Handler, level: int) -> None:
+def start_log(context: click.Context, handler: logging.Handler) -> None:
     """Send records of the package to a handler until the command ends."""
     logger = logging.getLogger("lmshealth")
-    handler.setLevel(level)
-    before = logger.level
-    logger.setLevel(logging.DEBUG)
+    logger.setLevel(logging.INFO)
     logger.addHandler(handler)
-
-    def stop() -> None:
-        logger.removeHandler(handler)
-        logger.setLevel(before)
-        handler.close()
-
-    context.call_on_close(stop)
+    context.call_on_close(handler.close)
+    context.call_on_close(lambda: logger.removeHandler(handler))
 
 
 def _columns() -> int | None:

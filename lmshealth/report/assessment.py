@@ -343,7 +343,7 @@ def _often(days: float) -> str:
     if days < 2:
         return "a log a day"
     if days < 14:
-        return "a log a week" if 7 <= days < 8 else f"a log every {days:.0f} days"
+        return "a log a week" if 7 <= days < 8 else f"a log every {int(days)} days"
     return f"a log every {int(min(days, 182) // 7)} weeks"
 
 

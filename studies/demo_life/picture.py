@@ -27,7 +27,7 @@ def main(folder: Path = PAGES) -> None:
         browser = play.chromium.launch(
             executable_path=shutil.which("chromium"), args=["--no-sandbox"]
         )
-        page = browser.new_page(viewport={"width": 1120, "height": 900})
+        page = browser.new_page(viewport={"width": 1120, "height": 1400})
         page.goto(pages[0].resolve().as_uri())
         box = page.locator("section.first").bounding_box()
         below = box["y"] + box["height"] if box else 690.0
