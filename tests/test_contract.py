@@ -33,7 +33,7 @@ COLUMNS = {
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
 }
-VERDICTS = {"healthy", "preload", "mount", "both", "step", "alarm", "no-alarm", "not-enough-data"}
+VERDICTS = {"healthy", "preload", "mount", "both", "step", "not-enough-data"}
 SOURCES = {"acc", "delta_e", "frf", "joint"}
 NOT_NUMBERS = re.compile(r"^[+-]?(nan|inf|infinity|none|null)$", re.IGNORECASE)
 Row = dict[str, str]
@@ -164,7 +164,7 @@ def _prognosis(tables: dict[str, list[Row]]) -> list[str]:
 def _verdicts(tables: dict[str, list[Row]]) -> list[str]:
     found = [f"verdict {r['verdict']!r}" for r in tables["verdict"] if r["verdict"] not in VERDICTS]
     for row in tables["verdict"]:
-        known = row["verdict"] not in ("alarm", "no-alarm", "not-enough-data")
+        known = row["verdict"] != "not-enough-data"
         if known and not 0 <= float(row["probability"]) <= 1:
             found.append(f"probability of {row['stage']}")
     stages = {row["stage"] for row in tables["modes"]}

@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from lmshealth.batch import constants
-from lmshealth.health.verdict import degraded_words, undeclared_events
+from lmshealth.health.verdict import NO_HEALTH, degraded_words, undeclared_events
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import Row, prognosis_rows
@@ -78,7 +78,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     Evidence of damage comes before missing logs, which must not hide it.
     """
     verdict, by, inspect = status.verdict, status.service_by, status.inspect_by
-    judged = verdict != "not-enough-data"
+    judged = verdict not in NO_HEALTH
     serious = {code for code, severity in status.warnings.items() if severity == "serious"}
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
     soon = today + timedelta(days=constants.SERVICE_LEAD_DAYS)
@@ -181,7 +181,7 @@ def _transitions(
     """Yield changes of verdict, silence and alarms; of a new machine only what is bad."""
     was = before.verdict if before else ""
     last = (before or now).recorded_at.date().isoformat()
-    if was != now.verdict and (before or _is_loss(now.verdict)):
+    if was != now.verdict and ((before and now.infers_health) or _is_loss(now.verdict)):
         recovered = _is_loss(was) and now.verdict == "healthy"
         yield "recovered" if recovered else "verdict", was, now.verdict
     elif before and before.alarms and not now.alarms:
@@ -193,7 +193,7 @@ def _transitions(
 
 
 def _is_loss(verdict: str) -> bool:
-    return verdict not in ("", "healthy", "not-enough-data")
+    return verdict not in ("", "healthy", *NO_HEALTH)
 
 
 def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:

@@ -117,7 +117,8 @@ def machine_tables(
         rows["prognosis"] = prognosis_rows(life, assessment.service())
     found = assessment.judgement
     own = found.stage, _iso(found.recorded_at)
-    rows["verdict"] = _rows("verdict", [(*own, found.verdict, found.probability)])
+    if assessment.stage.parameters:  # else all that is known is in events.csv and warnings.csv
+        rows["verdict"] = _rows("verdict", [(*own, found.verdict, found.probability)])
     rows["refused"] = refused_rows(assessment.refused)
     rows["warnings"] = _rows("warnings", [(*own, *astuple(one)) for one in notices(assessment)])
     return rows

@@ -61,7 +61,7 @@ def status(**given: Any) -> Status:
         (OPEN, "CHECK_FUNCTION", "no-verdict"),
         (OPEN | {"infers_health": False}, "NORMAL", ""),
         (OPEN | {"alarms": ALARM}, "OFF_SPEC", "alarm no-verdict"),
-        (OPEN | {"alarms": ALARM, "infers_health": False}, "OFF_SPEC", "alarm"),
+        (OPEN | {"verdict": "alarm", "alarms": ALARM, "infers_health": False}, "OFF_SPEC", "alarm"),
         ({"alarms": ALARM}, "NORMAL", ""),
         ({"probability_limit_reached": 0.49}, "NORMAL", ""),
         ({"probability_limit_reached": 0.5}, "FAILURE", "limit-reached"),
