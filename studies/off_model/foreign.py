@@ -10,11 +10,10 @@ Method
     description. Judged are labels, modes, alarms and 90 % intervals of the temperature's slopes.
     Control, which must fail: association that takes stated errors as they are, as before.
 Answer
-    Yes, in all 100 lives. 94 to 98 % of the estimates have a label, whatever is stated, and 99.9 %
-    of these the right one (control: 9 % have one); 392 of 400 slopes lie inside their intervals.
-    Most of the rest is ambiguous, most often where the table has no names. One life alarms: its
-    modes have only a description, by whose nearest frequency estimates are named, though the
-    temperature moves them by as much as they are apart.
+    Yes, in all 100 lives. 93 to 98 % of the estimates have a label, whatever is stated, and 99.9 %
+    of these the right one (control: 9 % have one); 393 of 400 slopes lie inside their intervals.
+    Most of the rest is ambiguous, most often where the table has no names. Three lives alarm, two
+    were allowed.
 Run time
     About five minutes of one processor.
 """
@@ -39,15 +38,12 @@ from lmshealth.tracking.association import associate
 from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.track import track
 from studies.common.histories import START
-from studies.harness.claims import Claim, Older, counted
+from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import Array
 
 STEP = "track"
 
-OLDER = {
-    "foreign": Older("11a4092d6a3a", "machines could run in before they wear"),
-}
 
 SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50
 FACTORS = (0.25, 1.0, 4.0, 8.0, 15.0)
@@ -59,6 +55,7 @@ REFERENCE_C, PER_KELVIN = 10.0, -4e-4
 # Asked for: labels given, and right ones among them, lives that alarm, slopes held at 90 %.
 LEAST_GIVEN, LEAST_RIGHT, MOST_ALARMS, LEAST_HELD = 0.9, 0.99, 0.02, 0.85
 _REACH = 1.6448536  # standard deviations of a 90 % interval
+NOT_MET = {"alarms": "3 of 100 alarm; a rate of 2 % gives as many in one of three samples"}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -89,7 +86,7 @@ def main() -> None:
         "control": summed(before),
     }  # fmt: skip
     answer["passed"] = verdicts(answer)
-    study.conclude(answer, quick_may_fail=True)
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 def mast(names: str, factor: float, seed: int, n_logs: int) -> Mast:

@@ -10,15 +10,16 @@ Method
     where 5 % of preload is lost. Control, which must fail: the same lives without wander, outliers,
     running-in, lag and wide scales, as the tracker was before these were added.
 Answer
-    In 19 of 21 stable worlds that break the tracker's assumptions at most 2 % of the lives alarm,
-    and 91 to 100 % of the preloads are held; before, up to all lives alarmed. A sensor that drifts
-    looks as a change of the modes does. Logs of two machines mixed at random alarm in 11 % of the
-    lives. Where wear accelerates within a few logs the epoch lags: 77 % (late) and 47 % (bathtub)
-    of the preloads are held. Where the model is right a loss of 5 % is found in 99 % of the lives
-    (before 100 %), 1.28 times as late. With wander or lag it is found in 83 and 81 %, and in 1 %
-    where scatter is four times what is stated.
+    Nearly. Over the 19 stable worlds whose disturbance can be told from a change of ln f, 18 of
+    1,900 lives alarm (before 1,013) and 90 to 100 % of the preloads are held; in four of these
+    worlds, and after running-in, 3 to 5 of 100 alarm, more than 2 % by chance or not. A sensor that
+    drifts looks as a change of the modes does, logs of two machines mixed at random alarm in 10 %
+    of the lives. Where wear accelerates within a few logs, 86 % (late) and 82 % (bathtub) of the
+    preloads are held. Where the model is right a loss of 5 % is found in 97 % of the lives (before
+    100 %), 1.29 times as late. With wander or lag it is found in 84 and 81 %, and in 1 % where
+    scatter is four times what is stated.
 Run time
-    25 minutes on one processor.
+    Forty minutes on one processor.
 """
 
 from __future__ import annotations
@@ -34,15 +35,12 @@ from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.track import Track, track
-from studies.harness.claims import Claim, Older, counted, number
+from studies.harness.claims import Claim, counted, number
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import COURSES, DISTURBANCES, MODES, Array, life_of
 
 STEP = "track"
 
-OLDER = {
-    "result": Older("e20a80285bb3", "machines could run in before they wear"),
-}
 LIVES, QUICK_LIVES = 100, 2
 LOSING = ", losing 5 %"
 # Worlds that lose 5 % of preload: what detection costs, and whether drifts are held.
@@ -51,7 +49,22 @@ LOSERS = tuple(
 )
 QUICK = ("control", "wander 3 sd, 5 logs", "outliers 5 %, 10 sd", "control" + LOSING)
 _DRIFT = "a drift of the sensor is a change of ln f like any other"
+_SEVERAL = (
+    "2 of 100 were allowed; a rate of 2 % gives 5 or more in one of twenty samples, and all stable "
+    "worlds together have fewer"
+)
+_NO_DRIFT = ("sensor drifts by 5 K", "two machines mixed")  # not separable from damage
 NOT_MET = {
+    **{
+        f"alarms: {name}": _SEVERAL
+        for name in (
+            "wander 3 sd, 5 logs, in common",
+            "outliers 5 %, 10 sd",
+            "lag 24 h",
+            "amplitude",
+            "running-in",
+        )
+    },
     "alarms: sensor drifts by 5 K": _DRIFT,
     "held: sensor drifts by 5 K": _DRIFT,
     "alarms: two machines mixed": (
@@ -182,6 +195,15 @@ def claims(answer: Row) -> Iterator[Claim]:
             f"{beside}; {held}",
             met=passed.get(f"alarms: {name}", True) and passed.get(f"held: {name}", True),
         )
+    calm = [row for row in answer["worlds"] if row["name"] in DISTURBANCES]
+    calm = [row for row in calm if row["name"] not in _NO_DRIFT]
+    yield counted(
+        f"lives that alarm in {len(calm)} stable worlds together",
+        sum(row["alarms"]["hits"] for row in calm),
+        sum(row["alarms"]["n"] for row in calm),
+        f"control: {sum(old[row['name']]['alarms']['hits'] for row in calm):,} alarm; "
+        "without the drifting sensor and the two machines mixed",
+    )
     later, wider = costs(answer["worlds"], answer["control"])
     yield Claim(
         "logs until 5 % of preload lost is found, over the control",
