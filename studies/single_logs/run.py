@@ -10,11 +10,12 @@ Method
     Controls on the same logs: the likelihood with a force that is steady and white, and
     frequencies that soften without the covariate.
 Answer
-    Not recorded yet. Of 60 logs with a hump of the force 93 % of the intervals of f held in
-    development (57 % for a white force), at 1.05 times the width in steady records. A hump may look
-    like a further resonance, beside which a name is doubtful or refused.
+    Yes: 92 to 96 % of 95 % intervals hold in all worlds (44 to 83 % of the controls of f), at 1.03
+    times the width where the force is steady and white. Unsteady forces have their flag in 97 to
+    100 % of the estimates, humps in 79 %; 1.7 % of the estimates under a white force are called
+    coloured. A hump may look like a further resonance, beside which a name is doubtful or refused.
 Run time
-    Five minutes on one processor.
+    Nine minutes on one processor.
 """
 
 from __future__ import annotations
@@ -38,6 +39,11 @@ STEP = "identify"
 
 LOGS, QUICK_LOGS = 150, 15
 LEAST, WIDEST = 0.90, 1.25
+NOT_MET = {
+    "no flag where the model holds": (
+        "a force is called coloured at a probability above 0.99, and of many white ones a few are"
+    ),
+}
 UNSTEADY = "bursts", "log-normal", "ramp"
 
 
@@ -53,7 +59,7 @@ def main() -> None:
         for world in WORLDS
     }
     record = {"worlds": worlds, "passed": verdicts(worlds)}
-    study.conclude(record, quick_may_fail=True)
+    study.conclude(record, not_met=NOT_MET, quick_may_fail=True)
 
 
 def examine(world: str, k: int) -> list[Row]:
