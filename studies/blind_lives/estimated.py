@@ -17,6 +17,7 @@ from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import accepted_estimates, track
 from models.dynamics.plant import closed_loop_modes
 from models.lives.degradation import LIVES
@@ -64,6 +65,23 @@ def blind_life(number: int) -> Row:
     plan = plan_of(number)
     life, stage = life_of(plan), described(plan)
     history = history_of(life, drawn(life, *recorded(plan.stage), rng_of(61, number)))
+    made = assessed(stage, history, number)
+    judged = made.judgement
+    table = {"guide_preload": life.health[:, 0], "mount_stiffness": life.health[:, 1]}
+    table["travel_km"] = life.travel / 1000
+    return {
+        "stage": plan.stage,
+        "kind": plan.life,
+        "drawn": plan.plant_seed is not None,
+        "logs": plan.logs,
+        "truth": truth_of(plan, pd.DataFrame(table)),
+        "told": {"verdict": judged.verdict, "probability": _number(judged.probability),
+                 "shown": None, "refused": {}, "events": _events(made)} | _intervals(made),
+    }  # fmt: skip
+
+
+def assessed(stage: Stage, history: History, number: int) -> Assessment:
+    """Assess as `lmshealth.assess` does, health at the last log and life by importance sampling."""
     found = track(history, stage)
     made = Assessment(
         stage=stage,
@@ -80,18 +98,8 @@ def blind_life(number: int) -> Row:
     )
     if not made.doubt:
         made = _with_results(made, number)
-    judged = judge(stage, history, made.present, found, doubt=made.doubt)
-    table = {"guide_preload": life.health[:, 0], "mount_stiffness": life.health[:, 1]}
-    table["travel_km"] = life.travel / 1000
-    return {
-        "stage": plan.stage,
-        "kind": plan.life,
-        "drawn": plan.plant_seed is not None,
-        "logs": plan.logs,
-        "truth": truth_of(plan, pd.DataFrame(table)),
-        "told": {"verdict": judged.verdict, "probability": _number(judged.probability),
-                 "shown": None, "refused": {}, "events": _events(made)} | _intervals(made),
-    }  # fmt: skip
+    judgement = judge(stage, history, made.present, found, doubt=made.doubt)
+    return replace(made, judgement=judgement)
 
 
 def _with_results(made: Assessment, number: int) -> Assessment:
