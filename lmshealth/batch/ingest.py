@@ -282,11 +282,11 @@ def _identify_logs(
 ) -> list[_Outcome]:
     """Read and identify logs, and pack their outcomes where these are to be stored."""
     return [
-        _Outcome.of(task, _identify_log(task, stages, max_memory), is_new=True) for task in tasks
+        _Outcome.of(task, identify_log(task, stages, max_memory), is_new=True) for task in tasks
     ]
 
 
-def _identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> Identified:
+def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> Identified:
     """Read and identify one log; every failure becomes its refusal, never an exception."""
     by, stage, asked = "", None, None
     try:

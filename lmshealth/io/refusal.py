@@ -40,7 +40,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def nearest(sought: Iterable[str], names: Iterable[str]) -> str:
-    """List for a message the three names most like those sought, or the first dozen of names."""
+    """List for a message the names most like those sought, or all of at most a dozen."""
     from difflib import get_close_matches
 
     there = {name.casefold(): name for name in names}
@@ -48,7 +48,7 @@ def nearest(sought: Iterable[str], names: Iterable[str]) -> str:
         there[key] for one in sought for key in get_close_matches(one.casefold(), there, _NEAREST)
     ]
     more = len(there) - len(set(near))
-    if not near:
+    if not near or len(there) <= _MOST_LISTED:
         return listed(there.values())
     return listed(dict.fromkeys(near)) + (f" (most like it, of {len(there)})" if more else "")
 

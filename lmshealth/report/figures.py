@@ -131,7 +131,10 @@ def print_figure(
 
     target = io.BytesIO()
     style: Any = _STYLE | {"svg.hashsalt": salt}
-    with matplotlib.rc_context(style), warnings.catch_warnings():
+    with matplotlib.rc_context(), warnings.catch_warnings():
+        # Settings of the process, or of its user, are not those of a page.
+        matplotlib.rcdefaults()
+        matplotlib.rcParams.update(style)
         # The browser draws characters that the font lacks in another one.
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)

@@ -151,7 +151,8 @@ def attack(folder: Path, base: Columns, url: str, password: str, _kind: str, *, 
     }
     pages = [text for path, text in written.items() if path.suffix == ".html"]
     kept = guards.everything_in(url).decode("utf-8", "replace")
-    reported = pd.read_csv(out / "verdict.csv", dtype=str, keep_default_na=False)["stage"].tolist()
+    status = json.loads((out / "status.json").read_text(encoding="utf-8"))
+    reported = [one["stage"] for one in status["machines"]]
     lost = set(pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)["log"])
     names = [path.name for path in out.iterdir() if path.suffix == ".html"]
     wrong = {

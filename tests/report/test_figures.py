@@ -8,6 +8,7 @@ import sys
 from dataclasses import replace
 from xml.etree import ElementTree
 
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -90,6 +91,20 @@ def test_import_leaves_matplotlib_alone() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+def test_settings_of_the_process_do_not_reach_a_page() -> None:
+    """A figure has the same bytes whatever another library has set, which stays set."""
+
+    def draw(ax: Axes) -> None:
+        ax.plot([1, 2], [3, 4], label="a line")
+        ax.legend()
+
+    expected = plots.svg(draw, salt="one")
+    others = {"axes.linewidth": 5.0, "legend.fontsize": 30, "figure.constrained_layout.w_pad": 1.0}
+    with matplotlib.rc_context(others):
+        assert plots.svg(draw, salt="one") == expected
+        assert matplotlib.rcParams["axes.linewidth"] == others["axes.linewidth"]
 
 
 def test_frequencies_in_hz_over_km(ax: Axes, history: History, track: Track) -> None:

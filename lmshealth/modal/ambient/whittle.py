@@ -164,6 +164,8 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
 # Newton decrement, a square in standard deviations, below which the search ends; along a valley as
 # flat as that of two modes at one frequency, after so many steps, a larger one.
 _ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
+# Slopes of E that are computed at a time: more channels would not fit into the processor's cache.
+_CACHED = 1 << 18
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -372,26 +374,36 @@ class _Point:
         row, w = self._slopes()
         # The columns of Φ for the floors are the unit vectors of the channels.
         basis = _frequency_last(whiten @ self._phi)
-        half = basis[:, row][:, None] * _combined(basis, w.conj().swapaxes(0, 1))[None].conj()
-        slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, n)
-        size = self._layout.bumps.start
-        slopes, by_gain = slopes[:, :, :size], slopes[:, :, size:].sum(axis=2)
-        excess_last = _frequency_last(excess) * count
-        turned = _combined(_frequency_last(eye - 2 * excess) * count, slopes)
         g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
         b = _congruent(self._phi, g)  # Φᵀ G Φ, (components, components, n)
-        gradient = _inner(slopes, excess_last[:, :, None])[:, 0]
-        hessian = _inner(slopes, turned) + self._curvature(w[:size], g, b)
+        size, n = self._layout.bumps.start, count.size
+        excess_last = _frequency_last(excess) * count
+        weight = _frequency_last(eye - 2 * excess) * count
+        gradient, hessian = np.zeros(size), np.zeros((size, size))
+        along, own, heights = np.zeros((size, n)), np.zeros(n), np.zeros(n)
+        step = max(1, _CACHED // (eye.size * row.size))
+        for part in (slice(first, first + step) for first in range(0, n, step)):
+            near = basis[..., part]
+            half = _combined(near, w[..., part].conj().swapaxes(0, 1)).conj()
+            half = near[:, row][:, None] * half[None]
+            slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, part)
+            slopes, by_gain = slopes[:, :, :size], slopes[:, :, size:].sum(axis=2)
+            turned = _combined(weight[..., part], slopes)
+            gradient += _inner(slopes, excess_last[:, :, None, part])[:, 0]
+            hessian += _inner(slopes, turned)
+            if self._layout.n_bumps:
+                # Heights change E as the gain of the forces does, times their bump.
+                across = _combined(weight[..., part], by_gain[:, :, None])
+                along[:, part] = np.sum((by_gain[:, :, None] * turned.conj()).real, axis=(0, 1))
+                own[part] = np.sum((by_gain * across[:, :, 0].conj()).real, axis=(0, 1))
+                heights[part] = np.sum((by_gain * excess_last[..., part].conj()).real, axis=(0, 1))
+        hessian += self._curvature(w[:size], g, b)
         if not self._layout.n_bumps:
             return gradient, hessian
-        # Heights change E as the gain of the forces does, times their bump.
-        along = np.sum((by_gain[:, :, None] * turned.conj()).real, axis=(0, 1))
         along += self._with_gain(row[:size], w[:size], b)
-        across = _combined(_frequency_last(eye - 2 * excess) * count, by_gain[:, :, None])
-        own = np.sum((by_gain * across[:, :, 0].conj()).real, axis=(0, 1)) + self._gains(b)
-        heights = np.sum((by_gain * excess_last.conj()).real, axis=(0, 1)) @ self._bump.T
+        own += self._gains(b)
         mixed = along @ self._bump.T
-        return np.append(gradient, heights), np.block(
+        return np.append(gradient, heights @ self._bump.T), np.block(
             [[hessian, mixed], [mixed.T, (self._bump * own) @ self._bump.T]]
         )
 
