@@ -40,6 +40,8 @@ _UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
 # Ordinates over which the level near a line is taken, and that it covers to either side.
 _LINE_NEIGHBOURS, _LINE_BINS = 41, 2
 _MOST_LINE_ROUNDS = 4
+# Ordinates times unknowns of a fit with finer bins.
+_MOST_SLOPES = 400_000
 # Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
 _DOUBTFUL = 200.0
 # The sign of a shape starts as that of the cross spectrum within so many damping ratios.
@@ -503,7 +505,12 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
     if (apart < bandwidth / 2).all() and bandwidth.min() > _NARROWER * min(expected):
         return optimum
     least = max(float(bandwidth.min()), min(expected) / constants.DAMPING_SPAN)
-    likelihood = replace(optimum.likelihood, blocks=make_blocks(data, least, f.tolist()))
+    blocks = make_blocks(data, least, f.tolist())
+    # One pole that is narrow by error must not make the bins of a wide band fine.
+    while sum(b.frequency.size for b in blocks) * optimum.p.size > _MOST_SLOPES:
+        least *= 2
+        blocks = make_blocks(data, least, f.tolist())
+    likelihood = replace(optimum.likelihood, blocks=blocks)
     p = likelihood.minimise(optimum.p)
     return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p))
 
