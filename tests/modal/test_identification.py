@@ -19,6 +19,7 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
+from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_cluster, fit_found
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
 from lmshealth.modal.identification import identify
@@ -154,6 +155,18 @@ def test_an_undescribed_mode_takes_no_name() -> None:
         patch.setattr(modal, "shows_more", lambda *_: False)
         wrong = identify(log, stage)
     assert abs(deviations(wrong, "pitch", *LMS_Y[1][1:])[0]) > 10
+
+
+def test_an_estimate_outside_of_its_data_is_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two narrow modes of which none is described make no mode where no resonance is."""
+    modes = [Mode(121.65, 0.0018, 1.0, (1.0, 0.5)), Mode(126.0, 0.0018, 1.0, (0.6, 1.0))]
+    log = acceleration_log(rng(4), modes, 24, RATE, 0.01)
+    stage = make_stage([("six", 131.4, 0.0018)])
+    assert why(identify(log, stage), "six") == "outside-search"
+    # Negative control: without the check there is a mode, far from both.
+    monkeypatch.setattr(cluster_fit, "_outside", lambda *_: None)
+    (f,) = identify(log, stage).frequency
+    assert min(abs(f - mode.frequency) for mode in modes) > 2
 
 
 def test_following_error_shows_a_mode_as_an_accelerometer_does() -> None:

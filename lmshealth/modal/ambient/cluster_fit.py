@@ -632,7 +632,10 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         lines=(),
         refused=(),
     )
-    judged = [_incredible(modes, i, one, residual.duration) for i, one in enumerate(targets)]
+    judged = [
+        _incredible(modes, i, one, residual.duration) or _outside(modes, i, one, residual.frequency)
+        for i, one in enumerate(targets)
+    ]
     rejected = {
         name: why._replace(frequency=at)
         for name, why, at in zip(names, judged, f.tolist(), strict=True)
@@ -734,6 +737,16 @@ def read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
     c = int(np.argmax(_powers(spectrum)[first:last].sum(axis=0)))
     frequency, amplitude = spectrum.channel(c).sine(first, last)
     return LineEstimate(data.spectra.channels[c], frequency, amplitude * float(data.unit[c]))
+
+
+def _outside(modes: Modes, i: int, target: Target, band: FloatArray) -> Rejection | None:
+    """Return why an estimate of a described mode is none: it is outside the frequencies in Hz."""
+    f = float(modes.frequency[i])
+    if target.amplitude is not None or band[0] <= f <= band[-1]:
+        return None
+    detail = f"the fit converged to {f:.5g} Hz, outside the band that it used ({band[0]:.5g} to "
+    detail += f"{band[-1]:.5g} Hz): a mode that is not described reaches into it"
+    return Rejection("outside-search", detail)
 
 
 def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Rejection | None:
