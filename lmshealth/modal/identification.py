@@ -151,7 +151,19 @@ def read_ambient(
     log = limit_channels(log, channels)
     used = choose_channels(log)
     targets = () if stage is None else choose_targets(stage, band)
-    stretches, whole = _transform(log, used, targets, band)
+    short: list[Refusal] = []
+    while True:
+        try:
+            stretches, whole = _transform(log, used, targets, band)
+            break
+        except BadLog as error:
+            if error.reason != "too-short" or len(targets) < 2:
+                raise
+            # One narrow mode must not refuse the others.
+            least = min(targets, key=lambda target: target.damping_ratio * target.frequency)
+            targets = tuple(target for target in targets if target is not least)
+            named = Refusal(log.name, error.reason, error.detail, mode=least.name)
+            short.append(replace(named, frequency=least.frequency))
     tested: list[tuple[str, float, float]] = []
     sought: tuple[Found, ...] = ()
     if stage is None:
@@ -161,7 +173,7 @@ def read_ambient(
             sought, tested, fits = explore(suspected)
     else:
         fits, known, more = _fit_described(whole, targets, _TOP * log.sample_rate)
-    refused = [refusal for fit in fits for refusal in fit.refusals(log.name)]
+    refused = [*short, *(refusal for fit in fits for refusal in fit.refusals(log.name))]
     left_out = [
         Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
         for part in sought

@@ -473,6 +473,15 @@ def test_a_record_too_short_names_the_seconds_needed() -> None:
     assert caught.value.reason == "too-short"
 
 
+def test_a_record_too_short_for_one_mode_shows_the_others() -> None:
+    """A described mode that the record cannot resolve is refused by name, and no other is."""
+    log = one_mode_log(20.0)
+    stage = make_stage([("wide", 105.0, 0.015), ("narrow", 60.0, 0.0001)])
+    found = identify(log, stage)
+    assert found.names == ("wide",)
+    assert why(found, "narrow") == "too-short"
+
+
 def test_a_sample_rate_too_low_names_the_one_needed() -> None:
     """A mode above half the sample rate is no question for this log."""
     with pytest.raises(BadLog, match=r"needed is at least 1\d{3} Hz") as caught:
