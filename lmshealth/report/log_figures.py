@@ -358,7 +358,7 @@ def _annotate(
         for ax in panels:
             ax.axvspan(
                 f * np.exp(-reach), f * np.exp(reach),
-                color=figures.BLUE, alpha=0.35, lw=0, label="mode, 95 % interval of its frequency",
+                color=figures.BLUE, alpha=0.35, lw=0, label="mode, 95 % interval",
             )  # fmt: skip
             ax.axvline(f, color=figures.BLUE, lw=0.6)
         name = spell(modes.names[k] or "unnamed")
@@ -369,7 +369,7 @@ def _annotate(
         if at is not None and band[0] <= at <= band[1]:
             style: Any = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
-                ax.axvline(at, **style, label="refused, where found or else sought")
+                ax.axvline(at, **style, label="refused, or not found")
             labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
     panels[-1].set_xlabel("frequency in Hz")
     panels[-1].set_xlim(*band)
@@ -377,7 +377,8 @@ def _annotate(
         from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
 
         panels[-1].set_xscale("log")
-        panels[-1].xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        subs = (1, 2, 5) if band[1] > 30 * band[0] else (1, 1.5, 2, 3, 4, 5, 7)
+        panels[-1].xaxis.set_major_locator(LogLocator(subs=subs))
         panels[-1].xaxis.set_minor_locator(NullLocator())
         panels[-1].xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     _write_labels(panels[0], [label for label in labels if band[0] <= label[0] <= band[1]])

@@ -73,7 +73,7 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
     away = np.abs(x - 50) > 2
     assert y[away].mean() == pytest.approx(1.0, abs=5 / np.sqrt(away.sum() * 4))
     assert curves["line: mains"].get_xdata() == pytest.approx([50.0])
-    assert curves["refused, where found or else sought"].get_xdata() == pytest.approx([80.5, 80.5])
+    assert curves["refused, or not found"].get_xdata() == pytest.approx([80.5, 80.5])
     assert not [line for line in second.lines if line.get_label() == "line: mains"
                 and len(np.asarray(line.get_xdata()))]  # fmt: skip
     (span,) = (p for p in second.patches if "95 %" in str(p.get_label()))
