@@ -33,7 +33,7 @@ from lmshealth.io.log import Log
 from studies.blind_modes.peers import pyoma2, toolbox
 from studies.blind_modes.worlds import World
 from studies.common.cost import one_thread
-from studies.harness.claims import Claim, Older
+from studies.harness.claims import Claim
 from studies.harness.study import Row, Study, real_data
 from studies.modes_real.sets import (
     FLOORS,
@@ -51,9 +51,6 @@ from studies.read_throughput.samples import MAPS
 
 STEP = "identify"
 
-OLDER = {
-    "blind": Older("ced8b61ec0d6", "modes were averaged over coloured forces"),
-}
 HALF_HOUR, BUILDING_RATE, BUILDING = 180_000, 100.0, (1.882, 2.422, 2.687)
 
 # Name, log, band, known frequencies and tolerances in Hz, and whether nothing else is there.
