@@ -20,7 +20,6 @@ if TYPE_CHECKING:
     from lmshealth.health.inference import infer_together as infer_together
     from lmshealth.health.verdict import judge as judge
     from lmshealth.io.reading import read_log as read_log
-    from lmshealth.io.reading import read_sep005 as read_sep005
     from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
     from lmshealth.modal.frf.identification import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
@@ -56,7 +55,6 @@ _HOMES = {
     "prognose": "prognosis.remaining_life",
     "read_frf": "modal.frf.identification",
     "read_log": "io.reading",
-    "read_sep005": "io.reading",
     "run": "batch.run",
     "track": "tracking.track",
 }

@@ -29,7 +29,6 @@ import lmshealth
 def assessed(folder: Path) -> str:
     stage = lmshealth.load_stage("lms-y")
     readings = []
-    copied = [lmshealth.read_sep005(lmshealth.read_log(path).to_sep005()) for path in [folder]]
     for path in folder.glob("*.h5"):
         try:
             log = lmshealth.read_log(path)

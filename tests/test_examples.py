@@ -93,12 +93,15 @@ def test_python_of_the_readme(logs: Path, root: Path, monkeypatch: pytest.Monkey
     known: dict[str, Any] = {}
     with redirect_stdout(StringIO()) as shown:
         exec(compile(program, "README.md", "exec"), known)
-    assert len(known["found"]) == 6
+    found = known["found"]
+    assert len(found.history.logs) == 6
     assert not known["refused"]
-    *why, service = shown.getvalue().split()
+    first, *shown_track = shown.getvalue().splitlines()
+    *why, service = first.split()
     assert service == "None" or date.fromisoformat(service) > date(2026, 1, 1)
     assert " ".join(why).startswith("Guide preload is at ")
+    assert 1 < len(shown_track) <= 8
     # The exports that the text names.
-    health = known["health"]
+    health = found.health
     assert set(health.to_arviz()["posterior"].data_vars) == set(health.parameters)
     assert set(health.to_frame()["parameter"]) == set(health.parameters)
