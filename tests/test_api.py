@@ -52,10 +52,7 @@ def assessed(folder: Path) -> str:
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
     reveal_type(  # noqa: F821
-        (
-            *(refused, copied, both, laws, day),
-            *(assessment.judgement.verdict, plan.duration_of_one, result),
-        )
+        (refused, both, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
     )
     return told
 """

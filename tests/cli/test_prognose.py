@@ -14,7 +14,7 @@ from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.tables import COLUMNS
-from lmshealth.report.text import GAP
+from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from tests.lives import (
@@ -108,8 +108,8 @@ def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Pat
     assert sound["probability_at_most"] < 0.5 * worn["probability_at_most"]
     assert worn["before"] == "2026-05-01"
     assert f"Service: by {worn['service_by']} (accepted risk 5 %)" in result.stdout
-    assert f"{worn['rul_km_q50']:,.0f}".replace(",", GAP) in result.stdout
-    assert "AX-2: remaining life" in result.stdout and "beyond 5,000" in result.stdout
+    assert plain(km(1000 * worn["rul_km_q50"])) in plain(result.stdout)
+    assert "AX-2: remaining life" in result.stdout and "beyond 5 000" in plain(result.stdout)
     tree = xarray.open_datatree(draws, engine="h5netcdf")
     assert tree["AX-1/posterior/guide_preload"].to_numpy().mean() == pytest.approx(0.835, abs=0.03)
 
