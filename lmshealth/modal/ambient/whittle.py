@@ -268,10 +268,24 @@ class Likelihood:
         # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
         # the point before where a step was too long.
         points = lru_cache(maxsize=1)(lambda raw: self._at(np.frombuffer(raw)))
-        both = lru_cache(maxsize=1)(lambda raw: self.derivatives(np.frombuffer(raw), points(raw)))
+
+        @lru_cache(maxsize=1)
+        def both(raw: bytes) -> tuple[FloatArray, FloatArray]:
+            p = np.frombuffer(raw)
+            try:
+                with np.errstate(over="ignore", invalid="ignore"):
+                    slope, curvature = self.derivatives(p, points(raw))
+            except np.linalg.LinAlgError:
+                curvature = np.array(np.nan)
+            if np.isfinite(curvature).all() and np.isfinite(slope).all():
+                return slope, curvature
+            # Overflow far away: the optimiser takes derivatives before it sees that the value is
+            # infinite and refuses the step.
+            return np.full(p.size, np.nan), np.eye(p.size)
 
         def value(p: FloatArray) -> float:
-            return self.value(p, points(p.tobytes()))
+            slope, _ = both(p.tobytes())
+            return self.value(p, points(p.tobytes())) if np.isfinite(slope).all() else np.inf
 
         def gradient(p: FloatArray) -> FloatArray:
             return both(p.tobytes())[0]

@@ -331,6 +331,33 @@ def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:
     assert target.value(p) == np.inf
 
 
+@pytest.mark.parametrize("beyond", [np.nan, np.inf, None])
+def test_a_search_turns_back_where_derivatives_overflow(
+    beyond: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A first step to where there are no derivatives is shortened; the end is the same."""
+    target = noisy(1, 2, 8.0)
+    start = target.start + 0.1
+    free = target.minimise(start)
+    plain, turned = Likelihood.derivatives, 0
+
+    def derivatives(
+        self: Likelihood, p: np.ndarray, points: object
+    ) -> tuple[np.ndarray, np.ndarray]:
+        nonlocal turned
+        if np.linalg.norm(p - start) <= 0.1 or turned >= 2:
+            return plain(self, p, points)  # type: ignore[arg-type]
+        turned += 1
+        if beyond is None:
+            raise np.linalg.LinAlgError
+        return np.full(p.size, beyond), np.full((p.size, p.size), beyond)
+
+    monkeypatch.setattr(Likelihood, "derivatives", derivatives)
+    held = target.minimise(start)
+    assert turned == 2
+    assert target.value(held) == pytest.approx(target.value(free), abs=1e-3)
+
+
 F = np.linspace(80.0, 160.0, 41)
 U = np.linspace(-1.2, 1.2, 41)
 
