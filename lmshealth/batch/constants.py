@@ -30,7 +30,7 @@ SQLITE_BUSY_TIMEOUT_S = 120
 SERVER_TIMEOUT_S = 20
 """Seconds (s) that a database server has to answer, unless its URL has ``connect_timeout``."""
 
-SCHEMA = 6
+SCHEMA = 7
 """Version of the tables of a store, part of their names: older tables are not read."""
 
 RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow")

@@ -1,9 +1,9 @@
 """Store of results: a content-addressed cache and the published assessments (SQLite, PostgreSQL).
 
 The key of a result is a fingerprint of everything that the result depends on. A change of any of it
-gives another key, so that only stale results are computed again. A row that this version cannot
-decode counts as absent. Every write may be repeated, and may be made by two runs at once: runs may
-be killed, and may share a store.
+gives another key, so that only stale results are computed again. A row that is damaged, or that
+this version cannot decode, counts as absent. Every write may be repeated, and may be made by two
+runs at once: runs may be killed, and may share a store.
 """
 
 import hashlib
@@ -11,10 +11,10 @@ import logging
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple, Self, cast
+from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
 import sqlalchemy as sql
@@ -55,6 +55,7 @@ _KINDS |= dict.fromkeys(("service_by", "inspect_by"), sql.Date)
 _KINDS |= dict.fromkeys(("recorded_at", "noticed_at"), sql.DateTime(timezone=True))
 _KINDS |= dict.fromkeys(("state", "verdict", "service", "alarms", "silent"), sql.Text)
 _KINDS |= dict.fromkeys(("quantity", "subject", "what", "before", "now"), sql.Text)
+_DIGEST_BYTES = 16  # of a record and its keys, before the record
 _OPTIONAL = {"machine", "low", "median", "high", "probability", "service_by", "inspect_by"}
 
 
@@ -219,13 +220,16 @@ class Store:
             query = sql.select(_IDENTIFIED.c.key, _IDENTIFIED.c.content)
             with self._begin() as connection:
                 rows = connection.execute(query.where(_IDENTIFIED.c.key.in_(part))).all()
-            yield from ((row.key, row.content) for row in rows)
+            for row in rows:
+                if (content := _unsealed(row.content, row.key)) is not None:
+                    yield row.key, content
 
     def put_identified(self, rows: Iterable[OutcomeRow]) -> None:
         """Store outcomes of logs in one transaction."""
         with self._begin() as connection:
             for row in rows:
-                connection.execute(self._upsert(_IDENTIFIED, row._asdict() | {"version": VERSION}))
+                sealed = {"content": _sealed(row.content, row.key), "version": VERSION}
+                connection.execute(self._upsert(_IDENTIFIED, row._asdict() | sealed))
 
     # Machines
 
@@ -235,42 +239,44 @@ class Store:
 
     def assessment(self, machine: str, key: str) -> bytes | None:
         """Fetch a packed assessment; None where it is not stored."""
-        return cast(bytes | None, self._of_assessment(_ASSESSED.c.content, machine, key))
+        return _unsealed(self._of_assessment(_ASSESSED.c.content, machine, key), machine, key)
 
     def evidence(self, machine: str, key: str) -> bytes | None:
         """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
-        return cast(bytes | None, self._of_assessment(_ASSESSED.c.evidence, machine, key))
+        return _unsealed(self._of_assessment(_ASSESSED.c.evidence, machine, key), machine, key)
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine, and its parts in place of those stored before."""
-        own = {"machine": _id(machine)}
-        row = own | {name: value for name, value in asdict(made).items() if name != "parts"}
+        own, parts = _id(machine), made.parts
+        row = {
+            name: _sealed(getattr(made, name), machine, key)
+            for name in ("content", "evidence", "summary")
+        }
         with self._begin() as connection:
-            connection.execute(self._upsert(_ASSESSED, row | {"key": key}))
-            if made.parts is None:
+            connection.execute(self._upsert(_ASSESSED, {"machine": own, "key": key} | row))
+            if parts is None:
                 return
-            of_this = _PARTS.c.machine == own["machine"]
-            connection.execute(
-                sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(made.parts)))
-            )
-            for part, content in made.parts.items():
-                row = own | {"key": part, "content": content}
-                connection.execute(self._upsert(_PARTS, row))
+            of_this = _PARTS.c.machine == own
+            connection.execute(sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(parts))))
+            for part, content in parts.items():
+                connection.execute(self._upsert(_PARTS, _part(machine, part, content)))
 
     def put_part(self, machine: str, key: str, content: bytes) -> None:
         """Store one more part of the last assessment of a machine."""
-        self._put(_PARTS, {"machine": _id(machine), "key": key, "content": content})
+        self._put(_PARTS, _part(machine, key, content))
 
     def part(self, machine: str, key: str) -> bytes | None:
         """Fetch a part of the last assessment of a machine; None where it is not stored."""
         where = _PARTS.c.machine == _id(machine), _PARTS.c.key == key
-        return cast(bytes | None, self._first(sql.select(_PARTS.c.content).where(*where)))
+        return _unsealed(self._first(sql.select(_PARTS.c.content).where(*where)), machine, key)
 
     def parts(self, machine: str) -> dict[str, bytes]:
         """Fetch the parts of the last assessment of a machine by key."""
         query = sql.select(_PARTS.c.key, _PARTS.c.content).where(_PARTS.c.machine == _id(machine))
         with self._begin() as connection:
-            return {row.key: row.content for row in connection.execute(query)}
+            rows = connection.execute(query).all()
+        found = {row.key: _unsealed(row.content, machine, row.key) for row in rows}
+        return {key: content for key, content in found.items() if content is not None}
 
     def put_points(self, machine: str, points: Iterable[dict[str, Any]]) -> None:
         """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
@@ -306,7 +312,7 @@ class Store:
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
-        self._put(_REFUSED, {"key": key, "content": pack(refused)})
+        self._put(_REFUSED, {"key": key, "content": _sealed(pack(refused), key)})
         return key
 
     def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
@@ -331,12 +337,15 @@ class Store:
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
         query = (
-            sql.select(_REPORTED.c.content)
+            sql.select(_REPORTED.c.key, _REPORTED.c.content)
             .where(_REPORTED.c.machine == _id(machine), _REPORTED.c.key != key)
             .order_by(_REPORTED.c.number.desc())
         )
         with self._begin() as connection:
-            summaries = (unpack_or_none(row, Summary) for row in connection.scalars(query))
+            summaries = (
+                unpack_or_none(_unsealed(row.content, machine, row.key), Summary)
+                for row in connection.execute(query)
+            )
             return next((summary for summary in summaries if summary is not None), None)
 
     def published(self) -> tuple[Published, ...]:
@@ -353,7 +362,8 @@ class Store:
         found: dict[Refusal, None] = {}
         for key in dict.fromkeys(keys):
             content = self._first(sql.select(_REFUSED.c.content).where(_REFUSED.c.key == key))
-            found |= dict.fromkeys(unpack_or_none(content, tuple[Refusal, ...]) or ())
+            listed = unpack_or_none(_unsealed(content, key), tuple[Refusal, ...])
+            found |= dict.fromkeys(listed or ())
         return tuple(found)
 
     # Statements
@@ -408,6 +418,33 @@ class Store:
 
 def _id(machine: str) -> str:
     return hashlib.sha256(machine.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _sealed(content: bytes, *keys: str) -> bytes:
+    """Prefix a record with a digest of it and of its keys.
+
+    A damaged index of SQLite leads to the record of another key, which is intact by itself.
+    """
+    return _digest(content, keys) + content
+
+
+def _unsealed(stored: bytes | None, *keys: str) -> bytes | None:
+    """Return the record that was stored under these keys; None for none or a damaged one."""
+    if stored is None:
+        return None
+    digest, content = stored[:_DIGEST_BYTES], stored[_DIGEST_BYTES:]
+    return content if digest == _digest(content, keys) else None
+
+
+def _digest(content: bytes, keys: tuple[str, ...]) -> bytes:
+    subject = "\0".join(keys).encode("utf-8", "surrogatepass")
+    return hashlib.blake2b(
+        content, digest_size=_DIGEST_BYTES, key=hashlib.sha256(subject).digest()
+    ).digest()
+
+
+def _part(machine: str, key: str, content: bytes) -> dict[str, Any]:
+    return {"machine": _id(machine), "key": key, "content": _sealed(content, machine, key)}
 
 
 # Databases

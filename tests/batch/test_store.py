@@ -371,6 +371,30 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
         assert isinstance(got_from(store, "k", "a.h5"), LogEstimates)
 
 
+def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_path: Path) -> None:
+    """A damaged index of the database leads to records of other logs and machines."""
+    with closing(Store(file_url)) as store:
+        put_in(store, "k", reading())
+        put_in(store, "l", reading())
+        for machine in ("A", "B"):
+            keep(store, machine, "k1", worn(tmp_path, machine))
+            store.put_part(machine, "p", pack(machine))
+        with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
+            for table in ("identified", "assessed", "parts", "reported"):
+                other = f"SELECT content FROM {table}_{SCHEMA} ORDER BY rowid"
+                (first,), *_ = file.execute(other).fetchall()
+                file.execute(f"UPDATE {table}_{SCHEMA} SET content = ?", (first,))
+        assert got_from(store, "k", "a.h5") is not None
+        assert got_from(store, "l", "a.h5") is None
+        assert recall(store, "A", "k1") is not None
+        assert recall(store, "B", "k1") is None
+        assert store.part("A", "p") is not None
+        assert store.part("B", "p") is None
+        assert store.parts("B") == {}
+        assert store.previous_summary("A", "k2") is not None
+        assert store.previous_summary("B", "k2") is None
+
+
 def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: Path) -> None:
     """Of every table and view the other may be a moment quicker: both have it."""
     path = tmp_path / "store.sqlite"
