@@ -19,6 +19,8 @@ _GOOD_SHARE = 0.3
 # Share of a wide component about all draws, which covers tails between and beyond the kernels, and
 # its width in standard deviations [Hesterberg1995].
 _WHOLE_SHARE, _WHOLE_WIDTH = 0.2, 1.5
+# Variance added in each direction, of that of the draws, where the draws span fewer dimensions.
+_RIDGE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,7 +131,10 @@ def _propose(
     mean = draws.weight @ draws.points
     off = draws.points - mean
     cov = (draws.weight[:, None] * off).T @ off + 1e-18 * np.eye(d)
-    factor = np.linalg.cholesky(cov)
+    try:
+        factor = np.linalg.cholesky(cov)
+    except np.linalg.LinAlgError:  # fewer effective draws than dimensions
+        factor = np.linalg.cholesky(cov + _RIDGE * np.diag(draws.points.var(axis=0) + 1e-18))
     # Silverman's width, of the effective number of kernels.
     width = (4 / (d + 2)) ** (1 / (d + 4)) * min(_N_KERNELS, draws.ess) ** (-1 / (d + 4))
     centres = draws.resampled(rng, _N_KERNELS)

@@ -173,3 +173,19 @@ def test_a_start_outside_of_the_support_is_refused() -> None:
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
         importance_sample(half, -np.abs(start(2)), np.random.default_rng(11), 500)
     assert np.shape(caught.value.chains) == (600, 2)
+
+
+@pytest.mark.parametrize("inside", [1, 2, 4])
+def test_a_start_that_spans_fewer_dimensions_than_the_density(inside: int) -> None:
+    """Few points of the start inside the support still lead to the whole density."""
+    points = start(6, seed=inside)
+    known = stats.multivariate_normal(np.zeros(6))
+    reached = np.zeros(points.shape[0], bool)
+    reached[np.argsort((points**2).sum(axis=1))[:inside]] = True
+
+    def density(x: FloatArray) -> FloatArray:
+        value = LN_SCALE + np.reshape(known.logpdf(x), x.shape[0])
+        return np.where(reached, value, -np.inf) if x is points else value
+
+    found = importance_sample_to_ess(density, points, np.random.default_rng(2), 2000)
+    assert agrees(found, LN_SCALE)
