@@ -21,7 +21,12 @@ Method
     not in the truth. Controls that must fail: the truth of another life of the stage, and intervals
     shrunk to a third.
 Answer
-    Not recorded yet.
+    Yes within the resolution of 64 lives, 45 of drawn machines: 57 verdicts are right, 52 of 54
+    away from borders; of 61 with a probability 54 are right where 57.6 are promised, 2.4 standard
+    deviations too sure. Intervals of 90 % hold 51 of 64 preloads (80 %, 68 to 89), 27 of 29
+    mounts, and 59 of 63 remaining lives, of those that reach a limit 42 of 46. Those of the
+    preload are probably too narrow on drawn machines. No alarm in 12 sound lives, one of which is
+    called worn.
 Run time
     Fifteen minutes on one processor; ``--again`` judges the recorded lives again.
 """
@@ -42,17 +47,10 @@ from studies.blind_lives.estimated import blind_life
 from studies.blind_lives.lives import SEED, BlindPlan, agrees, analyse, plan_of, truth_of
 from studies.common.lives import HEALTHY
 from studies.common.metrics import clopper_pearson
-from studies.harness.claims import Claim, Older, number, share
+from studies.harness.claims import Claim, number, share
 from studies.harness.study import LEVEL, Row, Study, read_record
 
 STEP = "all of it, from raw logs to the report"
-OLDER = {
-    "result": Older(
-        "00835a0747e8",
-        "most lives were those of machines that differ from the shipped map: these are raw logs of "
-        "the nominal machine",
-    )
-}
 NAMES = {
     "guide_preload": "preload",
     "mount_stiffness": "mount stiffness",
