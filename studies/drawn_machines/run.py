@@ -17,14 +17,16 @@ Method
     machines with the known laws, on which the same intervals must hold, and nominal healthy ones,
     which must raise no alarm.
 Answer
-    Far from it. Of 100 machines 82 are more than 3 % off the description, so that the program
-    withholds their health. Of 60 healthy ones 43 alarm, of those that did not run in 6 of 17, of 60
-    nominal ones none: lag, level and unlogged payload do that, of single circumstances. 90 %
-    intervals of the preload hold in 75 of 99 at the last log and 77 of 99 by the laws, those of the
-    first limit in 64 of 99 (30 of 33 where the description has the families, 34 of 66 elsewhere),
-    and 27 of 99 services at a risk of 5 % come after the failure. On nominal machines all hold, and
-    no service is late. What holds on drawn ones: the intervals of raw frequencies (44 of 44), those
-    of the mount at the last log and by the laws, and verdicts that are surer than 95 % (57 of 57).
+    Intervals widen and alarms wait. Of 100 machines 77 are more than 3 % off the description, so
+    that the program withholds their health. Of 60 healthy ones 1 alarms (43 before the tracker
+    allowed for lag, wander and running-in), of 60 nominal ones none. Of single circumstances only
+    a payload that no log states alarms, in 15 of 15: each change of it is a step. 90 % intervals
+    hold 90 of 100 preloads at the last log, 81 by the laws, and 91 of 100 remaining lives (31 of
+    33 where the description has the families, 60 of 67 elsewhere); 2 of 100 services at a risk of
+    5 % come after the failure. 86 verdicts are right and 3 are steps; all 42 that are surer than
+    95 % are right. With frequencies of its own 44 of 48 modes of raw logs are found and all 44
+    frequencies held, of the shipped description 37. On nominal machines all 16 hold, and no
+    service is late.
 Run time
     25 minutes on one processor.
 """
@@ -43,15 +45,12 @@ from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.tracking.track import track
 from studies.common.metrics import clopper_pearson
 from studies.drawn_machines.machines import PARAMETERS, RISK, followed, identified, told
-from studies.harness.claims import Claim, Older, counted, number
+from studies.harness.claims import Claim, counted, number
 from studies.harness.provenance import code_of
 from studies.harness.study import Row, Study, judge_places, judge_scores, share_row
 
 STEP = "health, on machines outside the model"
 
-OLDER = {
-    "result": Older("0196f31aa86b", "modes were averaged over coloured forces"),
-}
 FIRST_SEED = 1000
 # Machines with all answers, healthy ones, per circumstance, raw, of the control; logs; raw logs.
 FULL = {"machines": 100, "healthy": 60, "each": 15, "raw": 8, "control": 16,
@@ -85,7 +84,7 @@ CALM, IN_TIME = (
 )
 MODES_FOUND = "raw logs: modes are covered"
 NAMES = "names are not in doubt on a drawn machine"
-NOT_MET = (*HOLDS.values(), CALM, IN_TIME, NAMES, MODES_FOUND)
+NOT_MET = (NAMES, MODES_FOUND)
 
 
 def main() -> None:
