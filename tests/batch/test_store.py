@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import socket
 import sqlite3
 import time
@@ -39,6 +41,7 @@ from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
+from studies.harness.servers import Postgres
 from tests.assessments import leaves, worn
 
 SCHEMA = constants.SCHEMA
@@ -211,6 +214,40 @@ def test_a_server_that_says_nothing_is_not_waited_for(
         with pytest.raises(StoreError, match="timeout"):
             Store(f"postgresql://me@127.0.0.1:{port}/fleet{query}")
     assert time.monotonic() - begun < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_frozen_server_is_not_waited_for(
+    whole: bool, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process of the server that is stopped, or all, ends a statement by a StoreError."""
+    monkeypatch.setattr(constants, "ANSWER_TIMEOUT_S", 1)
+    with postgres.database() as url, closing(Store(f"{url}?connect_timeout=2")) as store:
+        put_in(store, "before", reading())
+        with pytest.raises(StoreError, match="has not answered for 1 s; its results are kept"):
+            _ask(store, "SELECT pg_sleep(20)")
+        [frozen] = [row[0] for row in _ask(store, "SELECT pg_backend_pid()")]
+        begun = time.monotonic()
+        try:
+            os.kill(frozen, signal.SIGSTOP)
+            if whole:
+                postgres.signal(signal.SIGSTOP)
+                with pytest.raises(StoreError, match=r"timeout|not answered"):
+                    put_in(store, "during", reading())
+            else:
+                # The connection is pinged first, and replaced.
+                put_in(store, "during", reading())
+        finally:
+            postgres.signal(signal.SIGCONT)
+            os.kill(frozen, signal.SIGCONT)
+        assert time.monotonic() - begun < 30
+        assert [key for key, _ in store.identified(["before"])] == ["before"]
+
+
+def _ask(store: Store, statement: str) -> list[tuple[object, ...]]:
+    with store._begin() as connection:
+        return [tuple(row) for row in connection.execute(text(statement))]
 
 
 def test_a_file_that_is_no_store_is_named(tmp_path: Path) -> None:
