@@ -553,11 +553,30 @@ def _create_tables(engine: Engine) -> None:
                 for table in _METADATA.sorted_tables:
                     if table.name not in existing:
                         connection.execute(CreateTable(table, if_not_exists=True))
+                        _carry_over(connection, table, existing)
                 _create_views(connection)
             return
         except SQLAlchemyError:
             if attempt == attempts - 1:
                 raise
+
+
+def _carry_over(connection: Connection, table: sql.Table, existing: set[str]) -> None:
+    """Copy the rows of the last schema that no run computes again, by the columns of both."""
+    name, _, number = table.name.rpartition("_")
+    found = (re.fullmatch(rf"{name}_(\d+)", other) for other in existing)
+    older = max((n for one in found if one and (n := int(one[1])) < int(number)), default=None)
+    if table not in (_REPORTED, _POINTS, _CHANGES) or older is None:
+        return
+    there = {column["name"] for column in sql.inspect(connection).get_columns(f"{name}_{older}")}
+    columns = [column for column in table.columns if column.name in there]
+    if all(column.nullable for column in table.columns if column not in columns):
+        before = sql.table(f"{name}_{older}", *(sql.column(c.name, c.type) for c in columns))
+        insert = _INSERT[connection.dialect.name](table)
+        # SQLite needs a condition in front of ON CONFLICT.
+        every = sql.select(before).where(sql.text("1 = 1"))
+        insert = insert.from_select([c.name for c in columns], every)
+        connection.execute(insert.on_conflict_do_nothing())  # of another run at the same time
 
 
 def _create_views(connection: Connection) -> None:

@@ -586,6 +586,40 @@ def test_points_are_replaced_but_remaining_lives_stay(file_url: str, tmp_path: P
     assert len(rows_of(file_url, remaining)) == 2
 
 
+def test_what_no_run_computes_again_comes_from_the_schema_before(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Earlier remaining lives, changes and summaries are copied once; results are not."""
+    assessment = worn(tmp_path)
+    with closing(Store(url)) as store:
+        store.put_points("M7-Y", points(machine_tables((), assessment)))
+        store.put_assessment("M7-Y", "k1", pack_assessment(assessment))
+        store.publish("M7-Y", ["k1"], store.put_refused(()))
+        summary = store.previous_summary("M7-Y", "k2")
+    shown = "SELECT * FROM lmshealth_points ORDER BY quantity, subject, recorded_at"
+    before = rows_of(url, shown)
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for view in ("status", "points", "changes"):
+            connection.execute(text(f"DROP VIEW lmshealth_{view}"))
+        for name in ("points", "changes", "reported", "assessed"):
+            new = f"{name}_{SCHEMA - 1}"
+            connection.execute(text(f"ALTER TABLE {name}_{SCHEMA} RENAME TO {new}"))
+        # A column that is no more, and one that is new.
+        connection.execute(text(f"ALTER TABLE points_{SCHEMA - 1} ADD COLUMN colour TEXT"))
+        connection.execute(text(f"ALTER TABLE points_{SCHEMA - 1} DROP COLUMN low"))
+    engine.dispose()
+    for _ in range(2):
+        with closing(Store(url)) as store:
+            assert rows_of(url, shown) == [row | {"low": None} for row in before] != []
+            assert pack(store.previous_summary("M7-Y", "k2")) == pack(summary) != pack(None)
+            assert not store.has_assessment("M7-Y", "k1")
+        engine = create_engine(url)
+        with engine.begin() as connection:
+            connection.execute(text(f"DELETE FROM points_{SCHEMA - 1}"))
+        engine.dispose()
+
+
 def test_views_of_another_schema_are_replaced(file_url: str, tmp_path: Path) -> None:
     """Dashboards keep their names of views; those of this schema stay as they are."""
     Store(file_url).close()
