@@ -4,6 +4,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
@@ -80,6 +81,23 @@ def test_core_has_no_copyleft() -> None:
     found: dict[str, Distribution] = {}
     needed("lmshealth", frozenset(), found)
     assert not WEAK_COPYLEFT & set(found)
+
+
+def wrong_versions(version: str, changelog: str, tags: list[str]) -> list[str]:
+    """Return which places of a release state another version; clones may have no tags."""
+    headings = re.findall(r"^## (\S+)", changelog, re.M)
+    wrong = [] if version in headings else [f"CHANGELOG.md: {headings}"]
+    return wrong + [tag for tag in tags if tag.startswith("v") and tag != f"v{version}"]
+
+
+def test_a_release_states_one_version() -> None:
+    """Project file, changelog and a tag of this commit agree."""
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    changelog = (ROOT / "CHANGELOG.md").read_text()
+    command = ["git", "tag", "--points-at", "HEAD"]
+    tags = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout
+    assert not wrong_versions(version, changelog, tags.split())
+    assert len(wrong_versions("9.9", changelog, ["v0.1.0"])) == 2
 
 
 def test_lock_holds_what_is_declared() -> None:

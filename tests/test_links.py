@@ -55,6 +55,14 @@ def test_content_is_not_quoted(stage, tmp_path, file):
         assert "Error tokenizing" not in str(caught.value)
 
 
+@pytest.mark.parametrize("file", ["a\\u0000b", "\\u202Ecba", "a\\u200Bb", "é" * 200, "x" * 10_000])
+def test_a_map_of_a_name_that_no_file_has(stage, file):
+    """Names with NUL or invisible characters, and very long ones, are errors in clear text."""
+    with pytest.raises(BadStage, match=r"map\.file: ") as caught:
+        load_stage(stage(file))
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 1000
+
+
 @pytest.mark.parametrize("kind", ["pipe", "device"])
 def test_no_device_is_read(tmp_path, kind):
     """Pipes and devices are refused before they are opened, by links too."""

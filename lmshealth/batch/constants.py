@@ -30,6 +30,10 @@ SQLITE_BUSY_TIMEOUT_S = 120
 SERVER_TIMEOUT_S = 20
 """Seconds (s) that a database server has to answer, unless its URL has ``connect_timeout``."""
 
+ANSWER_TIMEOUT_S = 60
+"""Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
+end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
+
 SCHEMA = 7
 """Version of the tables of a store, part of their names: older tables are not read."""
 

@@ -9,11 +9,13 @@ runs at once: runs may be killed, and may share a store.
 import hashlib
 import logging
 import re
+import socket
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
+from threading import Event, Timer
 from typing import Any, NamedTuple, Self
 from urllib.parse import quote
 
@@ -481,7 +483,10 @@ def _engine(url: URL, *, create: bool) -> Engine:
             url = url.set(drivername="postgresql+psycopg")  # the driver that the extra installs
         timeout = constants.SERVER_TIMEOUT_S
         wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
-        return sql.create_engine(url, pool_pre_ping=True, connect_args=wait)
+        engine = sql.create_engine(url, pool_pre_ping=True, connect_args=wait)
+        if url.drivername == "postgresql+psycopg":
+            sql.event.listen(engine, "do_connect", _connect_bounded)
+        return engine
     name = url.database or ":memory:"
     is_uri = name.startswith("file:")
     if create and not is_uri and not Path(name).parent.is_dir():
@@ -505,6 +510,39 @@ def _engine(url: URL, *, create: bool) -> Engine:
     return engine
 
 
+def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, Any]) -> Any:
+    """Connect to PostgreSQL; a server that is frozen then ends a statement, a ping or a commit."""
+    from psycopg import Connection, OperationalError
+
+    class Bounded(Connection[Any]):
+        def wait(self, *given: Any, **more: Any) -> Any:
+            # libpq waits without end for a server whose system still confirms packets.
+            late = Event()
+            timer = Timer(constants.ANSWER_TIMEOUT_S, _hang_up, [self.fileno(), late])
+            timer.daemon = True
+            timer.start()
+            try:
+                return super().wait(*given, **more)
+            except OperationalError as error:
+                if late.is_set():
+                    why = f"the server has not answered for {constants.ANSWER_TIMEOUT_S} s"
+                    raise OperationalError(why) from error
+                raise
+            finally:
+                timer.cancel()
+
+    return Bounded.connect(*arguments, **options)
+
+
+def _hang_up(number: int, late: Event) -> None:
+    """Close both directions of a socket, which whoever waits for it notices."""
+    late.set()
+    connection = socket.socket(fileno=number)
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+    connection.detach()
+
+
 def _create_tables(engine: Engine) -> None:
     """Create the tables that are missing; another run may do so at the same time."""
     attempts = 3  # PostgreSQL may fail where two runs create the same table
@@ -515,11 +553,30 @@ def _create_tables(engine: Engine) -> None:
                 for table in _METADATA.sorted_tables:
                     if table.name not in existing:
                         connection.execute(CreateTable(table, if_not_exists=True))
+                        _carry_over(connection, table, existing)
                 _create_views(connection)
             return
         except SQLAlchemyError:
             if attempt == attempts - 1:
                 raise
+
+
+def _carry_over(connection: Connection, table: sql.Table, existing: set[str]) -> None:
+    """Copy the rows of the last schema that no run computes again, by the columns of both."""
+    name, _, number = table.name.rpartition("_")
+    found = (re.fullmatch(rf"{name}_(\d+)", other) for other in existing)
+    older = max((n for one in found if one and (n := int(one[1])) < int(number)), default=None)
+    if table not in (_REPORTED, _POINTS, _CHANGES) or older is None:
+        return
+    there = {column["name"] for column in sql.inspect(connection).get_columns(f"{name}_{older}")}
+    columns = [column for column in table.columns if column.name in there]
+    if all(column.nullable for column in table.columns if column not in columns):
+        before = sql.table(f"{name}_{older}", *(sql.column(c.name, c.type) for c in columns))
+        insert = _INSERT[connection.dialect.name](table)
+        # SQLite needs a condition in front of ON CONFLICT.
+        every = sql.select(before).where(sql.text("1 = 1"))
+        insert = insert.from_select([c.name for c in columns], every)
+        connection.execute(insert.on_conflict_do_nothing())  # of another run at the same time
 
 
 def _create_views(connection: Connection) -> None:

@@ -45,6 +45,7 @@ _NO_BAND = (
 )
 _TRIED = 2  # channels in which `init` looks for modes
 _FORMAT = options.format_option("table", "csv", "json")
+_OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 _PLOT = click.option(
     "--plot",
     type=options.OUT,
@@ -65,7 +66,7 @@ _PLOT = click.option(
     metavar="HZ",
     help="Sample rate of logs that state neither times nor a rate.",
 )
-@click.option("--overwrite", is_flag=True, help="Replace files that exist.")
+@_OVERWRITE
 @options.MOST_MEMORY
 @click.pass_context
 def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any) -> None:
@@ -148,8 +149,6 @@ def _propose_stage(path: Path, log: Log) -> None:
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
             modes = read_ambient(log, channels=used, progress=report).modes
-        if modes.frequency.size:
-            path.unlink(missing_ok=True)
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])
@@ -182,6 +181,7 @@ def _propose_stage(path: Path, log: Log) -> None:
     metavar="FILE.toml",
     help="Write a stage description with the modes found in one log, ready to edit.",
 )
+@_OVERWRITE
 @_PLOT
 @click.option("--shapes", is_flag=True, help="Print mode shapes, their complexity and their MAC.")
 @_FORMAT
@@ -252,8 +252,8 @@ def _check_outputs(given: dict[str, Any]) -> None:
         why = None
         if path.suffix not in re.findall(r"\.\w+", endings):
             why = f"must end in {endings}"
-        elif option == "save" and path.exists():
-            why = "exists and is not overwritten; choose another name"
+        elif option == "save" and path.exists() and not given["overwrite"]:
+            why = "exists; set --overwrite, or choose another name"
         if why is not None:
             raise click.BadParameter(f"{path} {why}", param_hint=f"--{option}")
 

@@ -94,9 +94,10 @@ def print_text(text: str, mark: str = "") -> None:
 
 
 def print_refused(rows: Sequence[Row]) -> None:
-    """Print refusals and their reasons."""
-    if rows:
-        print_table("Refused", cells(_REFUSED, short_names(rows)), 5)
+    """Print refusals and their reasons, and apart from them channels that are used in part."""
+    for title, in_part in (("Refused", False), ("Used in part", True)):
+        if own := [row for row in rows if (row["reason"] == "gaps") == in_part]:
+            print_table(title, cells(_REFUSED, short_names(own)), 5)
 
 
 class _Numbers(Formatter):

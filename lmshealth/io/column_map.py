@@ -3,7 +3,6 @@
 A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
 """
 
-import codecs
 import math
 import re
 from dataclasses import dataclass
@@ -251,11 +250,12 @@ def _check(columns: ColumnMap) -> None:
 def _check_layout(layout: CsvLayout) -> None:
     """Check the marks and the encoding of text."""
     delimiter, encoding = layout.delimiter, layout.encoding
-    if delimiter is not None and (not delimiter.isascii() or delimiter in '\r\n"#'):
+    if delimiter is not None and (not delimiter.isascii() or delimiter in '\r\n"#+-'):
         raise ValueError(f"[csv] delimiter is {delimiter!r}, needed one ASCII separator")
     try:
-        codecs.lookup(encoding or "utf-8")
-    except LookupError as error:
+        # Not all codecs of Python are encodings of text.
+        b"1;2".decode(encoding or "utf-8", "replace")
+    except (LookupError, ValueError) as error:
         needed = "needed a name that Python has, such as cp1252"
         raise ValueError(f"[csv] encoding is {encoding!r}, {needed}") from error
     if delimiter is not None and delimiter == layout.decimal:

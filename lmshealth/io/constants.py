@@ -60,7 +60,8 @@ PERIODIC = 0.02
 """Largest amplitude of periodic jitter, in intervals: sidebands of a mode at a tenth of the sample
 rate are (π 0.1 0.02)² = 4e-5 of its power, below the floor of all but the clearest modes."""
 LARGEST_SPREAD = 2.0
-"""Largest ratio of the sample rates in one record: it is resampled to the lowest."""
+"""Largest ratio of the sample rates in one record, within `AGREEMENT` of each: it is resampled to
+the lowest."""
 INTERRUPTED_SHARE = 0.01
 """Interruptions per sample above which a record is refused instead of cut, beyond
 `ALWAYS_ALLOWED`."""

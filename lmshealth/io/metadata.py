@@ -1,6 +1,7 @@
 """Metadata of a log: text of the file, the column map and the manifest, converted and checked."""
 
 import math
+import re
 import unicodedata
 from collections.abc import Mapping
 from datetime import UTC, date, datetime
@@ -24,6 +25,10 @@ KEYS = (
     "velocity_mm_s",
 )
 
+# Fillers and selectors of variants are printable to Python, and yet nobody sees them.
+_INVISIBLE = re.compile(
+    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+)
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
 
@@ -56,20 +61,21 @@ def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
 
 
 def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
-    return Unusable("metadata", f"{key} is {given[key][:80]!r}, needed {needed}")
+    return Unusable("metadata", f"{key} is {given[key][:80]!a}, needed {needed}")
 
 
 def parse_name(given: Mapping[str, str], key: str) -> str | None:
-    """Read a name; None where there is none. Unprintable or very long ones are refused.
+    """Read a name; None where there is none. Very long ones are refused, and invisible characters.
 
     Names are normalised (NFC): systems differ in how they write an accented letter, and one
     machine must not become two.
     """
-    if not given.get(key):
+    name = given.get(key)
+    if not name:
         return None
-    if not given[key].isprintable() or len(given[key]) > constants.LONGEST_NAME:
+    if not name.isprintable() or _INVISIBLE.search(name) or len(name) > constants.LONGEST_NAME:
         raise _bad(given, key, f"printable text of at most {constants.LONGEST_NAME} characters")
-    return unicodedata.normalize("NFC", given[key])
+    return unicodedata.normalize("NFC", name)
 
 
 def parse_moment(given: Mapping[str, str]) -> datetime | None:

@@ -115,7 +115,8 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
         notes.append(f"the sample rate varies from {lowest:.6g} to {highest:.6g} Hz")
         own = float(f"{lowest:.10g}")
     note = " and ".join(notes)
-    spread = highest > constants.LARGEST_SPREAD * lowest
+    # Each of the two is known within the tolerance.
+    spread = highest > constants.LARGEST_SPREAD * (1 + 2 * constants.AGREEMENT) * lowest
     if n_lost > constants.LARGEST_MISSING * time.size or (varies and spread):
         needed = "export samples of one clock, or cut the record where the rate changes"
         raise Unusable("time", f"{note}; {needed}")

@@ -41,7 +41,7 @@ from lmshealth.modal.targets import (
     clusters,
     limit_channels,
 )
-from lmshealth.signal.segments import Segment, find_phases, stationary
+from lmshealth.signal.segments import Segment, find_phases, stationary, with_few_lengths
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
     LogSpectra,
@@ -263,7 +263,14 @@ def _transform(
     return stationary(phases, 0), LogSpectra(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
-        cross_spectra(channels, segments, rate, reach, ceiling=ceiling, resonances=resonances),
+        cross_spectra(
+            channels,
+            with_few_lengths(segments),
+            rate,
+            reach,
+            ceiling=ceiling,
+            resonances=resonances,
+        ),
     )
 
 

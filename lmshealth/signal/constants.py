@@ -12,6 +12,9 @@ SAME_VELOCITY = 0.01
 LEAST_LENGTH = 0.05
 # A segment of more than a minute is cut into parts of at least this many shortest segments.
 PARTS_LENGTH = 10
+# Segments of more lengths than this (a log of many gaps) are shortened to common ones, each by at
+# most this share: a standard deviation grows by 5 % at most, and a log takes seconds, not minutes.
+MOST_LENGTHS, SHORTENED = 24, 0.1
 
 # --- Lines --------------------------------------------------------------------------------------
 # Relative width of a line: it keeps its phase for about a thousand periods (mains wander by some

@@ -103,6 +103,22 @@ def stationary(phases: Sequence[Segment], n_least: int) -> tuple[Segment, ...]:
     )
 
 
+def with_few_lengths(segments: Sequence[Segment]) -> tuple[Segment, ...]:
+    """Shorten segments of very many lengths to fewer, each by at most `SHORTENED`.
+
+    Every length is a computation of its own in the fits.
+    """
+    common: dict[int, int] = {}
+    shortest = 0
+    for size in sorted({segment.stop - segment.start for segment in segments}):
+        if size * (1 - constants.SHORTENED) > shortest:
+            shortest = size
+        common[size] = shortest
+    if len(common) <= constants.MOST_LENGTHS:
+        return tuple(segments)
+    return tuple(replace(s, stop=s.start + common[s.stop - s.start]) for s in segments)
+
+
 def _parts(segment: Segment, longest: int) -> list[Segment]:
     """Cut a segment into the fewest parts of one length; a few last samples may be omitted."""
     from scipy import fft  # late: the command line needs only the names of the parts

@@ -1,6 +1,7 @@
 """Stage descriptions: schema, loading and checks of the TOML file (README.md is its reference)."""
 
 import hashlib
+import os
 import sys
 from dataclasses import dataclass
 from datetime import date
@@ -129,7 +130,7 @@ class ParameterSpec(_Part, frozen=True):
 class MapSpec(_Part, frozen=True):
     """File of the modal map and relative standard deviation of its sensitivities."""
 
-    file: str
+    file: Name
     model_std: Annotated[float, Meta(ge=0, lt=1)] = 0.05
 
 
@@ -378,7 +379,7 @@ def load_stage(reference: str, *, follow_links: bool = False) -> Stage:
             found = "it leaves the folder of the description"
             step = "copy the map into that folder, or set --follow-links"
             raise BadStage(f"{path}: map.file: {found}; {step}")
-        if not map_path.is_file():
+        if not os.path.isfile(map_path):
             raise BadStage(f"{path}: map.file: there is no file {map_path}")
         modal_map = read_map(str(map_path), names)
         digest.update(map_path.read_bytes())

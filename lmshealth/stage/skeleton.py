@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from lmshealth._files import write_text
 from lmshealth._toml import quoted
 from lmshealth.errors import BadStage
 from lmshealth.stage.description import ModeSpec
@@ -28,9 +29,8 @@ def write_skeleton(
 ) -> None:
     """Write a description of modes, each with a comment, that `load_stage` reads as it is.
 
-    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. `BadStage` if
-    there is no mode; `FileExistsError`: a description that somebody may have edited is not
-    overwritten.
+    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. A file that
+    exists is replaced. `BadStage` if there is no mode, `BadTable` if it cannot be written.
     """
     if not modes:
         raise BadStage(f"{path} is not written: a description needs at least one mode; none found")
@@ -40,6 +40,4 @@ def write_skeleton(
     template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
     machines = glob.escape(stage) if stage else "*"
     given = {"name": path.stem, "source": source, "stage": machines, "modes": modes}
-    text = template.render(given, quoted=quoted)
-    with path.open("x", encoding="utf-8") as file:
-        file.write(text)
+    write_text(path, template.render(given, quoted=quoted))

@@ -130,6 +130,11 @@ class Postgres:
             self._process.wait(WAIT_S)
             self._process = None
 
+    def signal(self, number: int) -> None:
+        """Send a signal to the main process of the server."""
+        assert self._process is not None
+        self._process.send_signal(number)
+
     def url(self, database: str) -> str:
         """Return the address of a database for SQLAlchemy, through TCP."""
         return f"postgresql+psycopg://{_USER}:{self.password}@127.0.0.1:{self.port}/{database}"

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import signal
 import socket
 import sqlite3
 import time
@@ -39,6 +41,7 @@ from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
+from studies.harness.servers import Postgres
 from tests.assessments import leaves, worn
 
 SCHEMA = constants.SCHEMA
@@ -211,6 +214,40 @@ def test_a_server_that_says_nothing_is_not_waited_for(
         with pytest.raises(StoreError, match="timeout"):
             Store(f"postgresql://me@127.0.0.1:{port}/fleet{query}")
     assert time.monotonic() - begun < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_frozen_server_is_not_waited_for(
+    whole: bool, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process of the server that is stopped, or all, ends a statement by a StoreError."""
+    monkeypatch.setattr(constants, "ANSWER_TIMEOUT_S", 1)
+    with postgres.database() as url, closing(Store(f"{url}?connect_timeout=2")) as store:
+        put_in(store, "before", reading())
+        with pytest.raises(StoreError, match="has not answered for 1 s; its results are kept"):
+            _ask(store, "SELECT pg_sleep(20)")
+        [frozen] = [row[0] for row in _ask(store, "SELECT pg_backend_pid()")]
+        begun = time.monotonic()
+        try:
+            os.kill(frozen, signal.SIGSTOP)
+            if whole:
+                postgres.signal(signal.SIGSTOP)
+                with pytest.raises(StoreError, match=r"timeout|not answered"):
+                    put_in(store, "during", reading())
+            else:
+                # The connection is pinged first, and replaced.
+                put_in(store, "during", reading())
+        finally:
+            postgres.signal(signal.SIGCONT)
+            os.kill(frozen, signal.SIGCONT)
+        assert time.monotonic() - begun < 30
+        assert [key for key, _ in store.identified(["before"])] == ["before"]
+
+
+def _ask(store: Store, statement: str) -> list[tuple[object, ...]]:
+    with store._begin() as connection:
+        return [tuple(row) for row in connection.execute(text(statement))]
 
 
 def test_a_file_that_is_no_store_is_named(tmp_path: Path) -> None:
@@ -547,6 +584,40 @@ def test_points_are_replaced_but_remaining_lives_stay(file_url: str, tmp_path: P
     assert subjects == ["frequency_hz roll", *(f"remaining_km {name}" for name in expected)]
     remaining = "SELECT * FROM lmshealth_points WHERE subject = 'any'"
     assert len(rows_of(file_url, remaining)) == 2
+
+
+def test_what_no_run_computes_again_comes_from_the_schema_before(
+    url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Earlier remaining lives, changes and summaries are copied once; results are not."""
+    assessment = worn(tmp_path)
+    with closing(Store(url)) as store:
+        store.put_points("M7-Y", points(machine_tables((), assessment)))
+        store.put_assessment("M7-Y", "k1", pack_assessment(assessment))
+        store.publish("M7-Y", ["k1"], store.put_refused(()))
+        summary = store.previous_summary("M7-Y", "k2")
+    shown = "SELECT * FROM lmshealth_points ORDER BY quantity, subject, recorded_at"
+    before = rows_of(url, shown)
+    engine = create_engine(url)
+    with engine.begin() as connection:
+        for view in ("status", "points", "changes"):
+            connection.execute(text(f"DROP VIEW lmshealth_{view}"))
+        for name in ("points", "changes", "reported", "assessed"):
+            new = f"{name}_{SCHEMA - 1}"
+            connection.execute(text(f"ALTER TABLE {name}_{SCHEMA} RENAME TO {new}"))
+        # A column that is no more, and one that is new.
+        connection.execute(text(f"ALTER TABLE points_{SCHEMA - 1} ADD COLUMN colour TEXT"))
+        connection.execute(text(f"ALTER TABLE points_{SCHEMA - 1} DROP COLUMN low"))
+    engine.dispose()
+    for _ in range(2):
+        with closing(Store(url)) as store:
+            assert rows_of(url, shown) == [row | {"low": None} for row in before] != []
+            assert pack(store.previous_summary("M7-Y", "k2")) == pack(summary) != pack(None)
+            assert not store.has_assessment("M7-Y", "k1")
+        engine = create_engine(url)
+        with engine.begin() as connection:
+            connection.execute(text(f"DELETE FROM points_{SCHEMA - 1}"))
+        engine.dispose()
 
 
 def test_views_of_another_schema_are_replaced(file_url: str, tmp_path: Path) -> None:

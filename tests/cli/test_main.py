@@ -253,6 +253,9 @@ def test_saved_modes_are_a_description_that_finds_them_again(folder: Path, tmp_p
                  (log, "--save", tmp_path / "b.toml", "--stage", path)):  # fmt: skip
         assert call("modes", *more).exit_code == 2
     assert path.read_text() == written and list(tmp_path.iterdir()) == [path]
+    path.write_text("edited")
+    assert call("modes", log, *band, "--save", path, "--overwrite").exit_code == 0
+    assert path.read_text() == written and list(tmp_path.iterdir()) == [path]
 
 
 def test_nothing_is_saved_without_modes(tmp_path: Path) -> None:

@@ -76,6 +76,9 @@ def test_absent_source(make, tmp_path):
         "sample_rate_hz = 1\n[metadata]\nsample_rate_hz = 1",
         "[csv]\ndelimiter = 'ab'",
         "[csv]\ndelimiter = '\"'",
+        "[csv]\ndelimiter = '-'",
+        "[csv]\nencoding = 'zlib_codec'",
+        "[csv]\nencoding = 'idna'",
         "not toml",
     ],
 )

@@ -42,6 +42,8 @@ def test_everything():
         ("sample_rate_hz", "inf"),
         ("baseline", "maybe"),
         ("stage", "a\x1b[31m"),
+        ("stage", "a\ufe0f"),
+        ("stage", "a\u3164"),
         ("servo_id", "x" * 300),
     ],
 )

@@ -124,8 +124,26 @@ def test_stamps_that_stand_still_are_refused(digits):
 
 def test_a_rate_that_more_than_doubles_is_refused():
     """Resampling to the lowest rate would lose more than half of the band."""
-    with pytest.raises(Unusable, match="cut the record where the rate changes"):
-        time_axis(np.cumsum(np.repeat([1e-3, 3e-3], 6000)), None)
+    for slow in (2.01e-3, 3e-3):
+        with pytest.raises(Unusable, match="cut the record where the rate changes"):
+            time_axis(np.cumsum(np.repeat([1e-3, slow], 6000)), None)
+
+
+@pytest.mark.parametrize("rates", [(1000, 500), (2999.7, 1499.85), (250, 500)])
+@pytest.mark.parametrize("digits", [6, 9])
+def test_a_rate_may_halve_or_double(rates, digits):
+    """A factor of two is resampled, as documented, however the stamps are rounded."""
+    time = np.cumsum(np.repeat(1 / np.array(rates), 6000))
+    axis = time_axis(np.round(time, digits), None)
+    assert axis.sample_rate == pytest.approx(min(rates), rel=2e-4)
+    sine = np.sin(2 * np.pi * 0.1 * min(rates) * time)
+    ranges = pieces(time.size, [axis.lost], axis.breaks)
+    (found, at), cut = resampled([(sine, True), (time, False)], ranges, axis)
+    for start, stop in cut:
+        steps = np.arange(stop - start) / axis.sample_rate
+        even = np.median(at[start:stop] - steps) + steps
+        error = np.abs(found[start:stop] - np.sin(2 * np.pi * 0.1 * min(rates) * even))
+        assert np.quantile(error, 0.9) < 0.01
 
 
 def test_pieces_around_missing_samples():

@@ -19,6 +19,7 @@ from lmshealth.signal.segments import (
     find_segments,
     nominal_velocity,
     select_segments,
+    with_few_lengths,
 )
 from tests.signals import make_log
 
@@ -229,3 +230,18 @@ def test_parts_stay_long_enough_for_what_is_looked_for(monkeypatch: pytest.Monke
     assert {p.stop - p.start for p in find_segments(log, 0.1)} == {1000}
     assert {p.stop - p.start for p in find_segments(log, 0.45)} == {4500}
     assert {p.stop - p.start for p in find_segments(log, 2.0)} == {9000}
+
+
+def test_segments_of_many_lengths_get_few() -> None:
+    """A hundred gaps leave a dozen lengths, each at most a tenth shorter; few lengths stay."""
+    ends = np.cumsum(np.random.default_rng(0).integers(500, 2000, 101)).tolist()
+    many = [Segment(start, stop, np.nan) for start, stop in pairwise(ends)]
+    few = with_few_lengths(many)
+    assert len({one.stop - one.start for one in few}) <= 14
+    for one, before in zip(few, many, strict=True):
+        assert one.start == before.start and one.stop <= before.stop
+        assert one.stop - one.start >= 0.9 * (before.stop - before.start)
+    assert with_few_lengths(many[:20]) == tuple(many[:20])
+    # Moves of nearly one length lose nothing more than what they differ in.
+    moves = [Segment(0, 5000 + k, 0.1) for k in range(40)]
+    assert {one.stop for one in with_few_lengths(moves)} == {5000}
