@@ -48,7 +48,7 @@ def test_trace(tmp_path):
     log = read_log(tmp_path / "log.xml", columns=ColumnMap(columns={"delta_e_mm": "lag error"}))
     assert log.sample_rate == pytest.approx(1000)
     np.testing.assert_allclose(log.channels[0].values, 1e-3 * X, rtol=1e-12)
-    with pytest.raises(BadLog, match=r"there: lag error, /v"):
+    with pytest.raises(BadLog, match=r"there: time \[s\], lag error, /v"):
         read_log(tmp_path / "log.xml")
     columns = ColumnMap(columns={"delta_e_mm": "lag error", "acc_x_g": "/v"})
     refused = read_log(tmp_path / "log.xml", columns=columns).refused
