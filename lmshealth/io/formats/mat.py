@@ -143,7 +143,7 @@ def _testlab(
             [] if stated is None else [str(np.ravel(one)[0]) for one in stated.ravel() if one.size]
         )
         if len(names) != columns.shape[1]:
-            names = [f"{variable}(:,{k + 1})" for k in range(columns.shape[1])]
+            names = [f"{variable}:{k + 1}" for k in range(columns.shape[1])]
         unit = str(label.ravel()[0]) if label is not None and label.size else ""
         begin = 0.0 if start is None or not start.size else float(start.ravel()[0])
         rate = rate_of(float(step.ravel()[0])) if step.size else None
