@@ -368,7 +368,7 @@ def test_limit_of_memory(tmp_path, packed):
 
 @pytest.mark.parametrize("packed", [True, False])
 def test_structs_of_testlab(tmp_path, packed):
-    """Names, unit, rate and values of an export of Siemens Testlab are read without a column map."""
+    """Names, unit, rate and values of an export of Siemens Testlab need no column map."""
     values = np.random.default_rng(1).normal(size=(400, 2))
     label = {"quantity": {"label": "g"}}
     axis = {"start_value": 0.0, "increment": 1 / 2048, "number_of_values": 400.0}
