@@ -2,7 +2,9 @@
 
 import csv
 import io
+import math
 import re
+import shlex
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -16,15 +18,14 @@ from lmshealth._toml import decode
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.registry import format_name
-from lmshealth.io.log import Log, Metadata, Refusal
+from lmshealth.io.log import Log, Refusal
 from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import shown
 from lmshealth.modal.acceleration_survey import survey
 from lmshealth.modal.free_decay.identification import identify_decays
 from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
-from lmshealth.modal.frf.measured import FORMATS, MeasuredResponse, read_responses
+from lmshealth.modal.frf.measured import MeasuredResponse, read_responses
 from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
@@ -33,7 +34,7 @@ from lmshealth.report.tables import Row
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
-from lmshealth.stage.proposal import propose
+from lmshealth.stage.proposal import moment_of, propose
 from lmshealth.stage.skeleton import searches, write_skeleton
 from lmshealth.tracking.history import LogEstimates
 
@@ -44,6 +45,8 @@ _NO_BAND = (
     "LOW HIGH. The mode names are valid for this call only."
 )
 _TRIED = 2  # channels in which `init` looks for modes
+# Signal-to-noise ratio of the modes in the band that it proposes, and factor to its ends.
+_CLEAR, _BESIDE = 3.0, 1.3
 _FORMAT = options.format_option("table", "csv", "json")
 _OVERWRITE = click.option("--overwrite", is_flag=True, help="Replace files that exist.")
 _PLOT = click.option(
@@ -86,65 +89,66 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     ctx.params |= {"logs": logs, "columns": decode(text.encode(), ColumnMap)}
     first: list[Log] = []
 
-    def tried(log: Log) -> tuple[str, Metadata]:
+    paths = {shown(path): path for path in logs}
+
+    def tried(log: Log) -> Row:
         first[:] = first or [log]
-        return log.name, log.metadata
+        path, own = paths[log.name], log.metadata
+        moment, remark = moment_of(path, log)
+        return {
+            "file": path.absolute(),
+            "stage": own.stage or path.absolute().parent.name,
+            "recorded_at": moment,
+            "travel_km": None if own.travel is None else own.travel / 1e3,
+            "temperature_c": own.covariates.get("temperature_c"),
+            "remark": f"recorded_at: {remark or 'not found'}",
+        }
 
     found, lost = _each(ctx, tried)
     if found:
         write_text(map_file, text)
         terminal.print_notes([f"{map_file}: column map, tried on {len(found)} logs"])
-        _propose_manifest(sheet, {shown(path): path for path in logs}, found)
-        _propose_stage(stage, first[0])
-        terminal.print_notes(_next_steps(first[0], map_file))
+        _propose_manifest(sheet, found)
+        band = _propose_stage(stage, first[0])
+        terminal.print_notes(_next_steps(first[0], map_file, band))
     _exit(ctx, found, lost)
 
 
-def _propose_manifest(
-    sheet: Path, paths: dict[str, Path], found: list[tuple[str, Metadata]]
-) -> None:
+def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
     """Write a manifest with what the files state; a manifest names no file out of its folder."""
     folder = sheet.absolute().parent
+    if outside := [row["file"] for row in rows if not row["file"].is_relative_to(folder)]:
+        why = f"not written, {outside[0]} is not in its folder: choose --out with the logs in it"
+        terminal.print_notes([f"{sheet}: {why}"])
+        return
     table = io.StringIO()
-    writer = csv.writer(table, lineterminator="\n")
-    writer.writerow(["file", "stage", "recorded_at", "travel_km", "temperature_c"])
-    for name, metadata in found:
-        path = paths[name].absolute()
-        if not path.is_relative_to(folder):
-            why = f"not written, {name} is not in its folder: choose --out with the logs in it"
-            terminal.print_notes([f"{sheet}: {why}"])
-            return
-        moment = metadata.recorded_at.isoformat() if metadata.recorded_at else ""
-        stage = metadata.stage or path.parent.name
-        writer.writerow(
-            [
-                path.relative_to(folder).as_posix(),
-                stage,
-                moment,
-                None if metadata.travel is None else metadata.travel / 1e3,
-                "",
-            ]
-        )
+    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(row | {"file": row["file"].relative_to(folder).as_posix()} for row in rows)
     write_text(sheet, table.getvalue())
-    why = "stage is the folder where the file names none; fill in what is empty, `run` needs it"
+    why = (
+        "stage is the folder where the file names none; `run` needs what is empty, remark says why"
+    )
     terminal.print_notes([f"{sheet}: {why}"])
 
 
-def _next_steps(log: Log, map_file: Path) -> list[str]:
+def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[str]:
     """Name the commands that read a log by its proposed map."""
     by = {one.kind: one.name for one in reversed(log.channels)}
-    steps = [f"next: lmshealth modes {log.name} --columns {map_file}"]
+    what = f"{shlex.quote(log.name)} --columns {shlex.quote(str(map_file))}"
+    steps = [f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")]
     if "current" in by:
         output = by.get("acceleration", by.get("displacement"))
-        step = steps[0].replace(
-            "next: lmshealth modes", "or, where a current excites: lmshealth frf"
-        )
-        steps.append(f"{step} --input {by['current']} --output {output}")
+        ends = f"--input {by['current']} --output {output}"
+        steps.append(f"or, where a current excites: lmshealth frf {what} {ends}")
     return steps
 
 
-def _propose_stage(path: Path, log: Log) -> None:
-    """Write a description of the modes of a log, where it has some; few channels are quick."""
+def _propose_stage(path: Path, log: Log) -> tuple[int, int] | None:
+    """Write a description of the modes of a log, where it has some; few channels are quick.
+
+    Return a band in Hz around the clear ones.
+    """
     used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
@@ -152,6 +156,9 @@ def _propose_stage(path: Path, log: Log) -> None:
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])
+        return None
+    clear = modes.frequency[modes.snr >= _CLEAR]
+    return (int(clear.min() / _BESIDE), math.ceil(clear.max() * _BESIDE)) if clear.size else None
 
 
 @options.command(
@@ -434,7 +441,7 @@ def _responses(
 ) -> list[Log | MeasuredResponse]:
     """Read the measured responses of a file that are asked for, or its log."""
     named = source is not None and output is not None
-    measured = read_responses(path, **reading) if named or format_name(path) in FORMATS else ()
+    measured = read_responses(path, **reading)
     used = [r for r in measured if output in (None, r.output) and source in (None, r.input)]
     if used:
         return list(used)

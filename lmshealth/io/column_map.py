@@ -49,6 +49,7 @@ _SPELLINGS = str.maketrans(
     {"/": "_", "^": None, "*": None, "µ": "u", "μ": "u", "²": "2", " ": None, "Â": None}
 )
 _ALIASES = {"A": "a", "mA": "ma", "gn": "g", "m_s_s": "m_s2", "m_sec2": "m_s2"}
+_ALIASES |= dict.fromkeys(("sec", "second", "seconds", "Second", "S"), "s")
 
 # By prefix of a column: its role, and the dimension of its units.
 _PREFIXES: dict[str, tuple[Role, str]] = {

@@ -6,6 +6,7 @@ Names and units decide first, the samples where neither does. Every guess has it
 import re
 from collections.abc import Iterator
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple
 
@@ -18,20 +19,25 @@ from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
+from lmshealth.io.formats.text_layouts import LOCAL_TIME
+from lmshealth.io.log import Log
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
 
-# Words in the names of columns, in the languages of exporters.
-_TIME = re.compile(r"time|zeit|temps|tiempo|tempo|x_value|\bt\b|\.x\.data", re.IGNORECASE)
+# Words in the names of columns, in the languages of exporters, and units of times in names.
+_TIME = re.compile(
+    r"time|zeit|temps|tiempo|tempo|date|datum|millis|micros|x_value|\bt\b|\.x\.data", re.IGNORECASE
+)
+_TIME_UNITS = {"ms": r"millis|[_(]ms\b", "us": r"micros|[_(][uµ]s\b", "s": r"[_(]s\b|second"}
 _SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECASE)
 # By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
 _SIGNALS = {
-    "delta_e": ("follow|error|deviat|lag|delta|schlepp|regelabw|PE", "length", 1e-6, "m"),
+    "delta_e": ("follow|error|deviat|lag|delta|schlepp|regelabw|PE|pos_?diff", "length", 1e-6, "m"),
     "acc": ("acc|beschl|vibr", "acceleration", 1.0, "m/s²"),
-    "current": ("current|strom|courant|i_?q|ampere", "current", 1.0, "A"),
+    "current": ("current(?! *pos| *vel)|strom|courant|i_?q|ampere", "current", 1.0, "A"),
 }
 # Units in which sensors are recorded without conversion, and samples from which columns are judged.
-_RAW_UNITS = ("", "-", "counts", "V", "mV", "Volts")
+_RAW_UNITS = ("", "-", "counts", "V", "mV", "Volt", "Volts")
 _JUDGED = 1 << 16
 # A vibration crosses its mean so often at least: in all, and as a share of its samples.
 _CROSSINGS = 50, 0.001
@@ -39,6 +45,11 @@ _CROSSINGS = 50, 0.001
 _MOST_GUESSED = 3
 # Sample rates in Hz by which the unit of times without one is chosen.
 _RATES = {"s": (10.0, 2e5), "ms": (20.0, 2e5), "us": (20.0, 2e6)}
+# A date in the name of a file, with or without a time.
+_DATE = re.compile(
+    r"(?<!\d)(?P<y>20\d\d)(?P<sep>[-_]?)(?P<m>\d\d)(?P=sep)(?P<d>\d\d)"
+    r"(?:[-_T ]?(?P<h>[01]\d|2[0-3])[-_.:h]?(?P<min>[0-5]\d)(?:[-_.:]?(?P<s>[0-5]\d))?)?(?!\d)"
+)
 _DEPTH = 3  # of structs in structs
 _UNIT = re.compile(r"(?P<name>.+) \[(?P<unit>[^\]]*)\]")
 
@@ -84,6 +95,25 @@ def propose(
     return "\n".join(_lines(label, content, guesses, None if timed else rate)), guesses
 
 
+def moment_of(path: Path, log: Log) -> tuple[str, str]:
+    """Return when a log was recorded (ISO 8601), and where that is stated; empty where it is not.
+
+    A moment without a time zone gets that of this computer.
+    """
+    if log.metadata.recorded_at:
+        return log.metadata.recorded_at.isoformat(), "stated in the file"
+    local = load(path, ColumnMap(columns={"acc_none": "\0"})).metadata.get(LOCAL_TIME, "")
+    where = "header of the file"
+    if not local and (date := _DATE.search(path.name)):
+        clock = f"{date['h']}:{date['min']}:{date['s'] or '00'}" if date["h"] else "00:00"
+        local, where = f"{date['y']}-{date['m']}-{date['d']} {clock}", "name of the file"
+    try:
+        moment = datetime.fromisoformat(local).astimezone().isoformat()
+    except ValueError:
+        return "", ""
+    return moment, f"{where}, time zone of this computer"
+
+
 def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], list[Guess]]:
     """Read all columns as they are; those that hold no such series of numbers are left out."""
     content = load(path, ColumnMap(), max_memory)
@@ -93,7 +123,8 @@ def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], lis
         pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
         units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
         for name in (name for name in units if name not in [*left_out, *read]):
-            key = "time_s" if _TIME.search(name) else "acc_probed"
+            own = unit_key(units[name], "time") or _time_unit(name)
+            key = f"time_{own or 's'}" if own or _TIME.search(name) else "acc_probed"
             try:
                 found = load(path, ColumnMap(columns={key: name}), max_memory)
                 # A struct is opened by its name.
@@ -133,18 +164,29 @@ def _guesses(columns: list[_Column]) -> list[Guess]:
 
 
 def _time(one: _Column) -> Guess | None:
-    """Guess a column of times: its name or its unit says so, and it ascends."""
-    unit, steps = unit_key(one.unit, "time"), np.diff(one.values)
-    if not (_TIME.search(one.name) or unit) or steps.size < 1 or not (steps > 0).all():
+    """Guess a column of times: its name or unit says so, or it has none; and it ascends."""
+    unit, steps = unit_key(one.unit, "time") or _time_unit(one.name), np.diff(one.values)
+    if steps.size < 1 or not (steps > 0).all():
         return None
     step = float(np.median(steps))
+    if even := bool(np.ptp(steps) < step / 2):
+        step = float(steps.mean())  # of rounded times
+    # Steps of 1 count rows.
+    unnamed = one.name.isdecimal() and even and step != 1
+    if not (_TIME.search(one.name) or unit or unnamed):
+        return None
     rates = {u: 1 / (step * parse_column(f"time_{u}").factor) for u in _RATES}
     fits = (u for u, (low, high) in _RATES.items() if low <= rates[u] <= high)
     taken = unit or next(fits, None)
     if taken is None:
         return None
-    how = f"in {one.unit}" if unit else f"in steps of {step:.6g}, taken as {taken}"
+    how = f"in {unit}" if unit else f"in steps of {step:.6g}, taken as {taken}"
     return Guess(one.name, f"time_{taken}", f"times {how}: {rates[taken]:.6g} Hz")
+
+
+def _time_unit(name: str) -> str | None:
+    """Return the unit of times that the name of a column holds."""
+    return next((unit for unit, words in _TIME_UNITS.items() if re.search(words, name, re.I)), None)
 
 
 def _by_name(one: _Column) -> Guess:
@@ -159,11 +201,14 @@ def _by_name(one: _Column) -> Guess:
             return Guess(one.name, f"reference_{what}_{unit}", f"set {what} in {one.unit}")
     for prefix, (words, dimension, *_) in _SIGNALS.items():
         known = unit_key(one.unit, dimension) is not None
-        word = re.search(rf"(?<![^\W\d_])({words})", one.name, re.IGNORECASE)
+        # A prefix of lower-case letters may name a type, as in fPosDiff.
+        word = re.search(rf"(?<![^\W\d_])(?:[a-z]{{1,2}}(?=[A-Z]))?((?i:{words}))", one.name)
         if known and prefix != "delta_e":
             return _signal(prefix, one, f"its unit is {one.unit}")
         if word and (known or one.unit in _RAW_UNITS):
-            return _signal(prefix, one, f"{word[0]!r} is in its name")
+            return _signal(prefix, one, f"{word[1]!r} is in its name")
+    if not one.unit and unit_key(one.name.rpartition("_")[2], "acceleration"):
+        return _signal("acc", one, "its name ends in a unit of acceleration")
     return Guess(one.name, "", "neither name nor unit is that of a signal")
 
 

@@ -12,7 +12,7 @@ from lmshealth._toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.reading import read_log
-from lmshealth.stage.proposal import propose
+from lmshealth.stage.proposal import moment_of, propose
 
 RNG = np.random.default_rng(1)
 NOISE = RNG.normal(0, 1, (4, 2000)).round(4)
@@ -65,6 +65,41 @@ def test_the_remaining_quantities(tmp_path: Path) -> None:
         "I_q": "current_i_q_a", "Pos": "", "Timestamp": "",
     }  # fmt: skip
     assert "assumed: set it" in text
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "moment", "where"),
+    [
+        ("a.csv", "# recorded_at: 2026-01-05T08:00:00+01:00\n", "2026-01-05T08:00:00", "stated"),
+        ("axis7_2026-01-05_0815.csv", "", "2026-01-05T08:15:00", "name"),
+        ("20260105T081530.csv", "", "2026-01-05T08:15:30", "name"),
+        ("log_20260105.csv", "", "2026-01-05T00:00:00", "name"),
+        ("20261305.csv", "", "", ""),
+        ("1202601057.csv", "", "", ""),
+    ],
+)
+def test_when_a_log_was_recorded(
+    tmp_path: Path, name: str, text: str, moment: str, where: str
+) -> None:
+    """The file comes before its name, a date that does not exist is none; the source is named."""
+    path = write(tmp_path / name, "time_s,acc_x_g", TIME, NOISE[0], before=text)
+    found, source = moment_of(path, read_log(path))
+    assert found[:19] == moment and where in source
+    assert not found or found[19] in "+-"
+    assert ("time zone of this computer" in source) == (where == "name")
+
+
+def test_a_header_says_when_a_log_was_recorded(tmp_path: Path) -> None:
+    """LabVIEW states date and time without a zone."""
+    head = (
+        "LabVIEW Measurement\t\nX_Columns\tOne\n***End_of_Header***\t\n\t\nDate\t2026/01/05\t\n"
+        "Time\t08:15:30,1250000000000\t\nY_Unit_Label\tg\t\n***End_of_Header***\t\nX_Value\ta\n"
+    )
+    rows = "\n".join(f"{t}\t{a}" for t, a in zip(TIME.tolist(), NOISE[0], strict=True))
+    path = tmp_path / "2020-01-01.lvm"
+    path.write_text(head + rows + "\n")
+    found, source = moment_of(path, read_log(path))
+    assert found.startswith("2026-01-05T08:15:30.125") and "header" in source
 
 
 def test_structs_of_matlab_are_opened(tmp_path: Path) -> None:

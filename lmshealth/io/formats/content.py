@@ -1,15 +1,21 @@
 """What every format returns: columns as they are in the file, and metadata as text."""
 
+import gzip
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Refusal
-from lmshealth.io.refusal import Unusable, listed, repeated
+from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
+
+GZIP = b"\x1f\x8b"
+_BLOCK = 1 << 20
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -48,6 +54,41 @@ class Format:
     sniff: Callable[[bytes], bool]
     load: Load
     library: str = ""
+
+
+@contextmanager
+def unpacked(path: Path) -> Iterator[Path]:
+    """Copy a file that gzip compressed to a temporary one as it was; other files are yielded.
+
+    `Unusable`: ``too-large`` for more than the file can honestly hold.
+    """
+    with path.open("rb") as stream:
+        packed = stream.read(len(GZIP)) == GZIP
+    if not packed:
+        yield path
+        return
+    stored, size = path.stat().st_size, 0
+    with TemporaryDirectory(prefix="lmshealth-") as folder:
+        copy = Path(folder) / path.name[: -len(".gz")]
+        with gzip.open(path) as whole, copy.open("wb") as target:
+            for block in iter(partial(whole.read, _BLOCK), b""):
+                size += target.write(block)
+                check_size(size, stored)
+        yield copy
+
+
+def gzipped(form: Format, others: Iterable[str] = ()) -> Format:
+    """Return the format of such files that gzip compressed, also of those with other suffixes."""
+
+    def load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
+        with unpacked(path) as copy:
+            with copy.open("rb") as stream:
+                if not form.sniff(stream.read(_BLOCK >> 8)):
+                    raise corrupt(f"its content does not start as {form.name} does")
+            return form.load(copy, columns, max_memory)
+
+    suffixes = tuple(f"{suffix}.gz" for suffix in (*form.suffixes, *others))
+    return Format(f"gzipped {form.name}", suffixes, lambda head: head.startswith(GZIP), load)
 
 
 def load_by(form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float) -> Content:

@@ -5,12 +5,12 @@ that are cut off, and allocates without bound for lines and quotes that do not e
 """
 
 import codecs
-import gzip
 import re
 import tempfile
 import threading
 import warnings
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Iterator, Mapping
+from datetime import UTC, datetime, timedelta
 from functools import partial
 from pathlib import Path
 from typing import IO, Any
@@ -20,7 +20,7 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks
 from lmshealth.io.column_map import ColumnMap, role_of
-from lmshealth.io.formats.content import Content, Format, check_size, not_numeric
+from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose, present
@@ -28,7 +28,6 @@ from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
-_GZIP_MAGIC = b"\x1f\x8b"
 _BOM = b"\xef\xbb\xbf"
 _LABVIEW = b"LabVIEW Measurement"
 # First bytes and lines from which the dialect is found.
@@ -41,9 +40,18 @@ _NO_ROWS = "a header line and no rows; needed rows"
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # The last row of some exports.
 _END = re.compile(rb"(?<=\n)EOF[^\r\n]*\s*$")
-# Least magnitude of time stamps that count ticks since an epoch, and the ticks of a second: ns, 100
-# ns (FILETIME), µs, ms.
-_TICKS = ((1e18, 1e9), (1e16, 1e7), (1e15, 1e6), (1e12, 1e3))
+# Least magnitude of time stamps that count ticks since an epoch, ticks of a second, and that epoch
+# as Unix time in s; the last time in s, of the year 2286, that is read in the unit of its column;
+# and Unix times from 2001 to 2039 (those of LabVIEW, since 1904, are later).
+_TICKS = (
+    *((1e18, 1e9, "ns", 0), (1e16, 1e7, "100 ns", -11644473600)),
+    *((1e15, 1e6, "µs", 0), (1e12, 1e3, "ms", 0)),
+)
+_LATEST, _UNIX_TIMES = 1e10, (1e9, 2.2e9)
+_UNIX = datetime(1970, 1, 1, tzinfo=UTC)
+# Days since 1900 from 1954 to 2173, which spreadsheets write, and their largest step: in s it would
+# be a sample rate of 1 MHz.
+_DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
 
 
 class Text:
@@ -118,8 +126,7 @@ class Text:
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    opened = gzip.open if path.name.lower().endswith(".gz") else open
-    with opened(path, "rb") as stream:
+    with path.open("rb") as stream:
         return parse_text(stream, path.stat().st_size, columns)
 
 
@@ -144,6 +151,9 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
     """Find the dialect of a text, and read its wanted columns."""
     head = _head(text, "utf-8" if encoding.startswith(("utf-16", "utf-32")) else encoding)
     lines = [line for _, line in head]
+    if lines and lines[0].startswith("DIAEXTENDED"):
+        detail = "the header of a DIAdem file, whose numbers are in others"
+        raise Unusable("format", f"{detail}; export the data as TDMS or CSV")
     stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
     dialect = stated or find_dialect(lines, columns)
     guessed = (*([f"{encoding} text"] if encoding != "utf-8" else []), *dialect.guessed)
@@ -152,9 +162,12 @@ def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
     if chosen.columns:
         text.seek(head[dialect.start][0] if dialect.start < len(head) else text.position)
         text.begin_rows(dialect.delimiter, len(dialect.channels))
-        times = [c for c in chosen.columns if role_of(columns.target(c) or "") == "time"]
+        times = {c: _unit_of(target, columns) for c in chosen.columns
+                 if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
         samples = _numbers(text, chosen.columns, dialect, times)
-        samples |= {name: _since_first(samples[name]) for name in times}
+        for name, unit in times.items():
+            samples[name], ticks, moment = _since_first(samples[name], unit)
+            guessed, metadata = (*guessed, *ticks), moment | metadata
     return Content(samples, metadata, names, chosen.refused, guessed)
 
 
@@ -241,12 +254,12 @@ def _head(text: Text, encoding: str) -> list[tuple[int, str]]:
 
 
 def _numbers(
-    text: Text, places: dict[str, int], dialect: Dialect, times: Collection[str]
+    text: Text, places: dict[str, int], dialect: Dialect, times: Mapping[str, float]
 ) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
 
-    Moments are read in the columns of times only, as seconds since the first of them. Empty lines
-    are left out where time stamps place the rows, and at the end.
+    Moments are read in the columns of times only, since the first of them, in their unit in s.
+    Empty lines are left out where time stamps place the rows, and at the end.
     """
     import pandas as pd
 
@@ -276,13 +289,13 @@ def _numbers(
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places, {})
+            return _spooled(partial(read, dtype=numbers), text, places, {}, {})
         except (ValueError, pd.errors.ParserWarning):
             # Half as fast, but accepts blanks and locates the fault.
             text.seek(start)
         try:
             careful = partial(read, skipinitialspace=True)
-            return _spooled(careful, text, places, dict.fromkeys(times, None))
+            return _spooled(careful, text, places, times, dict.fromkeys(times, None))
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
@@ -292,7 +305,11 @@ def _numbers(
 
 
 def _spooled(
-    read: Callable[[], Any], text: Text, places: dict[str, int], first: dict[str, Any]
+    read: Callable[[], Any],
+    text: Text,
+    places: dict[str, int],
+    times: Mapping[str, float],
+    first: dict[str, Any],
 ) -> dict[str, Samples]:
     """Read the rows block by block; ``first`` receives the first moments of its columns."""
     n_rows = n_blank = 0
@@ -313,7 +330,7 @@ def _spooled(
                 if values.dtype.kind not in "fiu" and name in first:
                     values = _moments(values)
                     first[name] = values.min() if first[name] is None else first[name]
-                    values = (values - first[name]).dt.total_seconds()
+                    values = (values - first[name]).dt.total_seconds() / times[name]
                 if values.dtype.kind not in "fiu":
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
                 if n_used:
@@ -335,16 +352,38 @@ def _moments(values: Any) -> Any:
     return pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
 
 
-def _since_first(time: Samples) -> Samples:
-    """Convert times that count ticks since an epoch to s since the first; other times stay."""
-    start = next((value for _, block in blocks(time) for value in block[:1]), 0.0)
-    scale = next((ticks for least, ticks in _TICKS if abs(start) >= least), None)
-    if scale is None:
-        return time
+def _unit_of(target: str, columns: ColumnMap) -> float:
+    """Return the unit of a column of times in s; 1 where it has none, which is refused later."""
+    try:
+        return columns.signal(target).factor
+    except Unusable:
+        return 1.0
+
+
+def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
+    """Convert ticks or days since an epoch to times since the first, in a unit in s.
+
+    Other times stay as they are. Return what was taken for what, and the moment of the first ticks.
+    """
+    first = next((block for _, block in blocks(time)), np.zeros(1))
+    start, step = float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
+    ticks = (one[1:] for one in _TICKS if abs(start) >= one[0] and abs(start) * unit > _LATEST)
+    if _DAYS[0] <= start < _DAYS[1] and step < _DAY_STEP:
+        scale, what, epoch = 1 / 86400, "days", None
+    elif _UNIX_TIMES[0] <= start * unit < _UNIX_TIMES[1]:
+        scale, what, epoch = 1 / unit, "", 0
+    else:
+        scale, what, epoch = next(ticks, (0.0, "", None))
+    if not scale:
+        return time, (), {}
     spool = Spool()
     for _, block in blocks(time):
-        spool.append((block - start) / scale)
-    return spool.samples()
+        spool.append((block - start) / (scale * unit))
+    guessed = (f"times in {what} since an epoch",) if what else ()
+    if epoch is None:
+        return spool.samples(), guessed, {}
+    moment = _UNIX + timedelta(seconds=start / scale + epoch)
+    return spool.samples(), guessed, {"recorded_at": moment.isoformat()}
 
 
 def _too_long(row: object, found: str, needed: int) -> Unusable:
@@ -361,7 +400,7 @@ def _first_text(values: list[object], n_before: int) -> str:
     return "text"
 
 
-_BINARY = (_GZIP_MAGIC, b"PAR1", b"\x89HDF")
+_BINARY = (GZIP, b"PAR1", b"\x89HDF")
 
 
 def _is_text(head: bytes) -> bool:
@@ -372,5 +411,3 @@ def _is_text(head: bytes) -> bool:
 
 
 CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)
-_GZIPPED = (".csv.gz", ".txt.gz", ".tsv.gz", ".dat.gz", ".asc.gz", ".lvm.gz")
-CSV_GZ = Format("gzipped CSV", _GZIPPED, lambda head: head.startswith(_GZIP_MAGIC), _load)

@@ -9,6 +9,7 @@ import csv
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from statistics import median
 from typing import NamedTuple
 
 from lmshealth.io.column_map import ColumnMap, CsvLayout, unit_key
@@ -33,10 +34,15 @@ _CLOCK = r"\d{1,2}:\d\d(:\d\d([.,]\d+)?)?"
 _MOMENT = re.compile(rf"({_DATE})([T ]\s*{_CLOCK})?\s*(Z|[+-]\d\d:?\d\d)?|{_CLOCK}")
 _REMARK = re.compile(r"\s*(#+|%+|//)\s*")
 _UNIT_BEHIND = re.compile(r"(?P<name>.*\S)\s*[\[(](?P<unit>[^\[\]()]*)[\])]\s*")
+# First fields of a line of names or units above rows that have no such field.
+_KEY = re.compile(
+    r"(\w+[ _])?(signals?|channels?|names?|units?)|kanal(name)?|einheit(en)?", re.IGNORECASE
+)
+_KEYED = re.compile(r"[^\t,;|]*:(\s|$)")
 _UNNAMED = 'no line of names (the columns are "0", "1", ...)'
 _MICRO = str.maketrans("µμ", "uu")
 _OTHER_UNITS = frozenset(
-    "min h V mV N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
+    "min h V mV Volt Volts N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
 )
 
 
@@ -117,7 +123,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
             heads = list(_heads(lines[: found.first], skip, found))
         _check_thousands(lines[found.first :], found)
     _check_no_row_before(lines[skip : found.first], found)
-    names, units, where = _names(heads, found, columns)
+    n_first = len(fields_of(lines[found.first], found.delimiter)) if found.share else 0
+    names, units, where = _names(heads, found, max(n_first, found.n_fields), columns)
     guessed = _guessed(found, layout, where, begin)
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
     return Dialect(found.delimiter, found.decimal, channels, found.first, metadata, guessed)
@@ -168,15 +175,19 @@ def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[
 
 
 def _first_row(split: Sequence[tuple[int, list[str]]], number: re.Pattern[str]) -> int | None:
-    """Find the first line of numbers with as many fields as a line beside it."""
-    sizes = [len(fields) for _, fields in split]
-    for i, (_, fields) in enumerate(split):
-        beside = sizes[max(i - 1, 0) : i] + sizes[i + 1 : i + 4]
-        if _share(fields, number) > _LEAST_SHARE and (not beside or sizes[i] in beside):
-            return i
-    # A row cut off, or one too long, below its names.
-    shares = (i for i, (_, own) in enumerate(split) if _share(own, number) > _LEAST_SHARE)
-    return next(shares, None)
+    """Find the first line of numbers with as many fields as most such lines.
+
+    Lines of keys and values, and of numbered channels, have fewer numbers than half of the rows.
+    """
+    shares = [_share(fields, number) for _, fields in split]
+    sizes = [
+        len(own) for (_, own), share in zip(split, shares, strict=True) if share > _LEAST_SHARE
+    ]
+    most = max(sizes, key=sizes.count, default=0)
+    rows = [(k, share) for k, share in enumerate(shares)
+            if share > _LEAST_SHARE and len(split[k][1]) == most]  # fmt: skip
+    usual = median(share for _, share in rows) if rows else 0.0
+    return next((k for k, share in rows if share > usual / 2), None)
 
 
 def _share(fields: Sequence[str], number: re.Pattern[str]) -> float:
@@ -194,9 +205,13 @@ def _heads(lines: Sequence[str], skip: int, found: _Rows) -> Iterator[tuple[int,
     for k in range(len(lines) - 1, skip - 1, -1):
         text = _REMARK.sub("", lines[k], count=1)
         remark = text != lines[k]
-        for delimiter in (found.delimiter, *_DELIMITERS) if text.strip() else ():
+        # A key with its value, not a name above the rows.
+        keyed = k + 1 < len(lines) and _KEYED.match(text)
+        for delimiter in (found.delimiter, *_DELIMITERS) if text.strip() and not keyed else ():
             fields = [one.strip() for one in fields_of(text, delimiter)]
             n = len(fields) - (len(fields) == found.n_fields + 1 and not fields[-1])
+            if n == found.n_fields + 1 and _KEY.fullmatch(fields[0]):
+                fields, n = fields[1:], n - 1
             # A remark names several columns; a line of one field is a title of several.
             if n == found.n_fields and not (remark and n == 1):
                 yield k, fields[:n]
@@ -226,9 +241,12 @@ def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
 
 
 def _names(
-    heads: Sequence[tuple[int, list[str]]], found: _Rows, columns: ColumnMap
+    heads: Sequence[tuple[int, list[str]]], found: _Rows, most: int, columns: ColumnMap
 ) -> tuple[list[str], list[str], int | None]:
-    """Name the columns, with their units, and return the line of the names, if there is one."""
+    """Name the columns, with their units, and return the line of the names, if there is one.
+
+    A row has ``most`` fields, of which the last may be empty and without a name.
+    """
     n, layout = found.n_fields, columns.csv
     if isinstance(layout.header, list):
         if len(layout.header) != n:
@@ -241,22 +259,27 @@ def _names(
     mapped = set(columns.columns.values())
     own = [one for one in heads if mapped and mapped <= set(one[1])]
     stated = bool(own)
-    own += [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
+    unlike = [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
+    unlike = [one for one in unlike if not all(map(_is_unit, one[1]))] or unlike
+    own += sorted(unlike, key=lambda one: sum(map(str.isdecimal, one[1])))
     where, names = (own or heads)[0]
-    if n and len(names) < n:
-        raise corrupt(f"row 1 has {n} fields, the line of names {len(names)}")
+    if n and not n <= len(names) <= most:
+        found_there = f"row 1 has {n} fields, the line of names {len(names)}"
+        raise corrupt(f"{found_there}; or list the names by header under [csv] of the column map")
     k = heads.index((where, names))
     if not stated and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
         k, (where, names) = k + 1, heads[k + 1]
-    units = heads[k - 1][1] if k else [""]
-    if len(units) != len(names) or not all(map(_is_unit, units)):
-        units = [""] * len(names)
+    # Below the names, or else in any other line.
+    others = [fields for _, fields in (*heads[max(k - 1, 0) : k], *heads) if fields is not names]
+    fitting = (one for one in others if len(one) == len(names) and all(map(_is_unit, one)))
+    units = next(filter(any, fitting), [""] * len(names))
     return names, [word.strip(" []()") for word in units], where
 
 
 def _is_unit(word: str) -> bool:
     """Return whether a field of a line of units may be one; it may be empty."""
     bare = word.strip(" []()")
+    bare = "" if _KEY.fullmatch(bare) else bare
     return not bare or bare in _OTHER_UNITS or unit_key(bare) is not None
 
 

@@ -1,5 +1,7 @@
 """MAT-files of version 5: variables, fields of structs, columns of matrices, as MATLAB names them.
 
+Structs of Siemens Testlab state names, units and sample rates of their channels.
+
 `scipy.io.loadmat` ends its process on damaged headers, and allocates what text and cells claim
 before it finds that they are not there: it works in a process of its own. One variable is held in
 memory.
@@ -18,6 +20,8 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, check_size, not_numeric
+from lmshealth.io.formats.unit_channels import Described, choose, rate_of
+from lmshealth.io.formats.unit_channels import present as present_channels
 from lmshealth.io.metadata import KEYS
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
@@ -42,6 +46,11 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     names = [name for name, _, _ in variables]
     chosen = _chosen(names, columns)
     stored, n_samples = path.stat().st_size, 0
+    if not chosen - set(KEYS) and (channels := _testlab(path, variables, max_memory)):
+        described = [channel for channel, _ in channels]
+        found = choose(described, columns)
+        samples = {name: as_samples(channels[k][1]) for name, k in found.columns.items()}
+        return Content(samples, found.metadata, present_channels(described), found.refused)
     read: dict[str, Samples] = {}
     metadata: dict[str, str] = {}
     present: list[str] = []
@@ -107,6 +116,49 @@ def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
     if twice := repeated(name for name in names if name in chosen):
         raise Unusable("columns", f"the file holds {listed(twice)} more than once")
     return chosen
+
+
+def _testlab(
+    path: Path, variables: list[tuple[str, tuple[int, ...], str]], max_memory: float
+) -> list[tuple[Described, np.ndarray]]:
+    """Read the time records that Siemens Testlab exports: structs of x_values and y_values.
+
+    Values are in the unit that the struct states, ``(n_samples,)`` each.
+    """
+    matlab: Any = import_module("scipy.io.matlab")
+    channels: list[tuple[Described, np.ndarray]] = []
+    for variable, shape, kind in variables:
+        if kind != "struct" or shape != (1, 1):
+            continue
+        _check_claim(variable, shape, kind, path.stat().st_size, max_memory)
+        struct = matlab.loadmat(path, appendmat=False, variable_names=[variable])[variable]
+        values = _inside(struct, "y_values", "values")
+        step, start = (_inside(struct, "x_values", key) for key in ("increment", "start_value"))
+        if values is None or step is None or values.dtype.kind not in "fiu" or values.ndim != 2:
+            continue
+        columns = values.reshape(-1, 1) if 1 in values.shape else values
+        label = _inside(struct, "y_values", "quantity", "label")
+        stated = _inside(struct, "function_record", "name")
+        names = (
+            [] if stated is None else [str(np.ravel(one)[0]) for one in stated.ravel() if one.size]
+        )
+        if len(names) != columns.shape[1]:
+            names = [f"{variable}:{k + 1}" for k in range(columns.shape[1])]
+        unit = str(label.ravel()[0]) if label is not None and label.size else ""
+        begin = 0.0 if start is None or not start.size else float(start.ravel()[0])
+        rate = rate_of(float(step.ravel()[0])) if step.size else None
+        for k, name in enumerate(names):
+            channels.append((Described(name, unit, rate, start=begin), columns[:, k]))
+    return channels
+
+
+def _inside(struct: Any, *names: str) -> Any:
+    """Return a field of structs in structs; None where there is none."""
+    for name in names:
+        if not struct.size or name not in (struct.dtype.names or ()):
+            return None
+        struct = struct.ravel()[0][name]
+    return struct
 
 
 def _arrays(values: Any, name: str) -> Iterator[tuple[str, Any]]:

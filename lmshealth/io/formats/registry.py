@@ -13,8 +13,8 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Format, load_by
-from lmshealth.io.formats.csv import CSV, CSV_GZ
+from lmshealth.io.formats.content import Content, Format, gzipped, load_by
+from lmshealth.io.formats.csv import CSV
 from lmshealth.io.formats.hdf5 import HDF5
 from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.mat import MAT
@@ -24,12 +24,16 @@ from lmshealth.io.formats.uff import UFF
 from lmshealth.io.formats.vendor_files import RTX, TRACE
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
-# Binary formats first: text is recognised by the absence of other signatures.
-FORMATS: tuple[Format, ...] = (HDF5, PARQUET, TDMS, MAT, CSV_GZ, RTX, TRACE, UFF, CSV)
-SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 # Exporters use them for delimited text, and people for notes: such files are read where they are
 # named, and not collected from folders, unless they are compressed.
 TEXT_SUFFIXES = (".txt", ".tsv", ".dat", ".asc")
+# Binary formats first: text is recognised by the absence of other signatures.
+FORMATS: tuple[Format, ...] = (
+    *(HDF5, PARQUET, TDMS, MAT),
+    *(gzipped(CSV, TEXT_SUFFIXES), *map(gzipped, (RTX, TRACE, UFF))),
+    *(RTX, TRACE, UFF, CSV),
+)
+SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
 GROUP = "lmshealth.formats"
 
 _HEAD = 4096
@@ -122,7 +126,10 @@ def confirm(path: Path) -> Format:
     form = format_of(path)
     if form is None:
         known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
-        raise Unusable("format", f"unknown suffix; needed one of {', '.join(known)}")
+        needed = (
+            f"needed one of {', '.join(known)}; save other arrays as columns of HDF5 or Parquet"
+        )
+        raise Unusable("format", f"unknown suffix {path.suffix!r}; {needed}")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if not head:

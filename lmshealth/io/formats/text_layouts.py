@@ -1,4 +1,4 @@
-"""Layouts of delimited text that have a header of their own: TwinCAT, LabVIEW, PI, Klipper.
+"""Layouts of delimited text that have a header of their own: TwinCAT, LabVIEW, PI, Klipper, Rigol.
 
 A layout returns the `Dialect` that the first lines of a file state, or None for another file. The
 layouts were taken from public readers and samples; see the README of `io`.
@@ -13,6 +13,8 @@ from lmshealth.io.formats.unit_channels import Described, rate_of
 from lmshealth.io.refusal import corrupt
 
 _GCS_LINE = re.compile(r"#\s*([A-Z_]+\d*)\s*=\s*(.*\S)\s*")
+# Key of a moment without a time zone, which is no metadatum of a log.
+LOCAL_TIME = "local_time"
 _FILETIME_EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
 
 
@@ -28,26 +30,24 @@ def twincat(lines: Sequence[str]) -> Dialect | None:
     interval = keys.get("SampleTime[ms]", [])
     if "Name" not in keys or len(interval) != len(keys["Name"]):
         raise corrupt("a TwinCAT Scope export without Name and SampleTime[ms] of each channel")
-    blank = [""] * len(interval)
-    units, scales = keys.get("Unit", blank), keys.get("ScaleFactor", blank)
+    # Values are written as scaled; their unit is followed by its quantity: g (Acceleration).
+    units = [unit.partition("(")[0] for unit in keys.get("Unit", [""] * len(interval))]
     channels = []
-    for name, text, unit, scale in zip(keys["Name"], interval, units, scales, strict=False):
+    for name, text, unit in zip(keys["Name"], interval, units, strict=False):
         rate = _number(text)
         if name == "Name":
             # The key column of a group holds its times; its rate is that of the next channel.
             channels.append(Described("time", "ms", None))
         elif name:
             own = None if rate is None else rate_of(rate / 1000)
-            if scale not in ("", "1", "1.0", "1,0"):
-                unit = f"{unit} x {scale}"
-            channels.append(Described(name, unit, own))
+            channels.append(Described(name, unit.strip(), own))
             if len(channels) > 1 and channels[-2].name == "time" and channels[-2].rate is None:
                 channels[-2] = Described("time", "ms", own)
     first = max(keys_at for key, keys_at in at.items() if key in keys and _number(key) is None)
     while first + 1 < len(lines) and not lines[first + 1].strip():
         first += 1
-    decimal = "," if any("," in word for word in fields_of(lines[min(first + 1, len(lines) - 1)],
-                         delimiter)) and delimiter != "," else "."  # fmt: skip
+    # The numbers of the first row may be whole.
+    decimal = "," if delimiter != "," and any("," in row for row in lines[first + 1 :]) else "."
     ticks = fields_of(lines[start], delimiter)[1:2]
     moment = _FILETIME_EPOCH + timedelta(microseconds=int(ticks[0]) // 10) if ticks else None
     metadata = {} if moment is None else {"recorded_at": moment.isoformat()}
@@ -77,7 +77,9 @@ def labview(lines: Sequence[str]) -> Dialect | None:
         if own_x == "Multi" and channels[-1].name == "X_Value":
             channels[-1] = Described("time", "s", rate, start=start)
         channels.append(Described(name, units[k], rate, start=start))
-    return Dialect(delimiter, decimal, tuple(channels), where + 1)
+    day, clock = (keys.get(key, [""])[0].replace("/", "-") for key in ("Date", "Time"))
+    metadata = {LOCAL_TIME: f"{day} {clock.replace(',', '.')[:15]}"} if day and clock else {}
+    return Dialect(delimiter, decimal, tuple(channels), where + 1, metadata)
 
 
 def gcs_array(lines: Sequence[str]) -> Dialect | None:
@@ -104,7 +106,18 @@ def klipper(lines: Sequence[str]) -> Dialect | None:
     return Dialect(",", ".", tuple(channels), where + 1)
 
 
-LAYOUTS = (twincat, labview, gcs_array, klipper)
+def rigol(lines: Sequence[str]) -> Dialect | None:
+    """Rigol oscilloscope: names, then units with the interval, then rows with a number of each."""
+    if len(lines) < 2 or not lines[0].startswith("X,") or ",Start,Increment" not in lines[0]:
+        return None
+    names, units = (fields_of(line, ",") for line in lines[:2])
+    n = names.index("Start")
+    rate = rate_of(_number(units[n + 1]))
+    channels = (Described(*pair, rate) for pair in zip(names[1:n], units[1:n], strict=True))
+    return Dialect(",", ".", (Described("X", ""), *channels), 2)
+
+
+LAYOUTS = (twincat, labview, gcs_array, klipper, rigol)
 
 
 def _number(text: str) -> float | None:

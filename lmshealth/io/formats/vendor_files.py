@@ -17,7 +17,7 @@ from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size
 from lmshealth.io.formats.uff import Function
-from lmshealth.io.formats.unit_channels import Described, choose
+from lmshealth.io.formats.unit_channels import Described, choose, present
 from lmshealth.io.refusal import Unusable, corrupt
 
 _RTX, _RTX_DATA, _RTX_END = b"HEADER::", b"Data:\r\n", b"EOF::"
@@ -54,10 +54,11 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     names: list[str] = []
     spools: dict[str, Spool] = {}
     records, n_rows = _records(path, names), 0
+    channels = [Described("time", "s")]
     while rows := list(islice(records, _ROWS)):
         table = np.array(rows)
         table[np.abs(table) > _NO_VALUE] = np.nan
-        channels = [Described("time", "s"), *(Described(name, "") for name in names)]
+        channels = [channels[0], *(Described(name, "") for name in names)]
         for name, k in choose(channels, columns).columns.items():
             spools.setdefault(name, Spool()).append(table[:, k])
         n_rows += len(rows)
@@ -65,7 +66,7 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     if not n_rows:
         detail = "no records (rec) of a trace; measured responses are read by `lmshealth frf`"
         raise Unusable("columns", detail)
-    return Content({name: one.samples() for name, one in spools.items()}, {}, tuple(names))
+    return Content({name: one.samples() for name, one in spools.items()}, {}, present(channels))
 
 
 def _records(path: Path, names: list[str]) -> Iterator[list[float]]:

@@ -13,8 +13,8 @@ from lmshealth._arrays import ComplexArray, FloatArray, ReadOnly
 from lmshealth.errors import BadLog
 from lmshealth.io import constants as limits
 from lmshealth.io.column_map import RESPONSE_COLUMN, ColumnMap, parse_column, role_of
-from lmshealth.io.formats.content import Content
-from lmshealth.io.formats.csv import CSV, CSV_GZ
+from lmshealth.io.formats.content import Content, unpacked
+from lmshealth.io.formats.csv import CSV
 from lmshealth.io.formats.registry import confirm, format_name, load
 from lmshealth.io.formats.uff import UFF, Function, load_functions
 from lmshealth.io.formats.vendor_files import TRACE, response_functions
@@ -26,7 +26,7 @@ from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import Ordinates
 from lmshealth.modal.frf.responses import Frf, average_noise
 
-FORMATS = (CSV.name, CSV_GZ.name, UFF.name, TRACE.name)
+_FORMATS = (CSV.name, UFF.name, TRACE.name)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
 _PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
@@ -68,18 +68,17 @@ def read_responses(
 
     `BadLog` if a response lacks a part, or its lines are not finite and ascending.
     """
-    given = columns or ColumnMap()
-    label, digest = shown(path), content_digest(path)
-    if (form := format_name(path)) not in FORMATS:
+    given, form = columns or ColumnMap(), format_name(path).removeprefix("gzipped ")
+    if form not in _FORMATS:
         return ()
+    label, digest = shown(path), content_digest(path)
     try:
         stated: dict[str, str] = {}
-        if form == UFF.name:
+        if form != CSV.name:
             confirm(path)
-            functions = load_functions(path, max_memory)
-        elif form == TRACE.name:
-            confirm(path)
-            functions = response_functions(path)
+            with unpacked(path) as file:
+                functions = (load_functions(file, max_memory) if form == UFF.name
+                             else response_functions(file))  # fmt: skip
         else:
             own = _ResponseColumns(columns=given.columns, csv=given.csv)
             content = load(path, own, max_memory)

@@ -364,3 +364,27 @@ def test_limit_of_memory(tmp_path, packed):
     with pytest.raises(Unusable, match=r"'delta_e_um' needs .* raise --max-memory") as caught:
         load(path, ColumnMap(), size - 1)
     assert caught.value.reason == "too-large"
+
+
+@pytest.mark.parametrize("packed", [True, False])
+def test_structs_of_testlab(tmp_path, packed):
+    """Names, unit, rate and values of an export of Siemens Testlab need no column map."""
+    values = np.random.default_rng(1).normal(size=(400, 2))
+    label = {"quantity": {"label": "g"}}
+    axis = {"start_value": 0.0, "increment": 1 / 2048, "number_of_values": 400.0}
+    names = np.array(["carriage:+Z", "carriage:+X"], dtype=object)
+    struct = {"x_values": axis, "y_values": label | {"values": values}}
+    signal = struct | {"function_record": {"name": names}}
+    other = {"y_values": {"values": values[0] + 1j}, "x_values": axis}  # a response
+    variables = {"Signal": signal, "FRF": other, "Plain": {"a": 1.0}}
+    scipy.io.savemat(tmp_path / "log.mat", variables, do_compression=packed)
+    log = read_log(tmp_path / "log.mat")
+    assert log.sample_rate == 2048
+    assert [one.name for one in log.channels] == ["acc_carriage_Z", "acc_carriage_X"]
+    for channel, held in zip(log.channels, values.T, strict=True):
+        np.testing.assert_allclose(channel.values, 9.80665 * held, rtol=1e-12)
+    signal["function_record"] = {"name": "one"}
+    scipy.io.savemat(tmp_path / "log.mat", {"S": signal}, do_compression=packed)
+    columns = ColumnMap(columns={"delta_e_um": "S:2"})
+    (found,) = read_log(tmp_path / "log.mat", columns=columns).channels
+    np.testing.assert_allclose(found.values, 1e-6 * values[:, 1], rtol=1e-12)

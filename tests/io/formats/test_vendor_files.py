@@ -1,13 +1,17 @@
 """Files of measuring systems and controls, written to their layouts."""
 
+import gzip
+
 import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.manifest import find_logs
 from lmshealth.io.reading import read_log
 from lmshealth.modal.frf.identification import read_measured
 from lmshealth.modal.frf.measured import read_responses
+from tests.io.handmade import uff_set
 
 X = 1e-3 * np.sin(np.arange(400) * 0.7)
 
@@ -42,13 +46,35 @@ def test_laser(tmp_path):
             read_log(tmp_path / "log.rtx", columns=columns)
 
 
+@pytest.mark.parametrize("suffix", [".rtx", ".xml", ".uff"])
+def test_compressed_files_are_read_and_found(tmp_path, suffix):
+    """They hold what the file held before; another content is refused, and so is a cut one."""
+    content = {
+        ".rtx": rtx(X),
+        ".xml": trace(X).encode(),
+        ".uff": uff_set(
+            (body := X.astype("<f8").tobytes()), X.size, name="delta_e_mm", binary=str(len(body))
+        ),
+    }[suffix]
+    source = {".rtx": "data", ".xml": "lag error", ".uff": "delta_e_mm"}[suffix]
+    path, columns = tmp_path / f"log{suffix}.gz", ColumnMap(columns={"delta_e_mm": source})
+    path.write_bytes(gzip.compress(content))
+    log = read_log(path, columns=columns)
+    np.testing.assert_allclose(log.channels[0].values, 1e-3 * X, rtol=1e-12)
+    assert find_logs(tmp_path).logs == (path,)
+    for damaged in (gzip.compress(b"PK" + content), gzip.compress(content)[:-20]):
+        path.write_bytes(damaged)
+        with pytest.raises(BadLog, match="corrupt"):
+            read_log(path, columns=columns)
+
+
 def test_trace(tmp_path):
     """Signals of a trace are named by their description; what has no value is missing."""
     (tmp_path / "log.xml").write_text(trace(X))
     log = read_log(tmp_path / "log.xml", columns=ColumnMap(columns={"delta_e_mm": "lag error"}))
     assert log.sample_rate == pytest.approx(1000)
     np.testing.assert_allclose(log.channels[0].values, 1e-3 * X, rtol=1e-12)
-    with pytest.raises(BadLog, match=r"there: lag error, /v"):
+    with pytest.raises(BadLog, match=r"there: time \[s\], lag error, /v"):
         read_log(tmp_path / "log.xml")
     columns = ColumnMap(columns={"delta_e_mm": "lag error", "acc_x_g": "/v"})
     refused = read_log(tmp_path / "log.xml", columns=columns).refused
