@@ -217,7 +217,7 @@ def report(
             if isinstance(output, str):
                 failed[name] = output
             else:
-                rows[name] = output.page.summary
+                rows[name] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         found = "the store holds only results of another version of lmshealth"
@@ -287,7 +287,7 @@ def _report(
             packed[name] = output.tables
             excluded.update(output.excluded)
             made[name] = output.status
-            rows[name] = output.page.summary
+            rows[name] = output.summary
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
@@ -326,7 +326,7 @@ def _outputs(
         if kept is None:
             missing[name] = machine, key
         else:
-            write_text(out / files[name], kept.page.text)
+            write_text(out / files[name], kept.page)
             yield name, kept
     records = (
         _record(name, keys[name], files[name], store, packed_logs(machine, store))
