@@ -1,7 +1,8 @@
 """Draw the pictures of how-to-read.html: one healthy and one worn simulated stage.
 
-Writes ``lmshealth/report/templates/reading/*.svg``. `python -m studies.demo_life.reading` simulates and
-analyses both lives, about four minutes; `... reading HEALTHY WORN` draws results of `lmshealth run`.
+`python -m studies.demo_life.reading` simulates and analyses both lives, in about four minutes, and
+writes ``lmshealth/report/templates/reading/*.svg``. With two folders, of a healthy and of a worn
+machine, it draws these results of `lmshealth run`.
 """
 
 from __future__ import annotations
@@ -96,7 +97,7 @@ def pictures(made: Assessment) -> dict[str, tuple[Draw, tuple[float, float]]]:
     shapes = partial(
         log_figures.plot_shapes, shapes=latest.shapes, stage=made.stage, before=before.shapes
     )
-    whole = {"spectrum": (spectrum, (6.2, 3.0)), "shapes": (shapes, (6.2, 2.1))}
+    whole = {"spectrum": (spectrum, (8.0, 3.3)), "shapes": (shapes, (8.0, 2.1))}
     return whole | {
         key: (partial(alone, draw), (figures.SIZE[0], 0.9 * figures.SIZE[1]))
         for key, draw in single.items()
