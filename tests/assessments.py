@@ -353,6 +353,7 @@ def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) ->
         offline=True, color_scheme=scheme, viewport={"width": width, "height": 800}
     )
     page = context.new_page()
+    page.set_default_timeout(180_000)  # on a busy machine
     seen: list[str] = []
     page.on("console", lambda message: seen.append(message.text))
     page.on("pageerror", lambda error: seen.append(str(error)))

@@ -106,7 +106,7 @@ def browser(needs: Callable[[str], None]) -> Iterator[Any]:
 def seen_in_a_log(name: str = "log-9.h5", seed: int = 2) -> LogEstimates:
     """Identify a log of two channels, with its spectra and shapes."""
     stage, rng = load_stage("lms-y"), np.random.default_rng(seed)
-    modes = [Mode(126.4, 0.015, (1.0, 0.3)), Mode(136.4, 0.015, (-0.4, 1.0))]
+    modes = [Mode(126.4, 0.015, shape=(1.0, 0.3)), Mode(136.4, 0.015, shape=(-0.4, 1.0))]
     made = accelerations(rng, modes, 20_000, 1000.0, 1.0)
     log = make_log({"acc_pitch": made[0], "acc_feed": made[1]}, 1000.0)
     reading = read_ambient(log, stage)
