@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
 import msgspec
+from sqlalchemy import URL
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
@@ -232,7 +233,7 @@ def report(
     )
 
 
-def write_interactive(url: str, result: RunResult) -> tuple[Path, ...]:
+def write_interactive(url: str | URL, result: RunResult) -> tuple[Path, ...]:
     """Write an interactive page of each machine of a run or report, from its store.
 
     They are in the folder ``interactive`` beside the static pages, under the same names.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 import click
+from sqlalchemy import URL
 
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
@@ -68,7 +69,7 @@ def _document(result: RunResult) -> dict[str, Any]:
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 
-def _write_others(result: RunResult, store: str, *, pdf: bool, interactive: bool) -> None:
+def _write_others(result: RunResult, store: str | URL, *, pdf: bool, interactive: bool) -> None:
     """Write what is asked for beside the pages."""
     if interactive:
         write_interactive(store, result)
