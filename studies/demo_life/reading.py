@@ -130,7 +130,7 @@ def write(key: str, draws: list[Draw], size: tuple[float, float]) -> None:
             draw(part)
 
     text = figures.inline(both, salt=key, size=(size[0], 2 * size[1] + 0.5))
-    text = HINT.sub("", text)
+    text = HINT.sub("", text).replace(">\n<", "><")
     text = text.replace("<svg ", '<svg style="background:var(--card,#ffffff)" ', 1)
     (FOLDER / f"{key}.svg").write_text(text + "\n", encoding="utf-8")
 
