@@ -18,11 +18,12 @@ from msgspec.structs import asdict
 
 from lmshealth._arrays import FloatArray
 from lmshealth._files import write_text
+from lmshealth.batch.status import coming_states, make_status
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.assessment import Assessment, Summary
+from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.signal.spectral_lines import Line
@@ -352,6 +353,7 @@ def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) ->
         offline=True, color_scheme=scheme, viewport={"width": width, "height": 800}
     )
     page = context.new_page()
+    page.set_default_timeout(180_000)  # on a busy machine
     seen: list[str] = []
     page.on("console", lambda message: seen.append(message.text))
     page.on("pageerror", lambda error: seen.append(str(error)))
@@ -420,8 +422,10 @@ def write_report(
     for one in assessments:
         identity = one.judgement.stage
         before = (earlier or {}).get(identity)
-        page = make_page(one, names[identity], before=before, generated=generated)
-        write_text(folder / page.summary.file, page.text)
-        summaries.append(page.summary)
+        summary = summarise(one, one.service(), names[identity])
+        states = coming_states(make_status(one, summary))
+        page = make_page(one, summary, before=before, states=states, generated=generated)
+        write_text(folder / summary.file, page)
+        summaries.append(summary)
     index = write_index(folder, summaries, refused, generated=generated)
     return [*(folder / one.file for one in by_urgency(summaries)), index]

@@ -124,6 +124,7 @@ def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) ->
         seed=machine.seed,
         waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
+        at_baseline=used[history.baseline] if used else None,
     )
     made = _with_results(made, used, machine.epochs, parts)
     judgement = judge(stage, history, made.present, made.track, doubt=made.doubt)

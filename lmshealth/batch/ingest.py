@@ -20,6 +20,7 @@ from lmshealth.io.manifest import find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.signal.constants import WATERFALL_BINS
 from lmshealth.signal.following_error import loop_error
@@ -305,7 +306,10 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
         rms, levels = loop_error(log), relative_spectrum(log, described)
-        found = LogEstimates(log.name, log.digest, log.metadata, modes, rms, levels, spectra)
+        shapes = mode_shapes(modes, reading.fitted)
+        found = LogEstimates(
+            log.name, log.digest, log.metadata, modes, rms, levels, spectra, shapes
+        )
         return Identified(found, by, stage, asked)
     except BadLog as error:
         refusal = Refusal(task.name, error.reason, error.detail)

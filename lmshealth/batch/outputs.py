@@ -13,11 +13,11 @@ from pathlib import Path
 from lmshealth._files import replacing, write_text
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
-from lmshealth.batch.status import Status, make_status, points
+from lmshealth.batch.status import Status, coming_states, make_status, points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
-from lmshealth.report.assessment import Assessment, Summary
-from lmshealth.report.machine_page import Page, make_page
+from lmshealth.report.assessment import Assessment, Summary, summarise
+from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import COLUMNS, Row, machine_tables
 from lmshealth.tracking.history import sort_by_time
 
@@ -43,7 +43,8 @@ class MachineRecord:
 class MachineOutput:
     """Page, packed table rows and status of a machine, and logs that its life excludes."""
 
-    page: Page
+    page: str  # HTML
+    summary: Summary
     tables: bytes
     excluded: tuple[str, ...]
     status: Status
@@ -55,15 +56,18 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     found: Assessment | None = unpack_or_none(record.assessment, Assessment)
     if found is None:
         return None
+    summary = summarise(found, found.service(), record.file)
+    status = make_status(found, summary)
     with _DRAWING:
-        page = make_page(found, record.file, before=record.before)
+        page = make_page(found, summary, before=record.before, states=coming_states(status))
     readings = sort_by_time(unpack_logs(record.logs))
     rows = machine_tables(readings, found) if readings else {}
     return MachineOutput(
         page=page,
+        summary=summary,
         tables=pack(rows),
         excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
-        status=make_status(found, page.summary),
+        status=status,
         points=tuple(points(rows)),
     )
 
@@ -77,7 +81,7 @@ def write_pages(
     """
     for record, output in pool.map_unordered(_output_or_reason, records, lambda _, why: why):
         if isinstance(output, MachineOutput):
-            write_text(out / record.file, output.page.text)
+            write_text(out / record.file, output.page)
         if output is not None:
             yield record.machine, output
 

@@ -8,6 +8,7 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
 import msgspec
+from sqlalchemy import URL
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
@@ -24,8 +25,9 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
-from lmshealth.report.assessment import Summary
+from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
+from lmshealth.report.interactive import interactive_page
 from lmshealth.report.tables import refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -217,7 +219,7 @@ def report(
             if isinstance(output, str):
                 failed[name] = output
             else:
-                rows[name] = output.page.summary
+                rows[name] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         found = "the store holds only results of another version of lmshealth"
@@ -229,6 +231,26 @@ def report(
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
     )
+
+
+def write_interactive(url: str | URL, result: RunResult) -> tuple[Path, ...]:
+    """Write an interactive page of each machine of a run or report, from its store.
+
+    They are in the folder ``interactive`` beside the static pages, under the same names.
+    `InteractiveError` if Bokeh is missing.
+    """
+    folder, written = result.index.with_name("interactive"), list[Path]()
+    with closing(Store(url, create=False)) as store:
+        keys = {one.machine: one.key for one in store.published()}
+        for row in result.rows:
+            content = store.assessment(row.identity, keys[row.identity])
+            found: Assessment | None = unpack_or_none(content, Assessment)
+            if found is not None:
+                page = interactive_page(found, f"../{row.file}")
+                folder.mkdir(exist_ok=True)
+                write_text(folder / row.file, page)
+                written.append(folder / row.file)
+    return tuple(written)
 
 
 def _prepare(out: Path) -> None:
@@ -287,7 +309,7 @@ def _report(
             packed[name] = output.tables
             excluded.update(output.excluded)
             made[name] = output.status
-            rows[name] = output.page.summary
+            rows[name] = output.summary
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
@@ -326,7 +348,7 @@ def _outputs(
         if kept is None:
             missing[name] = machine, key
         else:
-            write_text(out / files[name], kept.page.text)
+            write_text(out / files[name], kept.page)
             yield name, kept
     records = (
         _record(name, keys[name], files[name], store, packed_logs(machine, store))

@@ -97,6 +97,25 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     return {code: state for state, code, applies in found if applies}
 
 
+def coming_states(status: Status) -> dict[date, dict[str, DeviceHealth]]:
+    """Return the conditions on the day of the last log, and on later days that change the state.
+
+    Without a further log; the first of each day's conditions is the state.
+    """
+    days = [status.recorded_at.date()]
+    if status.service_by:
+        days.append(status.service_by - timedelta(days=constants.SERVICE_LEAD_DAYS))
+    if status.inspect_by:
+        days.append(status.inspect_by + timedelta(days=1))
+    states: dict[date, dict[str, DeviceHealth]] = {}
+    for day in sorted(one for one in days if one >= days[0]):
+        found = conditions(status, day)
+        before = next(reversed(states.values()), None)
+        if before is None or [*found.values()][:1] != [*before.values()][:1]:
+            states[day] = found
+    return states
+
+
 def make_status(assessment: Assessment, summary: Summary) -> Status:
     """Collect the status of a machine from its results, before it is compared and judged."""
     track, life, service = assessment.track, summary.life, summary.service

@@ -52,11 +52,30 @@ class ModeShapes:
 
         Shape ``(n_modes, n_modes)``; NaN for pairs with less than two common channels.
         """
-        there = np.isfinite(self.shapes).astype(float)
-        shapes = np.nan_to_num(self.shapes)
-        power = (np.abs(shapes) ** 2) @ there.T
-        power = np.where(there @ there.T > 1, power * power.T, np.nan)
-        return np.asarray(np.abs(shapes.conj() @ shapes.T) ** 2 / power)
+        return _assurance(self.shapes, self.shapes)
+
+    def mac_with(self, other: "ModeShapes") -> FloatArray:
+        """MAC of each mode with the mode of its name in another log, shape ``(n_modes,)``.
+
+        NaN where the other log lacks the mode, or has less than two channels of it in common.
+        """
+        common = [name for name in self.channels if name in other.channels]
+        own, others = (
+            one.shapes[:, [one.channels.index(name) for name in common]] for one in (self, other)
+        )
+        named = np.array(self.names)[:, None] == np.array(other.names)
+        pairs = np.where(named, _assurance(own, others), np.nan)
+        found = np.fmax.reduce(pairs, axis=1, initial=-1.0)
+        return np.where(found < 0, np.nan, found)
+
+
+def _assurance(a: ComplexArray, b: ComplexArray) -> FloatArray:
+    """Return the MAC of shapes ``(n, n_channels)`` and ``(m, n_channels)``, shape ``(n, m)``."""
+    in_a, in_b = np.isfinite(a), np.isfinite(b)
+    a, b = np.nan_to_num(a), np.nan_to_num(b)
+    power = ((np.abs(a) ** 2) @ in_b.T) * (in_a @ (np.abs(b) ** 2).T)
+    several = in_a.astype(int) @ in_b.T.astype(int) > 1
+    return np.asarray(np.abs(a.conj() @ b.T) ** 2 / np.where(several, power, np.nan))
 
 
 def mode_shapes(modes: Modes, fitted: Sequence[FittedSpectrum]) -> ModeShapes:

@@ -39,6 +39,7 @@ class SpectraSummary:
     fitted: NDArray[np.float16]  # expectation by the fit, where a mode was sought, likewise
     singular: NDArray[np.float16]  # of the cross-spectral matrix, descending, (n_values, n_bins)
     count: NDArray[np.float16]  # ordinates of single segments in each bin, (n_bins,)
+    velocities: tuple[float, ...] = ()  # of its segments in m/s
 
     def __post_init__(self) -> None:
         n, bins = len(self.channels), self.count.size
@@ -89,7 +90,11 @@ def summarise(
         expected[rows] = np.where(np.isnan(own), expected[rows], own)
     singular = _singular_values(matrix, float(np.median(count)), n_singular)
     shown = count.clip(1, 6e4).astype(np.float16)
-    return replace(empty, level=level, fitted=expected, singular=singular, count=shown)
+    moving = {round(abs(s.velocity), 4) for s in spectra.spectra if np.isfinite(s.velocity)}
+    return replace(
+        empty, level=level, fitted=expected, singular=singular, count=shown,
+        velocities=tuple(sorted(moving)),
+    )  # fmt: skip
 
 
 def _binned(spectrum: CrossSpectrum, edges: FloatArray) -> ComplexArray:

@@ -46,7 +46,9 @@ class Assessment:
     seed: int  # seed of all random streams
     # Spectra of the logs of the history; None when no log covers the band of the modes.
     waterfall: Waterfall | None = None
-    latest: LogEstimates | None = None  # of the last log
+    # Estimates of the last log, and of the first one of the baseline.
+    latest: LogEstimates | None = None
+    at_baseline: LogEstimates | None = None
     # Evidence for the fleet prior; None without a posterior of the life.
     evidence: MachineEvidence | None = None
     # Fleet prior of the prognosis; None when it rests on the prior of the description.

@@ -37,7 +37,7 @@ class Month:
 
 def file_names(identities: Iterable[str]) -> dict[str, str]:
     """Name the pages of machines: valid on every file system and unique regardless of case."""
-    taken = {"index"}
+    taken = {"index", "how-to-read"}
     names = {}
     for identity in sorted(set(identities)):
         stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:_NAME_LENGTH] or "stage"
@@ -64,7 +64,7 @@ def write_index(
     *,
     generated: datetime | None = None,
 ) -> Path:
-    """Write ``index.html``; its bytes do not depend on the order of the summaries.
+    """Write ``index.html`` and ``how-to-read.html``; the order of the summaries is of no effect.
 
     ``refused`` are logs that belong to no machine; ``generated`` is printed on the page.
     """
@@ -95,6 +95,7 @@ def write_index(
     )
     path = folder / "index.html"
     write_text(path, text)
+    write_text(folder / "how-to-read.html", render("how_to_read.html.j2"))
     return path
 
 

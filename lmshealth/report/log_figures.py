@@ -32,7 +32,9 @@ from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
 from lmshealth.signal.segments import select_segments
 from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
+from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
+from lmshealth.tracking.history import LogEstimates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -47,6 +49,8 @@ _RANK = 1e-9
 # Drawings of shapes in a row, their height in inches, the largest motion over the extent of the
 # sensors, and the projection of x, y and z.
 _DRAWN_BESIDE, _DRAWING, _MOVED = 4, 1.8, 0.25
+# Height of a bar of a component, and of titles and legend of a row of them, in inches.
+_BAR, _TITLE = 0.24, 1.0
 _ISOMETRIC = np.array([[0.866, -0.5], [0.866, 0.5], [0.0, 1.0]])
 # Distance of labels over the width of the axes: side by side, and upright from this many on.
 _APART, _APART_UPRIGHT, _UPRIGHT = 0.2, 0.03, 6
@@ -76,25 +80,18 @@ def modes_figure(
     fitted = [_without_harmonics(fit, reading) for fit in reading.fitted]
     summary = summarise(reading.spectra, fitted, modes, (low, high), _BINS, n_singular=_SINGULAR)
     shapes = mode_shapes(modes, reading.fitted)
-    sensors = {one.name: one for one in stage.description.channel} if stage else {}
-    places = [sensors[name] for name in shapes.channels if name in sensors]
     width, height = spectra_size(summary, modes, reading.sought)
-    n_rows = -(-len(modes.names) // _DRAWN_BESIDE) if places else 0
+    below = shapes_size(shapes, stage)[1]
 
     def draw(figure: Figure) -> None:
-        if not n_rows:
-            plot_spectra(figure, summary, modes, stage, reading.sought)
+        if not below:
+            plot_spectra(figure, summary, modes, stage, sought=reading.sought)
             return
-        parts: Any = figure.subfigures(2, height_ratios=[height, n_rows * _DRAWING])
-        plot_spectra(parts[0], summary, modes, stage, reading.sought)
-        axes = parts[1].subplots(n_rows, _DRAWN_BESIDE, squeeze=False).ravel()
-        for ax in axes[len(modes.names) :]:
-            ax.set_axis_off()
-        for i, ax in enumerate(axes[: len(modes.names)]):
-            plot_shape(ax, shapes, i, places)
+        parts: Any = figure.subfigures(2, height_ratios=[height, below])
+        plot_spectra(parts[0], summary, modes, stage, sought=reading.sought)
+        plot_shapes(parts[1], shapes, stage)
 
-    size = width, height + n_rows * _DRAWING
-    return LogFigure(f"Modes of {log.name}", size, draw, modes)
+    return LogFigure(f"Modes of {log.name}", (width, height + below), draw, modes)
 
 
 def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSpectrum:
@@ -109,6 +106,83 @@ def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSp
             there = one.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
             expected = expected - there / np.outer(fit.unit, fit.unit)
     return replace(fit, expected=expected)
+
+
+def shapes_size(shapes: ModeShapes, stage: Stage | None) -> tuple[float, float]:
+    """Return the size of `plot_shapes` in inches; its height is 0 where nothing is drawn."""
+    n_rows = -(-len(_shown(shapes)) // _DRAWN_BESIDE)
+    bars = _TITLE + _BAR * len(shapes.channels)
+    return _WIDTH, n_rows * (bars + bool(_places(shapes, stage)) * _DRAWING)
+
+
+def plot_shapes(
+    figure: Figure, shapes: ModeShapes, stage: Stage | None, before: ModeShapes | None = None
+) -> Figure:
+    """Plot the complex components of each mode per channel, beside those of an earlier log.
+
+    Where the description places the sensors, the motion is drawn above.
+    """
+    places, shown = _places(shapes, stage), _shown(shapes)
+    mac = np.full(len(shapes.names), np.nan) if before is None else shapes.mac_with(before)
+    heights = [_DRAWING] * bool(places) + [_TITLE + _BAR * len(shapes.channels)]
+    n_rows, n_columns = -(-len(shown) // _DRAWN_BESIDE), min(len(shown), _DRAWN_BESIDE)
+    grid: Any = figure.subplots(
+        n_rows * len(heights), n_columns, squeeze=False, height_ratios=heights * n_rows
+    )
+    for ax in grid.ravel():
+        ax.set_axis_off()
+    for k, i in enumerate(shown):
+        row, column = divmod(k, n_columns)
+        axes = grid[row * len(heights) : (row + 1) * len(heights), column]
+        if places:
+            plot_shape(axes[0], shapes, i, places)
+        axes[-1].set_axis_on()
+        _plot_components(axes[-1], shapes, i, before)
+        _name_shape(axes[0], shapes, i, float(mac[i]))
+        axes[-1].tick_params(labelleft=column == 0)
+    handles, labels = grid[len(heights) - 1, 0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower left", ncols=4)
+    return figure
+
+
+def _shown(shapes: ModeShapes) -> list[int]:
+    """Return the modes with components in several channels."""
+    return np.flatnonzero(np.isfinite(shapes.shapes).sum(axis=1) > 1).tolist()
+
+
+def _places(shapes: ModeShapes, stage: Stage | None) -> list[ChannelSpec]:
+    """Return the described places of the channels of shapes."""
+    sensors = {one.name: one for one in stage.description.channel} if stage else {}
+    return [sensors[name] for name in shapes.channels if name in sensors]
+
+
+def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | None) -> None:
+    """Draw real and imaginary part of a mode per channel, the first channel on top."""
+    y = np.arange(len(shapes.channels))
+    part = shapes.shapes[i]
+    style: Any = {"height": 0.62, "lw": 0}
+    if before is not None and shapes.names[i] in before.names:
+        row = before.shapes[before.names.index(shapes.names[i])]
+        at = [before.channels.index(c) if c in before.channels else -1 for c in shapes.channels]
+        own = np.array([row[k].real if k >= 0 else np.nan for k in at])
+        # Shapes are known but for their sign.
+        own = own * (np.sign(np.nansum(own * part.real)) or 1.0)
+        ax.barh(y, own, color=figures.MUTED, alpha=0.35, label="at the baseline, real", **style)
+    style["height"] = 0.26
+    ax.barh(y, part.real, color=figures.BLUE, label="in phase (real)", **style)
+    ax.plot(part.imag, y, "D", color=figures.RED, ms=3.5, label="90° shifted (imaginary)")
+    ax.axvline(0, color=figures.MUTED, lw=0.8)
+    ax.set_xlim(-1.1, 1.1)
+    ax.set_xticks([-1, 0, 1])
+    ax.set_yticks(y, [figures.plain_label(name) for name in shapes.channels])
+    ax.invert_yaxis()
+
+
+def _name_shape(ax: Axes, shapes: ModeShapes, i: int, mac: float) -> None:
+    """Write the mode above its shape, with its phase collinearity and its MAC."""
+    values = {"MPC": float(shapes.complexity[i]), "MAC": mac}
+    text = ", ".join(f"{name} {value:.2f}" for name, value in values.items() if np.isfinite(value))
+    ax.set_title(figures.plain_label(f"{spell(shapes.names[i])}\n{text}"), size=9)
 
 
 def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpec]) -> Axes:
@@ -146,10 +220,6 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     ax.margins(0.12)
     ax.set_aspect("equal", anchor="N")
     ax.set_axis_off()
-    title = spell(shapes.names[i])
-    if np.isfinite(shapes.complexity[i]):
-        title += f", MPC {shapes.complexity[i]:.2f}"
-    ax.set_title(figures.plain_label(title), size=9)
     return ax
 
 
@@ -165,9 +235,14 @@ def plot_spectra(
     summary: SpectraSummary,
     modes: Modes,
     stage: Stage | None,
+    *,
+    before: LogEstimates | None = None,
     sought: Sequence[Found] = (),
 ) -> Figure:
-    """Plot the spectrum of each channel with its fit, lines, modes and what was refused."""
+    """Plot the spectrum of each channel with its fit, lines, modes and what was refused.
+
+    The spectra and modes of an earlier log are drawn behind them.
+    """
     middle = (summary.edges[1:] + summary.edges[:-1]) / 2
     n = len(summary.channels) + bool(len(summary.singular)) + bool(sought)
     panels = list(figure.subplots(n, sharex=True, squeeze=False)[:, 0])
@@ -181,6 +256,8 @@ def plot_spectra(
     for ax, name, derived, density, fit in zip(
         panels, summary.channels, summary.derived, level, fitted, strict=False
     ):
+        if before is not None and before.spectra is not None:
+            _plot_before(ax, before.spectra, before.modes, name)
         ax.plot(middle, density, color=figures.INK, lw=0.7, label="measured")
         ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label="fit")
         if np.isfinite(fit).any():
@@ -201,6 +278,7 @@ def plot_spectra(
     for ax in panels[: len(level) + bool(singular.size)]:
         ax.set_yscale("log")
         ax.margins(y=0.08)  # room for markers
+    _mark_orders(panels[: len(level)], summary, stage)
     for part in sought:
         _plot_search(panels, part)
     if sought:
@@ -208,6 +286,20 @@ def plot_spectra(
     figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=10)
     _annotate(figure, panels, (summary.low, summary.high), modes, stage)
     return figure
+
+
+def _plot_before(ax: Axes, summary: SpectraSummary, modes: Modes, channel: str) -> None:
+    """Fill the area below the spectrum of a channel in an earlier log, and mark its modes."""
+    if channel not in summary.channels:
+        return
+    level = np.asarray(summary.level[summary.channels.index(channel)], dtype=float)
+    low = 10 ** (np.nanmin(level, initial=np.inf) / 10)
+    style: Any = {"color": figures.MUTED, "alpha": 0.3, "lw": 0}
+    middle = (summary.edges[1:] + summary.edges[:-1]) / 2
+    ax.fill_between(middle, low, 10 ** (level / 10), label="measured at the baseline", **style)
+    for f in modes.frequency.tolist():
+        if summary.low <= f <= summary.high:
+            ax.axvline(f, color=figures.MUTED, lw=1, ls="-.", label="mode at the baseline")
 
 
 def _name_panel(ax: Axes, name: str) -> None:
@@ -344,6 +436,16 @@ def _mark_lines(
         ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
 
 
+def _mark_orders(panels: Sequence[Axes], summary: SpectraSummary, stage: Stage | None) -> None:
+    """Mark where the described orders of the velocities of the log are, whether found or not."""
+    band = summary.low, summary.high
+    for f, name in expected_orders(stage, summary.velocities, band) if stage else ():
+        style: Any = {"color": figures.RED, "ms": 9, "mew": 1.4}
+        label = figures.plain_label(f"expected: {spell(name)}")
+        for ax in panels:
+            ax.plot(f, 0.05, "|", transform=ax.get_xaxis_transform(), label=label, **style)
+
+
 def _annotate(
     figure: Figure,
     panels: Sequence[Axes],
@@ -364,10 +466,15 @@ def _annotate(
         name = spell(modes.names[k] or "unnamed")
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
     sought = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
+    for at in sought.values():
+        style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
+        if band[0] <= at <= band[1]:
+            place = panels[-1].get_xaxis_transform()
+            panels[-1].plot(at, 0, "^", transform=place, label="declared frequency", **style)
     for refusal in modes.refused:
         at = refusal.frequency or sought.get(refusal.mode)
         if at is not None and band[0] <= at <= band[1]:
-            style: Any = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
+            style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
                 ax.axvline(at, **style, label="refused, or not found")
             labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))

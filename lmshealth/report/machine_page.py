@@ -5,8 +5,7 @@ This module collects results and figures; wording and markup are in ``templates/
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import date, datetime
 from functools import partial
 from itertools import combinations
@@ -22,9 +21,9 @@ from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.prognosis.maintenance_decision import Service, day_after, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, Summary, first_limit, limit_of, summarise
+from lmshealth.report.assessment import Assessment, Summary, first_limit, limit_of
 from lmshealth.report.changes import changes
-from lmshealth.report.log_figures import plot_spectra, spectra_size
+from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.notices import notices
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import track_rows
@@ -32,7 +31,7 @@ from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
-from lmshealth.tracking.history import History
+from lmshealth.tracking.history import History, LogEstimates
 from lmshealth.tracking.track import Effect, Track
 
 Item = TypeVar("Item")
@@ -40,32 +39,34 @@ Item = TypeVar("Item")
 _SIZES = {"waterfall": (4.5, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
-@dataclass(frozen=True, slots=True)
-class Page:
-    """Page of a machine: its HTML, and the machine as the fleet page shows it."""
-
-    text: str
-    summary: Summary
-
-
 def make_page(
     assessment: Assessment,
-    file: str,
+    summary: Summary,
     *,
     before: Summary | None = None,
+    states: Mapping[date, Mapping[str, str]] | None = None,
     generated: datetime | None = None,
-) -> Page:
-    """Make the page of one machine, under a name from `file_names`.
+) -> str:
+    """Make the page of one machine (HTML).
 
-    ``before`` is the summary of the machine in its previous report; ``generated`` is printed.
+    Parameters
+    ----------
+    assessment, summary : Assessment, Summary
+        Results of the machine, and what `summarise` makes of them.
+    before : Summary, optional
+        Summary of the machine in its previous report.
+    states : mapping, optional
+        States by NAMUR NE 107 of its conditions, from each day on until the next.
+    generated : datetime, optional
+        Printed as the time at which the page was written.
     """
-    service, parameters = assessment.service(), assessment.stage.parameters
-    summary = summarise(assessment, service, file)
+    service, parameters = summary.service, assessment.stage.parameters
     highest = max((one.high for one in summary.health), default=1.0)
     content = {
         "assessment": assessment,
         "notices": notices(assessment),
         "summary": summary,
+        "states": states or {},
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "postponed": list(_postponed(assessment.prognosis, service)),
         "first_limit": first_limit(assessment.prognosis),
@@ -80,16 +81,14 @@ def make_page(
         key: figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
         for k, (key, plot) in enumerate(draw.items())
     }
-    latest = assessment.latest
-    if latest is not None and latest.spectra is not None:
-        shown = latest.spectra, latest.modes
-        plot = partial(plot_spectra, summary=shown[0], modes=shown[1], stage=assessment.stage)
-        pictures["latest", "all"] = figures.inline(plot, salt="last", size=spectra_size(*shown))
+    content["mac"] = _mac(assessment)
+    for key, (whole, size) in _log_pictures(assessment).items():
+        pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
     content["picture"] = {
         key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
     }
-    return Page(render("stage.html.j2", generated, **content), summary)
+    return render("stage.html.j2", generated, **content)
 
 
 def latest_modes(track: Track) -> list[dict[str, Any]]:
@@ -266,6 +265,40 @@ def _track_pictures(
     if track is not None and _nis(track) is not None:
         draw["nis", "all"] = partial(figures.plot_nis, track=track)
     return draw
+
+
+def _compared(assessment: Assessment) -> LogEstimates | None:
+    """Return the first log of the baseline; None where that is the last log."""
+    latest, before = assessment.latest, assessment.at_baseline
+    return before if latest and before and before.log != latest.log else None
+
+
+def _mac(assessment: Assessment) -> dict[str, float]:
+    """Return the MAC of each mode of the last log with that of the baseline."""
+    latest, before = assessment.latest, _compared(assessment)
+    if not (latest and latest.shapes and before and before.shapes):
+        return {}
+    found = latest.shapes.mac_with(before.shapes)
+    return {name: one for name, one in zip(latest.shapes.names, found, strict=True) if one >= 0}
+
+
+def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, float]]]:
+    """Return what draws the last log beside the one at the baseline, and the size in inches."""
+    latest, stage, before = assessment.latest, assessment.stage, _compared(assessment)
+    if latest is None:
+        return {}
+    found: dict[str, tuple[Any, tuple[float, float]]] = {}
+    if latest.spectra is not None:
+        plot = partial(plot_spectra, summary=latest.spectra, modes=latest.modes)
+        size = spectra_size(latest.spectra, latest.modes)
+        found["latest"] = partial(plot, stage=stage, before=before), size
+    if latest.shapes is not None and (size := shapes_size(latest.shapes, stage))[1]:
+        earlier = before and before.shapes
+        found["shapes"] = (
+            partial(plot_shapes, shapes=latest.shapes, stage=stage, before=earlier),
+            size,
+        )
+    return found
 
 
 def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str, ...], Any]:

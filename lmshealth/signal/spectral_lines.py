@@ -71,6 +71,19 @@ def name_lines(
     return _without_duplicates(named, resolution)
 
 
+def expected_orders(
+    stage: Stage, velocities: Iterable[float], band: tuple[float, float]
+) -> list[tuple[float, str]]:
+    """Return frequency in Hz and name of the described orders in a band, at velocities in m/s.
+
+    Up to the harmonic that `name_lines` names.
+    """
+    bases = [(f, name) for f, name in _fundamentals(stage, velocities) if name != "mains"]
+    harmonics = range(1, constants.MOST_HARMONICS + 1)
+    found = {(n * base, name) for base, name in bases for n in harmonics if base > 0}
+    return sorted(one for one in found if band[0] <= one[0] <= band[1])
+
+
 @dataclass(frozen=True, slots=True)
 class _Detection:
     """A line at one velocity, with the resolution of its frequency in Hz."""

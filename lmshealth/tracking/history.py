@@ -13,6 +13,7 @@ from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth._result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Metadata, Notice, Refusal
+from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.signal.waterfall import RelativeSpectrum
@@ -227,6 +228,8 @@ class LogEstimates:
         Spectrum about the tracked modes, for plots; None where the log has none.
     spectra : SpectraSummary or None
         Spectrum of each channel with the fit of the modes, for plots; None if it was not kept.
+    shapes : ModeShapes or None
+        Complex shapes of the modes, for plots; None if they were not kept.
 
     Examples
     --------
@@ -253,6 +256,7 @@ class LogEstimates:
     loop_error: float | None = None
     levels: RelativeSpectrum | None = None
     spectra: SpectraSummary | None = None
+    shapes: ModeShapes | None = None
 
 
 def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:

@@ -19,7 +19,11 @@ PAGES = HERE.parents[1] / "demo" / "result"
 
 def main(folder: Path = PAGES) -> None:
     """Write report.png down to the end of the first screen, in few colours: it stays small."""
-    pages = [path for path in sorted(folder.glob("*.html")) if path.name != "index.html"]
+    pages = [
+        path
+        for path in sorted(folder.glob("*.html"))
+        if path.name not in ("index.html", "how-to-read.html")
+    ]
     if not pages:
         sys.exit(f"{folder} holds no report: run `make demo` first")
     target = HERE / "report.png"

@@ -74,7 +74,8 @@ def one_stage(folder: Path, plan: Plan, epochs: int, stage: Stage) -> Row:
         "life_s": life_s,
         "page_s": seconds["reporting"],
         "store_mb": size_mb(out, "*.sqlite*"),
-        "page_mb": size_mb(out, "*.html") - size_mb(out, "index.html"),
+        "page_mb": size_mb(out, "*.html")
+        - sum(size_mb(out, name) for name in ("index.html", "how-to-read.html")),
     }
 
 

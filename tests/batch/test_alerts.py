@@ -22,8 +22,6 @@ from lmshealth.batch.alerts import Alerts, read_fleet, run_command
 from lmshealth.batch.run import RunResult, Settings, run
 from lmshealth.batch.store import Identified
 from lmshealth.errors import NothingUsable
-from lmshealth.report.assessment import Assessment, summarise
-from lmshealth.report.machine_page import Page
 from lmshealth.stage.description import Stage
 from studies.harness.servers import wait_until
 from tests.lives import FREQUENCY, MODES, START, make_reading, make_stage
@@ -51,7 +49,7 @@ class Nights:
 
         monkeypatch.setattr(running, "datetime", Clock)
         monkeypatch.setattr(ingest, "identify_log", self.identify)
-        monkeypatch.setattr(outputs, "make_page", _no_page)
+        monkeypatch.setattr(outputs, "make_page", lambda *_, **__: "")
 
     def identify(self, task: Any, stages: tuple[Stage, ...], max_memory: float) -> Identified:
         """Return the estimates that a file states."""
@@ -87,10 +85,6 @@ def rows_of(path: Path) -> list[dict[str, str]]:
     """Read a table."""
     with path.open(encoding="utf-8", newline="") as stream:
         return list(csv.DictReader(stream))
-
-
-def _no_page(found: Assessment, file: str, **_: Any) -> Page:
-    return Page("", summarise(found, found.service(), file))
 
 
 @pytest.fixture

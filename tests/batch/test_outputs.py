@@ -85,7 +85,7 @@ def test_a_page_needs_no_logs(tmp_path: Path) -> None:
     made = pack_assessment(worn(tmp_path))
     output = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
     assert output is not None
-    summary = output.page.summary
+    summary = output.summary
     assert (summary.file, summary.identity) == ("M7-Y.html", "M7-Y")
     assert unpack(output.tables, dict[str, list[Row]]) == {}
     assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None

@@ -30,7 +30,7 @@ from lmshealth.io.log import Log
 from lmshealth.modal.identification import AmbientReading
 from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior
 from lmshealth.prognosis.life_likelihood import scatter_prior
-from lmshealth.report.assessment import Assessment
+from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.tables import COLUMNS, machine_tables
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import LogEstimates
@@ -201,9 +201,9 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     drawn: list[str] = []
     whole = outputs.make_page
 
-    def counted(found: Assessment, file: str, **options: Any) -> Any:
-        drawn.append(file)
-        return whole(found, file, **options)
+    def counted(found: Assessment, summary: Summary, **options: Any) -> Any:
+        drawn.append(summary.file)
+        return whole(found, summary, **options)
 
     monkeypatch.setattr(outputs, "make_page", counted)
     run(logs, [modes_only], out)

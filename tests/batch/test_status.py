@@ -12,7 +12,14 @@ import numpy as np
 import pytest
 
 from lmshealth._serialize import pack, unpack
-from lmshealth.batch.status import Status, compare, conditions, make_status, points
+from lmshealth.batch.status import (
+    Status,
+    coming_states,
+    compare,
+    conditions,
+    make_status,
+    points,
+)
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
 from lmshealth.tracking.track import Event
@@ -93,6 +100,18 @@ def test_every_result_has_a_namur_state(given: dict[str, Any], state: str, codes
     found = conditions(status(**given), TODAY)
     assert " ".join(found) == codes
     assert next(iter(found.values()), "NORMAL") == state
+
+
+def test_states_to_come_are_those_of_their_days() -> None:
+    """A later day is listed where it changes the state, and no day before the last log."""
+    sound = status(inspect_by=date(2027, 7, 1))
+    coming = coming_states(sound)
+    lead = date(2027, 6, 1) - timedelta(days=30)
+    assert [*coming] == [LAST.date(), lead]
+    assert coming[LAST.date()] == {} and coming[lead] == {"service-due": "MAINTENANCE_REQUIRED"}
+    assert all(found == conditions(sound, day) for day, found in coming.items())
+    worn = status(verdict="preload", service_by=date(2026, 1, 1))
+    assert [*coming_states(worn)] == [LAST.date()]
 
 
 @pytest.mark.parametrize(

@@ -872,11 +872,13 @@ def test_report_writes_the_pages_of_run_without_its_logs(stage: Path, tmp_path: 
     shutil.rmtree(logs)
     Path(own).unlink()
     url = f"sqlite:///{(tmp_path / 'out' / 'lmshealth.sqlite').as_posix()}"
-    result = call("report", "--store", url, "--out", tmp_path / "pages")
+    result = call("report", "--store", url, "--out", tmp_path / "pages", "--interactive")
     assert (result.exit_code, result.stderr) == (0, "")
     assert str(tmp_path / "pages" / "index.html") in result.stdout
-    names = sorted(page.name for page in (tmp_path / "pages").iterdir())
-    assert names == ["index.html", "test-A.html"]
+    names = sorted(page.name for page in (tmp_path / "pages").iterdir() if page.is_file())
+    assert names == ["how-to-read.html", "index.html", "test-A.html"]
+    text = (tmp_path / "pages" / "interactive" / "test-A.html").read_text(encoding="utf-8")
+    assert 'href="../test-A.html"' in text and "Modes and health over the odometer" in text
     for name in names:
         assert (tmp_path / "pages" / name).read_bytes() == (tmp_path / "out" / name).read_bytes()
     assert "broken.h5" in (tmp_path / "pages" / "index.html").read_text()
@@ -936,7 +938,7 @@ def test_an_unreadable_machine_is_reported_and_the_others_are_written(tmp_path: 
     assert result.exit_code == 3
     assert "M8-Y" in result.stderr and len(result.stderr.splitlines()) == 1
     names = sorted(page.name for page in (tmp_path / "pages").iterdir())
-    assert names == ["M7-Y.html", "index.html"]
+    assert names == ["M7-Y.html", "how-to-read.html", "index.html"]
 
 
 @pytest.mark.slow

@@ -54,3 +54,18 @@ def test_criteria_are_those_of_the_literature() -> None:
     assert found.mac[1, 0] == pytest.approx(overlap)
     assert np.diag(found.mac)[:2] == pytest.approx([1.0, 1.0])
     assert np.isnan(found.mac[2]).all()
+
+
+def test_mac_with_another_log_compares_modes_of_one_name() -> None:
+    """Over the channels that both have, in any order; NaN where there is nothing to compare."""
+    now = ModeShapes(
+        ("roll", "pitch", "yaw"), ("a", "b", "c"),
+        np.array([[1.0, 0.5, np.nan], [1.0, -1.0, 0.3], [np.nan, np.nan, 1.0]], dtype=complex),
+    )  # fmt: skip
+    before = ModeShapes(
+        ("pitch", "roll", "yaw"), ("b", "a", "d"),
+        np.array([[-1j, 1j, 0.1], [1.0, -0.5, 0.2], [1.0, 1.0, 1.0]]),
+    )  # fmt: skip
+    assert now.mac_with(before) == pytest.approx([0.0, 1.0, np.nan], nan_ok=True)
+    assert now.mac_with(now)[:2] == pytest.approx([1.0, 1.0])
+    assert np.isnan(now.mac_with(ModeShapes((), (), np.empty((0, 0), dtype=complex)))).all()

@@ -18,11 +18,20 @@ from lmshealth.modal.ambient.wandering import Harmonic
 from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
-from lmshealth.report.log_figures import LogFigure, modes_figure, plot_shape, write_figure
+from lmshealth.report.log_figures import (
+    LogFigure,
+    modes_figure,
+    plot_shape,
+    plot_shapes,
+    plot_spectra,
+    shapes_size,
+    write_figure,
+)
 from lmshealth.signal.segments import find_segments
 from lmshealth.signal.spectra import LogSpectra, cross_spectra
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.stage.description import ChannelSpec
+from lmshealth.stage.description import ChannelSpec, load_stage
+from tests.report.test_readable import seen_in_a_log
 from tests.signals import Mode, accelerations, make_log, make_stage, sine, white
 
 RATE, N = 500.0, 16000
@@ -145,7 +154,41 @@ def test_shapes_are_drawn_where_the_description_places_the_sensors() -> None:
     rest = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]])
     isometric = np.array([[0.866, -0.5], [0.866, 0.5], [0.0, 1.0]])
     assert np.array(tips) == pytest.approx((rest + motions) @ isometric)
-    assert ax.get_title() == "roll, MPC 1.00"
+
+
+def test_components_stand_beside_those_of_the_baseline() -> None:
+    """Bars are real parts, points imaginary ones; the baseline is turned to the same sign."""
+    now = ModeShapes(("roll", "yaw"), ("a", "b"), np.array([[1.0, -0.5 + 0.2j], [np.nan, 1.0]]))
+    before = ModeShapes(("roll",), ("b", "a"), np.array([[0.4, -0.8]], dtype=complex))
+    figure = Figure()
+    plot_shapes(figure, now, None, before)
+    (ax,) = figure.axes  # a mode in one channel has no shape
+    widths = [[bar.get_width() for bar in part] for part in ax.containers]
+    assert widths == [pytest.approx([0.8, -0.4]), pytest.approx([1.0, -0.5])]
+    assert np.asarray(ax.lines[0].get_xdata()) == pytest.approx([0.0, 0.2])
+    assert ax.get_title() == "roll\nMPC 0.90, MAC 0.98"
+    assert shapes_size(now.__class__((), (), np.empty((0, 0), complex)), None)[1] == 0
+
+
+def test_the_baseline_and_the_declared_frequencies_are_in_the_spectrum() -> None:
+    """An earlier log is an area with its modes; orders are where the velocity puts them."""
+    latest, before = seen_in_a_log(), seen_in_a_log("log-1.h5", seed=3)
+    spectra = latest.spectra
+    assert spectra is not None
+    spectra = replace(spectra, velocities=(0.128,))  # 32 Hz over 4 mm
+    stage = load_stage("lms-y")
+    figure = Figure()
+    plot_spectra(figure, spectra, latest.modes, stage, before=before)
+    ends: dict[str, list[float]] = {}
+    for line in figure.axes[-1].lines + figure.axes[0].lines:
+        x = np.atleast_1d(np.asarray(line.get_xdata(), dtype=float))
+        ends.setdefault(str(line.get_label()), []).append(float(x[0]))
+    assert ends["declared frequency"] == [126.4, 136.6, 155.0]
+    assert sorted(set(ends["mode at the baseline"])) == pytest.approx(before.modes.frequency)
+    assert set(ends["expected: ball pass"]) == {128.0, 160.0}
+    again = Figure()
+    plot_spectra(again, spectra, latest.modes, stage)
+    assert len(again.axes[0].collections) < len(figure.axes[0].collections)
 
 
 def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -> None:

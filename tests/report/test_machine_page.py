@@ -16,6 +16,7 @@ from msgspec import structs
 from lmshealth import examples
 from lmshealth._arrays import FloatArray
 from lmshealth.batch.assess import assess
+from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.spectra_summary import summarise
@@ -45,6 +46,7 @@ from tests.assessments import (
     write_report,
     write_stage,
 )
+from tests.report.test_readable import seen_in_a_log
 from tests.signals import Mode, accelerations, make_log
 
 __all__ = ["make"]
@@ -89,6 +91,23 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
         shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]
         assert shown == pytest.approx(100 * float(risk.at_most[-1]), abs=1.5)
     assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
+
+
+@pytest.mark.slow
+def test_the_last_log_stands_beside_the_baseline(make: Maker, tmp_path: Path) -> None:
+    """Spectrum and shapes of both, the MAC of each mode in the table, and the state by NE 107."""
+    latest, before = seen_in_a_log(), seen_in_a_log("log-1.h5", seed=3)
+    made = replace(make(), latest=latest, at_baseline=before)
+    text = words(one(tmp_path, made))
+    assert latest.shapes is not None and before.shapes is not None
+    mac = dict(zip(latest.shapes.names, latest.shapes.mac_with(before.shapes), strict=True))
+    row = text[text.index("MAC with baseline") : text.index("Spectrum of the last log")]
+    assert re.search(rf"roll .* {mac['roll']:.3f} pitch", row) and "yaw" in row
+    for part in ("first log of the baseline (log-1.h5)", "Shapes of the modes", "mode at the base"):
+        assert part in text
+    assert "NAMUR NE 107 at the last log: maintenance required (M) (loss" in text
+    alone = words(one(tmp_path, replace(made, at_baseline=latest)))
+    assert "Shapes of the modes" in alone and "MAC" not in alone
 
 
 @pytest.mark.usefixtures("blank")
@@ -315,9 +334,14 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
     """Made alone, the same page and the same rows come out."""
     stages = [make(), nothing(make("M8-Y"))]
     *pages, index = write_report(tmp_path / "a", stages, ())
-    alone = [make_page(stage, path.name) for stage, path in zip(stages, pages, strict=True)]
-    assert [page.text for page in alone] == [path.read_text(encoding="utf-8") for path in pages]
-    again = write_index(tmp_path, [page.summary for page in alone[::-1]], ())
+    rows = [
+        summarise_machine(stage, stage.service(), path.name)
+        for stage, path in zip(stages, pages, strict=True)
+    ]
+    for stage, row, path in zip(stages, rows, pages, strict=True):
+        states = coming_states(make_status(stage, row))
+        assert make_page(stage, row, states=states) == path.read_text(encoding="utf-8")
+    again = write_index(tmp_path, rows[::-1], ())
     assert again.read_bytes() == index.read_bytes()
 
 
@@ -326,9 +350,10 @@ def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.M
     """The first screen, what is new, the pictures and the row of the index share one decision."""
     assessment, asked = make(), []
     decided = assessment.service()
+    summary = summarise_machine(assessment, decided)
     monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
-    make_page(assessment, "a.html", before=summarise_machine(assessment, decided))
-    assert asked == [assessment]
+    make_page(assessment, summary, before=summary)
+    assert asked == []
 
 
 @pytest.mark.usefixtures("blank")
@@ -357,10 +382,16 @@ def test_empty_fleet(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_a_page_is_self_contained_and_well_formed(make: Maker, tmp_path: Path) -> None:
     """Nothing is loaded from outside, identifiers are unique, headings descend by one."""
-    for path in write_report(tmp_path / "out", [make()], ()):
+    paths = write_report(tmp_path / "out", [make()], ())
+    examples = Page(paths[0].with_name("how-to-read.html"))
+    linked = {
+        a.partition("#")[2] for a in Page(paths[0]).loads if a.startswith("how-to-read.html#")
+    }
+    assert linked and linked <= set(examples.ids)
+    for path in [*paths, paths[0].with_name("how-to-read.html")]:
         page = Page(path)
         assert "http:" not in page.source and "https:" not in page.source
-        allowed = ("#", "data:", "index.html", "M7-Y.html")
+        allowed = ("#", "data:", "index.html", "M7-Y.html", "how-to-read.html")
         assert all(address.startswith(allowed) for address in page.loads), page.loads
         assert len(page.ids) == len(set(page.ids))
         assert {a[1:] for a in page.loads if a.startswith("#")} <= set(page.ids)

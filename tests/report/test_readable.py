@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import LogEstimates
@@ -100,15 +102,25 @@ def browser(needs: Callable[[str], None]) -> Iterator[Any]:
         yield one
 
 
-def pages(make: Maker, folder: Path) -> list[Path]:
-    """Write pages of a worn, a partly determined and an unknown machine, and of the fleet."""
-    stage, rng = load_stage("lms-y"), np.random.default_rng(2)
-    modes = [Mode(126.4, 0.015), Mode(136.4, 0.015)]
-    log = make_log({"acc_pitch": accelerations(rng, modes, 20_000, 1000.0, 1.0)[0]}, 1000.0)
+@cache
+def seen_in_a_log(name: str = "log-9.h5", seed: int = 2) -> LogEstimates:
+    """Identify a log of two channels, with its spectra and shapes."""
+    stage, rng = load_stage("lms-y"), np.random.default_rng(seed)
+    modes = [Mode(126.4, 0.015, shape=(1.0, 0.3)), Mode(136.4, 0.015, shape=(-0.4, 1.0))]
+    made = accelerations(rng, modes, 20_000, 1000.0, 1.0)
+    log = make_log({"acc_pitch": made[0], "acc_feed": made[1]}, 1000.0)
     reading = read_ambient(log, stage)
     spectra = summarise(reading.spectra, reading.fitted, reading.modes, (110.0, 180.0), 100)
-    latest = LogEstimates("log-9.h5", log.digest, log.metadata, reading.modes, spectra=spectra)
-    machines = [replace(make(), latest=latest), blind(make("M8-Y")), nothing(make("M9-Y"))]
+    shapes = mode_shapes(reading.modes, reading.fitted)
+    found = LogEstimates(name, log.digest, log.metadata, reading.modes)
+    return replace(found, spectra=spectra, shapes=shapes)
+
+
+def pages(make: Maker, folder: Path) -> list[Path]:
+    """Write pages of a worn, a partly determined and an unknown machine, and of the fleet."""
+    latest, before = seen_in_a_log("log-9.h5"), seen_in_a_log("log-1.h5", seed=3)
+    worn = replace(make(), latest=latest, at_baseline=before)
+    machines = [worn, blind(make("M8-Y")), nothing(make("M9-Y"))]
     found = write_report(folder / "out", machines, ())
     assert found[0].with_name("index.html").is_file()
     return sorted(found[0].parent.glob("*.html"))
