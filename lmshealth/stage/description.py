@@ -53,9 +53,9 @@ class ModeSpec(_Part, frozen=True):
     ``shape`` holds the acceleration of channels by name, in any unit.
     """
 
-    name: Name
-    frequency_hz: Positive
-    damping_ratio: Share
+    name: Annotated[Name, Meta(examples=["pitch"])]
+    frequency_hz: Annotated[Positive, Meta(examples=[136.4])]
+    damping_ratio: Annotated[Share, Meta(examples=[0.015])]
     direction: Name = ""
     snr: Positive = 100.0
     search: Share = 0.15
@@ -74,8 +74,8 @@ def _expect_ascending(name: str, low: float, high: float) -> None:
 class WatchedBand(_Part, frozen=True):
     """A narrow band of which only the acceleration level is reported."""
 
-    low_hz: Positive
-    high_hz: Positive
+    low_hz: Annotated[Positive, Meta(examples=[1950])]
+    high_hz: Annotated[Positive, Meta(examples=[2050])]
 
     def __post_init__(self) -> None:
         _expect_ascending("the band", self.low_hz, self.high_hz)
@@ -84,7 +84,7 @@ class WatchedBand(_Part, frozen=True):
 class Limit(_Part, frozen=True):
     """Value below which a health parameter is worn out."""
 
-    below: Positive
+    below: Annotated[Positive, Meta(examples=[0.6])]
 
 
 class ParameterSpec(_Part, frozen=True):
@@ -94,11 +94,11 @@ class ParameterSpec(_Part, frozen=True):
     word by which verdict.csv names its loss.
     """
 
-    name: Name
+    name: Annotated[Name, Meta(examples=["guide_preload"])]
     prior: Prior
     baseline: Positive = 1.0
     unit: Name = ""
-    limit: Limit | None = None
+    limit: Annotated[Limit | None, Meta(examples=[{"below": 0.6}])] = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
     verdict: Name = ""
 
@@ -129,23 +129,24 @@ class ParameterSpec(_Part, frozen=True):
 class MapSpec(_Part, frozen=True):
     """File of the modal map and relative standard deviation of its sensitivities."""
 
-    file: str
+    file: Annotated[str, Meta(examples=["my-stage.map.csv"])]
     model_std: Annotated[float, Meta(ge=0, lt=1)] = 0.05
 
 
 class Order(_Part, frozen=True):
     """A spectral line at velocity / wavelength."""
 
-    name: Name
-    wavelength_mm: Positive
+    name: Annotated[Name, Meta(examples=["ball pass"])]
+    wavelength_mm: Annotated[Positive, Meta(examples=[4.0])]
 
 
 class ChannelSpec(_Part, frozen=True):
     """Place of a sensor in m and the direction that it measures, for drawings of mode shapes."""
 
-    name: Name
-    position_m: tuple[float, float, float]
-    direction: tuple[float, float, float]  # of any length but 0
+    name: Annotated[Name, Meta(examples=["acc_pitch"])]
+    position_m: Annotated[tuple[float, float, float], Meta(examples=[[0.1, 0.0, 0.25]])]
+    # Of any length but 0.
+    direction: Annotated[tuple[float, float, float], Meta(examples=[[0, 0, 1]])]
 
     def __post_init__(self) -> None:
         if not any(self.direction):
@@ -159,9 +160,9 @@ class Covariate(_Part, frozen=True):
     ``curvature_std`` that of its quadratic coefficient per unit squared.
     """
 
-    name: Name
-    reference: float
-    prior_std: Positive
+    name: Annotated[Name, Meta(examples=["temperature_c"])]
+    reference: Annotated[float, Meta(examples=[21.0])]
+    prior_std: Annotated[Positive, Meta(examples=[0.001])]
     curvature_std: Annotated[float, Meta(ge=0)] = 0.0
 
 
@@ -204,7 +205,7 @@ class Usage(_Part, frozen=True):
 class Description(_Part, frozen=True):
     """The stage description as written; ``source`` and ``loop`` are accepted, not used."""
 
-    name: Name
+    name: Annotated[Name, Meta(examples=["my stage"])]
     mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
