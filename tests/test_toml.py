@@ -32,7 +32,8 @@ class _Tree(Struct, forbid_unknown_fields=True):
         (
             'nme = "a"\npart = 3',
             "several mistakes\n  name: missing\n  nme: unknown key; known are name, part; "
-            "most like it is name\n  part: Expected `array`, got `int`\nTo copy and edit:\n\nname = ",
+            "most like it is name\n"
+            "  part: Expected `array`, got `int`\nTo copy and edit:\n\nname = ",
         ),
         ("part = []", "name: missing"),
         ("name = 3", "name: Expected `str`, got `int`"),

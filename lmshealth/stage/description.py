@@ -4,6 +4,7 @@ import hashlib
 import sys
 from dataclasses import dataclass
 from datetime import date
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -408,3 +409,20 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
             f"tracked [[mode]] ({described})"
         )
+    at = np.exp(modal_map.ln_frequency(np.log([[p.baseline for p in description.parameter]]))[0])
+    free = {
+        name.casefold(): (name, f)
+        for name, f in zip(modal_map.modes, at.tolist(), strict=True)
+        if name not in described
+    }
+    for k, mode in enumerate(description.mode):
+        if not mode.tracked or mode.name in modal_map.modes:
+            continue
+        for near in get_close_matches(mode.name.casefold(), free):
+            name, f = free[near]
+            if abs(f / mode.frequency_hz - 1) <= mode.search:
+                raise BadStage(
+                    f"{path}: mode[{k}].name: {mode.name!r} is not on the map, whose {name!r} at "
+                    f"{f:.4g} Hz no [[mode]] describes; write {name!r}, or, if these are two "
+                    "modes, describe both"
+                )
