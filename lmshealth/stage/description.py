@@ -245,7 +245,7 @@ class ScatterPrior:
     deviation: tuple[float, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Stage:
     """A checked stage description with its modal map, None when there is no health parameter.
 
@@ -257,6 +257,11 @@ class Stage:
     modal_map: ModalMap | None
     digest: str
     scatter: ScatterPrior | None = None
+
+    def __repr__(self) -> str:
+        modes = ", ".join(f"{mode.name} {mode.frequency_hz:g} Hz" for mode in self.modes)
+        parameters = ", ".join(parameter.name for parameter in self.parameters)
+        return f"Stage {self.name}: modes {modes}; parameters {parameters or 'none'}"
 
     @property
     def name(self) -> str:

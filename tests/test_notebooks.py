@@ -1,0 +1,54 @@
+"""The notebooks run from their first to their last cell, and are all listed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
+LONGEST_S = 1200  # of a cell, on a busy machine
+
+
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_has_a_question_and_its_limits(path: Path) -> None:
+    """It begins with a question, ends with what it does not show, and is listed."""
+    cells = re.split(r"^# %%", path.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]
+    assert "**Question.**" in cells[0] and "**What this does not show.**" in cells[-1]
+    assert f"[{path.stem}]({path.name})" in path.with_name("README.md").read_text(encoding="utf-8")
+
+
+def executed(path: Path, root: Path) -> list[str]:
+    """Execute a notebook; return the types of all that its cells show."""
+    import jupytext
+    import nbclient
+
+    notebook = jupytext.read(path)
+    metadata = {"metadata": {"path": str(root)}}
+    nbclient.NotebookClient(
+        notebook, timeout=LONGEST_S, kernel_name="python3", resources=metadata
+    ).execute()
+    outputs = [one for cell in notebook.cells for one in cell.get("outputs", ())]
+    return [kind for one in outputs for kind in one.get("data", {})]
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+@pytest.mark.parametrize("path", NOTEBOOKS, ids=lambda path: path.stem)
+def test_a_notebook_runs(path: Path, root: Path, needs: Callable[[str], None]) -> None:
+    """All cells run, its own comparisons with the truth hold, and there is a picture."""
+    if path.stem == "own_machine":
+        needs("data")  # else it would be downloaded
+    assert "image/png" in executed(path, root)
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
+def test_a_cell_that_fails_is_seen(tmp_path: Path) -> None:
+    """Control: a notebook with a false statement does not pass."""
+    path = tmp_path / "wrong.py"
+    path.write_text("# %%\nassert 1 + 1 == 3\n", encoding="utf-8")
+    with pytest.raises(Exception, match="AssertionError"):
+        executed(path, tmp_path)
