@@ -20,7 +20,11 @@ import lmshealth as lh
 
 logs = Path(tempfile.mkdtemp()) / "logs"
 life = "lms-y --life both --logs 12 --seconds 12 --seed 3 --workers 1".split()
-subprocess.run([sys.executable, "-m", "models", "simulate", *life, "--out", logs], check=True)
+subprocess.run(
+    [sys.executable, "-m", "models", "simulate", *life, "--out", logs],
+    check=True,
+    capture_output=True,
+)
 sorted(path.name for path in logs.iterdir())[:3]
 
 # %% [markdown]

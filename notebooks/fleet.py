@@ -23,7 +23,11 @@ lives = {"LMS-1-Y": "healthy", "LMS-2-Y": "preload-wear", "LMS-3-Y": "sudden-loo
 for seed, life in enumerate(lives.values(), start=1):
     options = f"lms-y --life {life} --logs 9 --seconds 10 --seed {seed} --workers 1".split()
     out = ["--out", folder / "logs" / life]
-    subprocess.run([sys.executable, "-m", "models", "simulate", *options, *out], check=True)
+    subprocess.run(
+        [sys.executable, "-m", "models", "simulate", *options, *out],
+        check=True,
+        capture_output=True,
+    )
 
 # %% [markdown]
 # ## One call for the archive
