@@ -152,6 +152,7 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
         table = result.to_frame()
         assert len(table) == rows
         assert list(table)[: len(columns.split())] == columns.split()
+        assert "recorded_at" not in table or str(table["recorded_at"].dt.tz) == "UTC"
     named = replace(lives, stage="<script>")
     assert "&lt;script&gt;" in named._repr_html_() and "<script>" not in named._repr_html_()
     np.testing.assert_allclose(lives.to_frame()["frequency_hz"], 100.0)
