@@ -94,8 +94,8 @@ assert verdict == "step"
 #
 # ## What no check can see: an error that looks like wear
 #
-# Preload and mount soften by the proportions of the map, but the cause is the temperature sensor,
-# which drifts: the logs state 21 °C all the time, while the machine becomes warmer.
+# Now all modes fall in the proportions in which a loss of preload moves them, but the cause is
+# another: for example, a temperature sensor that drifts while the machine becomes warmer.
 
 # %%
 loss = stage.drift(np.log([[0.9, 1.0]]), ("roll", "pitch", "yaw"))[0]
