@@ -74,10 +74,10 @@ for ax, (parameter, own) in zip(axes, health.groupby("parameter"), strict=True):
 axes[0].set_ylabel("% of baseline")
 _ = axes[0].legend()
 # %% [markdown]
-# Lines are medians, bands 90 % intervals. The healthy machine stays at 100 %. The worn guide loses
-# preload and leaves its mount alone. The loose mount falls between two logs and not slowly: its
-# verdict is `step`, which asks for an inspection and makes no forecast, because no law of wear has
-# such a course.
+# Lines are medians, bands 90 % intervals, at the four epochs that were asked for. The healthy machine
+# stays at 100 %. The worn guide loses preload and leaves its mount alone. The loose mount lost its
+# stiffness between two logs: its verdict is `step`, which asks for an inspection and has no service
+# date, for no law of wear has such a course.
 
 # %%
 assert verdicts["verdict"].to_dict() == {
