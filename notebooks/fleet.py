@@ -73,11 +73,12 @@ for ax, (parameter, own) in zip(axes, health.groupby("parameter"), strict=True):
     ax.set(title=parameter.replace("_", " "), xlabel="travel in km")
 axes[0].set_ylabel("% of baseline")
 _ = axes[0].legend()
+
 # %% [markdown]
-# Lines are medians, bands 90 % intervals, at the four epochs that were asked for. The healthy machine
-# stays at 100 %. The worn guide loses preload and leaves its mount alone. The loose mount lost its
-# stiffness between two logs: its verdict is `step`, which asks for an inspection and has no service
-# date, for no law of wear has such a course.
+# Lines are medians, bands 90 % intervals, at the four epochs that were asked for. The healthy
+# machine stays at 100 %. The worn guide loses preload and leaves its mount alone. The loose mount
+# lost its stiffness between two logs: its verdict is `step`, which asks for an inspection and has
+# no service date, for no law of wear has such a course.
 
 # %%
 assert verdicts["verdict"].to_dict() == {

@@ -110,12 +110,12 @@ results["bench-B"]
 figure, axes = plt.subplots(1, 2, figsize=(9, 3.2), sharey=True, layout="constrained")
 for ax, (name, own) in zip(axes, results.items(), strict=True):
     own.health.plot("coupling_stiffness", ax=ax)
-    ax.set_title(name)
-    ax.set_xlabel("running time in hours")
+    ax.set_xlabel(f"{name}: running time in hours")
 axes[1].plot(168 * np.arange(10), 100 * (1 - 0.004 * np.arange(10)) ** 2, "k--", label="truth")
 _ = axes[1].legend()
 # %% [markdown]
-# `bench-A` keeps its stiffness. `bench-B` falls as it must; the dashed line is the truth.
+# `bench-A` keeps its stiffness. `bench-B` falls as it must; the dashed line is the truth. If the fall goes
+# on, the limit of 80 % is reached 2,922 hours after the last log.
 
 # %%
 stiffness = results["bench-B"].health.to_frame().iloc[-1]
