@@ -59,6 +59,7 @@ axes.semilogy(frf.frequency, abs(frf.response), "o", ms=4, label="measured")
 axes.semilogy(fit.ordinates.frequency, abs(fit.response), label="fit")
 axes.set(xlabel="frequency in Hz", ylabel="angle of the load per current")
 _ = axes.legend()
+
 # %% [markdown]
 # One resonance: the load turns against the motor. The points scatter around the fit by more than
 # the noise of the periods, because the bench is not quite linear. The standard deviation of the
@@ -113,9 +114,10 @@ for ax, (name, own) in zip(axes, results.items(), strict=True):
     ax.set_xlabel(f"{name}: running time in hours")
 axes[1].plot(168 * np.arange(10), 100 * (1 - 0.004 * np.arange(10)) ** 2, "k--", label="truth")
 _ = axes[1].legend()
+
 # %% [markdown]
-# `bench-A` keeps its stiffness. `bench-B` falls as it must; the dashed line is the truth. If the fall goes
-# on, the limit of 80 % is reached 2,922 hours after the last log.
+# `bench-A` keeps its stiffness. `bench-B` falls as it must; the dashed line is the truth. If the
+# fall goes on, the limit of 80 % is reached 2,922 hours after the last log.
 
 # %%
 stiffness = results["bench-B"].health.to_frame().iloc[-1]
