@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo picture check test slow coverage statistics bench fuzz compat lock locked sbom clean
+.PHONY: demo notebooks picture check test slow coverage statistics bench fuzz compat lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -20,6 +20,13 @@ demo: .venv/installed
 picture: .venv/installed
 	@test -d $(DEMO)/result || $(MAKE) demo
 	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
+
+# The notebooks with the results of their cells, as pages in demo/notebooks.
+notebooks: .venv/installed
+	@mkdir -p $(DEMO)/notebooks
+	$(BIN)/jupytext --set-kernel python3 --to ipynb --execute --run-path . notebooks/*.py
+	@mv notebooks/*.ipynb $(DEMO)/notebooks/
+	$(BIN)/jupyter nbconvert --to html $(DEMO)/notebooks/*.ipynb
 
 # Linters, types, layers of the packages.
 check: .venv/installed

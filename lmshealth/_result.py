@@ -36,10 +36,13 @@ class Result:
         return self.to_columns()
 
     def to_frame(self) -> pd.DataFrame:
-        """Return the result as a table; units are in the names of its columns."""
+        """Return the result as a table; units are in the names of its columns, moments in UTC."""
         import pandas as pd
 
-        return pd.DataFrame(self.to_columns())
+        table = pd.DataFrame(self.to_columns())
+        if "recorded_at" in table:
+            table["recorded_at"] = pd.to_datetime(table["recorded_at"], utc=True, format="ISO8601")
+        return table
 
     def plot(self, what: str = "", ax: Axes | None = None) -> Axes:
         """Plot the result, or one mode or parameter of it, in Axes or a new figure."""

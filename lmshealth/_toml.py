@@ -1,15 +1,15 @@
-"""Decode TOML into structs, of which every error names the key; write strings of TOML."""
+"""Decode TOML into structs, of which errors name every wrong key; write values of TOML."""
 
 import json
 import re
 import tomllib
-from collections.abc import Iterable, Iterator
-from functools import reduce
-from operator import getitem
-from typing import Any, TypeVar
+from collections.abc import Iterator
+from difflib import get_close_matches
+from types import UnionType
+from typing import Annotated, Any, TypeVar, Union, get_args, get_origin
 
 import msgspec
-from msgspec.inspect import StructType, Type, UnionType, VarTupleType, type_info
+from msgspec.structs import FieldInfo, fields
 
 # A hundred modes take a tenth of it.
 _MOST_BYTES = 1 << 17
@@ -18,22 +18,21 @@ _MOST_PARTS = 16
 # Each word is tried once, and given back by none: the time is linear.
 _WORD = r"""(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')"""
 _LONG_KEY = re.compile(rf"(?<![\w-]){_WORD}(?:[ \t]*+\.[ \t]*+{_WORD}){{{_MOST_PARTS},}}+")
-_LONGEST_PLACE, _LONGEST_MESSAGE = 80, 400
+_LONGEST_PLACE, _LONGEST_MESSAGE, _MOST_MISTAKES = 80, 400, 12
 
 Kind = TypeVar("Kind")
 
 _PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
-_STEP = re.compile(r"\.([^.\[\]]+)|\[(\d+)\]")
 # msgspec does not name the wrong value of a table with free keys.
 _ANY_VALUE = "[...]"
-_FIELD = re.compile(r"Object (?P<what>contains unknown|missing required) field `(?P<field>.*)`$")
 
 
 def decode(content: bytes, kind: type[Kind]) -> Kind:
     """Decode TOML into a msgspec struct.
 
-    `ValueError` where it is no TOML, with the line if there is one, or breaks the schema: with the
-    key, what was found and what is needed.
+    `ValueError` where it is no TOML, with the line if there is one, or breaks the schema: with
+    every wrong key, what was found and what is needed, and an example of each
+    table that lacks keys.
     """
     if len(content) > _MOST_BYTES:
         raise ValueError(f"{len(content)} bytes are too many; needed at most {_MOST_BYTES}")
@@ -50,12 +49,7 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
-        schema = type_info(kind)
-        message = _explained(str(error), table, schema).lstrip(".: ")
-        lacking = [_short(one.lstrip("."), _LONGEST_PLACE) for one in _missing(schema, table)]
-        if message.removesuffix(": missing") in lacking:
-            message = f"{', '.join(lacking)}: missing"
-        raise ValueError(_short(message, _LONGEST_MESSAGE)) from error
+        raise ValueError(_described(kind, table)) from error
 
 
 def quoted(text: str) -> str:
@@ -63,81 +57,149 @@ def quoted(text: str) -> str:
     return json.dumps(text, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _short(text: str, most: int) -> str:
+def _described(kind: Any, table: dict[str, Any]) -> str:
+    """List the mistakes of a table, and write an example of each part of it that lacks keys."""
+    faults = [(path.lstrip("."), text) for path, text in _faults(kind, table, "")]
+    lacking = [path for path, text in faults if text == "missing"]
+    wrong = [f"{_short(path)}: {text}".lstrip(": ") for path, text in faults if text != "missing"]
+    if lacking:
+        wrong.insert(0, f"{', '.join(map(_short, lacking))}: missing")
+    wrong[_MOST_MISTAKES:] = [f"{len(wrong[_MOST_MISTAKES:])} more"] * (len(wrong) > _MOST_MISTAKES)
+    lines = [_short(line, _LONGEST_MESSAGE) for line in wrong]
+    message = lines[0] if len(lines) == 1 else "\n  ".join(["several mistakes", *lines])
+    names = {re.split(r"[.[]", path)[0] for path in lacking}
+    parts = [_part(field) for field in fields(kind) if field.encode_name in names]
+    return "\n\n".join([message + "\nTo copy and edit:" * bool(parts), *parts])
+
+
+def _part(field: FieldInfo) -> str:
+    """Write a key of the document with an example of its value, a table under its head."""
+    name, value = field.encode_name, _example(field.type)
+    table = value[0] if isinstance(value, list) else value
+    if not isinstance(table, dict):
+        return f"{name} = {_literal(value)}"
+    head = f"[[{name}]]" if isinstance(value, list) else f"[{name}]"
+    return "\n".join([head, *(f"{key} = {_literal(one)}" for key, one in table.items())])
+
+
+def _literal(value: Any) -> str:
+    """Write a value of TOML."""
+    if isinstance(value, str):
+        return quoted(value)
+    if isinstance(value, list):
+        return f"[{', '.join(map(_literal, value))}]"
+    if isinstance(value, dict):
+        return f"{{ {', '.join(f'{key} = {_literal(one)}' for key, one in value.items())} }}"
+    return repr(value)
+
+
+def _example(kind: Any) -> Any:
+    """Return a valid value by the examples of the schema.
+
+    A struct has its required keys, and those with an example of their own.
+    """
+    if stated := _examples(kind):
+        return stated[0]
+    if item := _item(kind):
+        return [_example(item)]
+    if not (parts := _structs(kind)):
+        return None
+    settings = parts[0].__struct_config__
+    tagged = {settings.tag_field: settings.tag} if settings.tag_field else {}
+    used = (field for field in fields(parts[0]) if field.required or _examples(field.type))
+    return tagged | {field.encode_name: _example(field.type) for field in used}
+
+
+def _examples(kind: Any) -> list[Any]:
+    """Return the examples that an annotation states itself."""
+    notes = get_args(kind)[1:] if get_origin(kind) is Annotated else ()
+    return [one for note in notes if isinstance(note, msgspec.Meta) for one in note.examples or ()]
+
+
+def _short(text: str, most: int = _LONGEST_PLACE) -> str:
     """Keep both ends of a text, and escape what cannot be seen."""
     if len(text) > most:
         text = f"{text[: most // 2]} … {text[-most // 2 :]}"
     return "".join(c if c.isprintable() else ascii(c)[1:-1] for c in text)
 
 
-def _explained(error: str, table: Any, schema: Type) -> str:
-    """Convert msgspec's message into one that begins with the key and has the known names."""
-    path = ""
-    if found := _PLACE.search(error):
-        error, path = error[: found.start()], found["path"]
-    if path.endswith(_ANY_VALUE):
-        path, error = path.removesuffix(_ANY_VALUE), f"one of its values: {error}"
-    keys = [name or int(index) for name, index in _STEP.findall(path)]
-    value = reduce(getitem, keys, table)
-    if field := _FIELD.match(error):
-        name, parts = field["field"], _structs(schema, keys)
-        if "missing" in field["what"]:
-            tags = [str(part.tag) for part in parts if part.tag_field == name]
-            error = f"missing; there are {', '.join(tags)}" if tags else "missing"
-        else:
-            error = f"unknown key; known are {', '.join(_known_keys(parts, value))}"
-        return f"{_short(f'{path}.{name}', _LONGEST_PLACE)}: {error}"
-    if error.startswith("Invalid value"):
-        tags = [str(part.tag) for part in _structs(schema, keys[:-1]) if part.tag_field == keys[-1]]
-        error = f"there are {', '.join(tags)}" if tags else error
-    if "matching regex" in error:
-        error = "needed printable text"
-    if "got" not in error and not isinstance(value, dict | list):
-        error = f"{error}, got {_short(repr(value), _LONGEST_PLACE)}"
-    return f"{_short(path, _LONGEST_PLACE)}: {error.replace('object', 'table')}"
+def _faults(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield the place and text of each mistake in a value, the innermost only."""
+    inner: list[tuple[str, str]] = []
+    if isinstance(value, list) and (item := _item(kind)):
+        for k, one in enumerate(value):
+            inner += _faults(item, one, f"{path}[{k}]")
+    elif isinstance(value, dict) and (parts := _structs(kind)):
+        part, tag = _selected(parts, value)
+        if part is None:
+            tags = ", ".join(str(one.__struct_config__.tag) for one in parts)
+            got = f"there are {tags}, got {value[tag]!r}" if tag in value else ""
+            yield f"{path}.{tag}", got or f"missing; there are {tags}"
+            return
+        known = {field.encode_name: field for field in fields(part)}
+        absent = [key for key, field in known.items() if field.required and key not in value]
+        inner += [(f"{path}.{key}", "missing") for key in absent]
+        for key, one in value.items():
+            if key in known:
+                inner += _faults(known[key].type, one, f"{path}.{key}")
+            elif key != tag:
+                inner.append((f"{path}.{key}", _unknown(key, [*filter(None, [tag]), *known])))
+    yield from inner or _wrong(kind, value, path)
 
 
-def _known_keys(parts: list[StructType], own: dict[str, Any]) -> list[str]:
-    """List the keys of the struct that a table selects by its tag, or of the only one."""
-    selected = (part for part in parts if part.tag_field and part.tag == own.get(part.tag_field))
-    part = next(selected, parts[0])
-    return [*filter(None, [part.tag_field]), *(field.encode_name for field in part.fields)]
+def _unknown(key: str, known: list[str]) -> str:
+    near = [f"; most like it is {one}" for one in get_close_matches(key, known, 1)]
+    return "".join([f"unknown key; known are {', '.join(known)}", *near])
 
 
-def _missing(schema: Type, value: Any, path: str = "") -> Iterator[str]:
-    """Yield the places of all required keys that a table lacks."""
-    if isinstance(value, list):
-        lists = [part for part in _branches(schema) if isinstance(part, VarTupleType)]
-        for k, item in enumerate(value if lists else ()):
-            yield from _missing(lists[0].item_type, item, f"{path}[{k}]")
-    if not isinstance(value, dict):
-        return
-    parts = [one for one in _branches(schema) if isinstance(one, StructType)]
-    if len(parts) > 1:
-        parts = [one for one in parts if one.tag_field and one.tag == value.get(one.tag_field)]
-    for field in parts[0].fields if parts else ():
-        place = f"{path}.{field.encode_name}"
-        if field.encode_name in value:
-            yield from _missing(field.type, value[field.encode_name], place)
-        elif field.required:
-            yield place
+def _wrong(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
+    """Yield what msgspec finds wrong with a value as a whole."""
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError as caught:
+        error = str(caught)
+        if found := _PLACE.search(error):
+            error, path = error[: found.start()], path + found["path"]
+        if path.endswith(_ANY_VALUE):
+            path, error = path.removesuffix(_ANY_VALUE), f"one of its values: {error}"
+        if "matching regex" in error:
+            error = "needed printable text"
+        if "got" not in error and not isinstance(value, dict | list):
+            error = f"{error}, got {_short(repr(value))}"
+        yield path, error.replace("object", "table")
 
 
-def _structs(schema: Type, keys: list[Any]) -> list[StructType]:
-    """List the structs that may be at a place of the schema."""
-    types = list(_branches(schema))
-    for key in keys:
-        types = [inner for one in types for inner in _inside(one, key)]
-    return [one for one in types if isinstance(one, StructType)]
+def _branches(kind: Any) -> Iterator[Any]:
+    """Yield the alternatives of an annotation, without their constraints."""
+    if get_origin(kind) is Annotated:
+        yield from _branches(get_args(kind)[0])
+    elif get_origin(kind) in (Union, UnionType):
+        for one in get_args(kind):
+            yield from _branches(one)
+    else:
+        yield kind
 
 
-def _inside(schema: Type, key: str | int) -> Iterable[Type]:
-    if isinstance(schema, VarTupleType):
-        yield from _branches(schema.item_type)
-    for field in schema.fields if isinstance(schema, StructType) else ():
-        if field.encode_name == key:
-            yield from _branches(field.type)
+def _structs(kind: Any) -> list[Any]:
+    """List the structs among the alternatives of an annotation."""
+    return [
+        one for one in _branches(kind) if isinstance(one, type) and issubclass(one, msgspec.Struct)
+    ]
 
 
-def _branches(schema: Type) -> Iterable[Type]:
-    return schema.types if isinstance(schema, UnionType) else (schema,)
+def _item(kind: Any) -> Any:
+    """Return the annotation of the items of an array of any length; None if it is none."""
+    for one in _branches(kind):
+        inner = get_args(one)
+        if get_origin(one) is list or (get_origin(one) is tuple and inner[-1] is ...):
+            return inner[0]
+    return None
+
+
+def _selected(parts: list[Any], value: dict[str, Any]) -> tuple[Any, str | None]:
+    """Return the struct that a table selects by its tag, or the only one; and the tag's key."""
+    tag = parts[0].__struct_config__.tag_field
+    if len(parts) == 1:
+        return parts[0], tag
+    fitting = (one for one in parts if one.__struct_config__.tag == value.get(tag))
+    return next(fitting, None), tag

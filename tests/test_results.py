@@ -10,10 +10,13 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from lmshealth import examples
+from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.report.tables import COLUMNS
+from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.track import track
 from tests.lives import make_health, make_prognosis
@@ -149,6 +152,7 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
         table = result.to_frame()
         assert len(table) == rows
         assert list(table)[: len(columns.split())] == columns.split()
+        assert "recorded_at" not in table or str(table["recorded_at"].dt.tz) == "UTC"
     named = replace(lives, stage="<script>")
     assert "&lt;script&gt;" in named._repr_html_() and "<script>" not in named._repr_html_()
     np.testing.assert_allclose(lives.to_frame()["frequency_hz"], 100.0)
@@ -182,3 +186,15 @@ def test_results_are_plotted_by_name() -> None:
         assert ax.get_xlabel().startswith(label) and ax.has_data()
     with pytest.raises(BadQuestion, match=r"nothing is called 'rol'; there are \['roll'\]"):
         lives.plot("rol")
+
+
+def test_a_stage_and_an_assessment_print_in_a_few_lines() -> None:
+    """What they are, and what they have; not their fields."""
+    stage = load_stage("lms-y")
+    text = (
+        "Stage lms-y: modes roll 126.4 Hz, pitch 136.6 Hz, yaw 155 Hz; parameters guide_preload, "
+    )
+    assert repr(stage) == f"{text}mount_stiffness"
+    found = repr(assess(examples.readings()[:2], stage, epochs=1)).splitlines()
+    assert len(found) <= 8 and found[0].endswith(": not-enough-data")
+    assert found[-1].startswith("2 logs, ") and "with history" in found[-1]

@@ -9,6 +9,7 @@ import pytest
 from msgspec import Meta, Struct
 
 from lmshealth._toml import decode
+from lmshealth.stage.description import Description
 
 
 class _Leaf(Struct, forbid_unknown_fields=True, tag="leaf", tag_field="kind"):
@@ -27,7 +28,13 @@ class _Tree(Struct, forbid_unknown_fields=True):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("size = 1", "size: unknown key; known are name, part"),
+        ('name = "a"\nsize = 1', "size: unknown key; known are name, part"),
+        (
+            'nme = "a"\npart = 3',
+            "several mistakes\n  name: missing\n  nme: unknown key; known are name, part; "
+            "most like it is name\n"
+            "  part: Expected `array`, got `int`\nTo copy and edit:\n\nname = ",
+        ),
         ("part = []", "name: missing"),
         ("name = 3", "name: Expected `str`, got `int`"),
         ('name = "a"\npart = 3', "part: Expected `array`, got `int`"),
@@ -90,6 +97,27 @@ def test_dots_that_are_no_keys(text: str) -> None:
         decode(text.encode(), _Tree)
     except ValueError as error:
         assert "parts" not in str(error)
+
+
+def test_all_mistakes_are_named_at_once_and_what_is_missing_can_be_copied() -> None:
+    """The examples in the message of an almost empty description are a valid description."""
+    tables = ["mode", "watch", "order", "channel", "covariate", "parameter"]
+    text = "".join(f"[[{name}]]\n" for name in tables) + "search = 2\n[map]"
+    with pytest.raises(ValueError) as caught:
+        decode(text.encode(), Description)
+    mistakes, _, block = str(caught.value).partition("\nTo copy and edit:\n\n")
+    for key in ("name", "mode[0].damping_ratio", "covariate[0].reference", "parameter[0].prior"):
+        assert key in mistakes
+    assert "parameter[0].search: unknown key" in mistakes
+    made = decode(block.encode(), Description)
+    assert all(getattr(made, name) for name in [*tables, "map"])
+
+
+def test_many_mistakes_are_cut() -> None:
+    """A message lists a dozen lines and counts the others."""
+    with pytest.raises(ValueError) as caught:
+        decode(('name = "a"\n' + "\n".join(f"x{k} = 1" for k in range(50))).encode(), _Tree)
+    assert len(str(caught.value).splitlines()) == 14 and "38 more" in str(caught.value)
 
 
 def test_messages_are_short_and_visible() -> None:

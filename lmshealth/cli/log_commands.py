@@ -205,8 +205,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
 
     def estimate(log: Log) -> LogEstimates:
-        with terminal.progress_bars(terminal.PATIENCE) as report:
-            reading = _read_modes(log, given, report)
+        reading = _read_modes(log, given, ctx.obj)
         shapes, mac = tables.shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
         content["shapes"] += shapes
         content["mac"] += mac
@@ -490,7 +489,7 @@ def _each(
 ) -> tuple[list[Result], list[Refusal]]:
     """Analyse one log after the other; return results and refused logs.
 
-    ``read`` reads what a file holds, where that is not one log.
+    ``read`` reads what a file holds, where that is not one log. ``ctx.obj`` reports progress.
     """
     found: list[Result] = []
     lost: list[Refusal] = []
@@ -498,23 +497,32 @@ def _each(
     reading = {name: ctx.params[name] for name in ("columns", "max_memory")}
     named = ctx.params["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
-    for path in [path for path in named if path.name not in NOT_LOGS] or named:
-        items: list[Any] = []
-        with _refusing(lost):
-            if path.parent not in manifests:
-                beside = manifests[path.parent] = read_manifest_beside(path)
-                faults = [refusal for refusal in beside.refused if refusal.log == MANIFEST]
-                terminal.print_notes(_sentences(faults))
-            more = reading | {"overrides": manifests[path.parent].overrides(path)}
-            items = [read_log(path, **more)] if read is None else read(path, **more)
-            terminal.print_notes(
-                f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
-                for log in items
-                if isinstance(log, Log) and log.guessed
-            )
-        for item in items:
+    paths = [path for path in named if path.name not in NOT_LOGS] or named
+
+    def items(path: Path) -> list[Any]:
+        if path.parent not in manifests:
+            beside = manifests[path.parent] = read_manifest_beside(path)
+            faults = [refusal for refusal in beside.refused if refusal.log == MANIFEST]
+            terminal.print_notes(_sentences(faults))
+        more = reading | {"overrides": manifests[path.parent].overrides(path)}
+        logs = [read_log(path, **more)] if read is None else read(path, **more)
+        terminal.print_notes(
+            f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
+            for log in logs
+            if isinstance(log, Log) and log.guessed
+        )
+        return logs
+
+    with terminal.progress_bars(terminal.PATIENCE) as ctx.obj:
+        for k, path in enumerate(paths):
+            ctx.obj("logs", k, len(paths))
+            there: list[Any] = []
             with _refusing(lost):
-                found.append(analyse(item))
+                there = items(path)
+            for item in there:
+                with _refusing(lost):
+                    found.append(analyse(item))
+        ctx.obj("logs", len(paths), len(paths))
     return found, lost
 
 

@@ -69,8 +69,14 @@ def track(table: Path, **given: Any) -> None:
     more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
     machines, notes = read_machines(table, stage, **more)
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
-    for history, refused in machines:
-        found, smoothed = track_modes(history, stage), None
+    tracked = []
+    with progress_bars(PATIENCE) as progress:
+        for k, (history, _) in enumerate(machines):
+            progress("tracking", k, len(machines))
+            tracked.append(track_modes(history, stage))
+        progress("tracking", len(machines), len(machines))
+    for (history, refused), found in zip(machines, tracked, strict=True):
+        smoothed = None
         refused += outlier_refusals(history, found)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)

@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import click
 import msgspec
 from rich import box, progress
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.table import Table
 
 from lmshealth.report.text import fixed, number, percent, plain
@@ -159,14 +159,24 @@ def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:
     return [row | {"log": names[row["log"]]} for row in rows]
 
 
+class _Bars(progress.Progress):
+    """Progress bars that appear at a time of the monotonic clock, whether or not work goes on."""
+
+    shown_from = 0.0
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        shown = time.monotonic() >= self.shown_from
+        return super().get_renderables() if shown else ()
+
+
 @contextmanager
 def progress_bars(delay: float = 0.0) -> Iterator[Any]:
     """Show progress bars on standard error if it is a terminal; yield their callback.
 
-    Nothing is shown in the first ``delay`` seconds.
+    Nothing is shown in the first ``delay`` seconds. Until the end nothing may be printed on
+    standard output.
     """
-    shown_from = time.monotonic() + delay
-    with progress.Progress(
+    with _Bars(
         progress.TextColumn("{task.description:<12}"),
         progress.BarColumn(),
         progress.MofNCompleteColumn(),
@@ -175,13 +185,12 @@ def progress_bars(delay: float = 0.0) -> Iterator[Any]:
         console=Console(stderr=True),
         disable=quiet() or not sys.stderr.isatty(),
     ) as bars:
+        bars.shown_from = time.monotonic() + delay
         tasks: dict[str, Any] = {}
 
         def report(what: str, done: int, total: int) -> None:
             if done in (0, total) or done % max(total // 10, 1) == 0:
                 _logger.info("%s: %d of %d", what, done, total)
-            if time.monotonic() < shown_from:
-                return
             if what not in tasks:
                 tasks[what] = bars.add_task(what, total=total, completed=done)
             bars.update(tasks[what], completed=done, total=total)

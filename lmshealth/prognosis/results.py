@@ -39,7 +39,10 @@ class ModeError:
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Prognosis(Result):
-    """Remaining useful life of one machine, of which `n` health parameters have a limit."""
+    """Remaining useful life of one machine, of which `n` health parameters have a limit.
+
+    `lmshealth.prognosis.maintenance_decision.probability_before` has the probability by a day.
+    """
 
     stage: str  # identity of the machine
     recorded_at: datetime  # of the last log, at which the prognosis is made

@@ -30,7 +30,7 @@ from lmshealth.tracking.track import Track
 State = Literal["good", "bad", "open"]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
 class Assessment:
     """All results of one machine, as far as its data carry them."""
 
@@ -57,6 +57,16 @@ class Assessment:
     ended: tuple[EndedLife, ...] = ()
     calibration: Calibration | None = None
     doubt: str = ""  # why the names of the modes are in doubt; then there is no health
+
+    def __repr__(self) -> str:
+        judged, service = self.judgement, self.service()
+        at = f"{judged.recorded_at.date()}: {judged.verdict}"
+        lines = [f"Assessment of {judged.stage} at {at}", judged.why]
+        lines += [f"Service: {service.kind} {service.by or ''}".rstrip()] * bool(self.prognosis)
+        parts = ("history", "track", "health", "prognosis")
+        there = ", ".join(name for name in parts if getattr(self, name) is not None)
+        lines.append(f"{len(self.history.logs)} logs, {len(self.refused)} refusals; with {there}")
+        return "\n".join(lines)
 
     def service(self) -> Service:
         """Choose the day of the service by the rule of the description.

@@ -442,8 +442,10 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
     if what and what not in names:
         raise BadQuestion(f"{result.title()}: nothing is called {what!r}; there are {names}")
     style: Any = _STYLE | {"axes.facecolor": PAPER}
+    # The first figure starts the backend, whose settings must outlast those of this one.
+    figure = None if ax else pyplot.figure(figsize=SIZE, layout="constrained")
     with matplotlib.rc_context(style):
-        ax = ax or pyplot.figure(figsize=SIZE, layout="constrained").add_subplot()
+        ax = figure.add_subplot() if figure else ax
         match result:
             case Log():
                 return plot_log(ax, result, what)

@@ -242,7 +242,7 @@ def events_rows(track: Track) -> list[Row]:
 
 def health_rows(health: Health) -> list[Row]:
     """Return a posterior of the health parameters, one row per epoch and parameter."""
-    rows = health.to_frame().to_dict("records")
+    rows = pd.DataFrame(health.to_columns()).to_dict("records")
     return [{str(name): value for name, value in row.items()} for row in rows]
 
 

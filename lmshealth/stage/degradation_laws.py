@@ -17,6 +17,11 @@ _LARGEST_LN = 300
 _BISECTIONS = 50
 
 
+def _lognormal(median: float) -> msgspec.Meta:
+    """Return an example of a prior, for messages."""
+    return msgspec.Meta(examples=[{"kind": "lognormal", "median": median, "sigma": 1.0}])
+
+
 class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
     """A degradation law: health, as a fraction of its value at the begin, over travel from there.
 
@@ -79,7 +84,7 @@ def _draw_length(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
 class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5."""
 
-    life_km: Prior
+    life_km: Annotated[Prior, _lognormal(8000)]
     exponent: Uniform = Uniform(0.7, 1.6)
     outer: ClassVar[float] = 1.5
     label: ClassVar[str] = "wear of the contacts (Hertz)"
@@ -131,8 +136,8 @@ class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
 class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
     """Joint that settles towards a floor: k(s) = k_f + (1 - k_f) exp(-s / s_m)."""
 
-    life_km: Prior
-    floor: Prior
+    life_km: Annotated[Prior, _lognormal(8000)]
+    floor: Annotated[Prior, msgspec.Meta(examples=[{"kind": "uniform", "low": 0.3, "high": 1.0}])]
     label: ClassVar[str] = "loosening towards a floor"
     names: ClassVar[tuple[str, ...]] = ("floor", "life_m")
 
@@ -177,7 +182,7 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
 class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
     """Loss proportional to travel: h(s) = 1 - r s; a negative rate is a gain."""
 
-    rate_per_km: Prior
+    rate_per_km: Annotated[Prior, _lognormal(5e-5)]
     label: ClassVar[str] = "loss in proportion to travel"
     names: ClassVar[tuple[str, ...]] = ("rate_per_m",)
 
@@ -240,7 +245,7 @@ def _late(y: FloatArray) -> FloatArray:
 class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind", kw_only=True):
     """Slow loss that accelerates: ln h(s) = -b s / s_w - (s / s_w)^n."""
 
-    slow: Lognormal
+    slow: Annotated[Lognormal, _lognormal(0.1)]
     exponent: Uniform = Uniform(2.0, 12.0)
     label: ClassVar[str] = "slow loss that accelerates"
     names: ClassVar[tuple[str, ...]] = ("life_m", "exponent", "slow")

@@ -5,6 +5,7 @@ import os
 import sys
 from dataclasses import dataclass
 from datetime import date
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
@@ -54,9 +55,9 @@ class ModeSpec(_Part, frozen=True):
     ``shape`` holds the acceleration of channels by name, in any unit.
     """
 
-    name: Name
-    frequency_hz: Positive
-    damping_ratio: Share
+    name: Annotated[Name, Meta(examples=["pitch"])]
+    frequency_hz: Annotated[Positive, Meta(examples=[136.4])]
+    damping_ratio: Annotated[Share, Meta(examples=[0.015])]
     direction: Name = ""
     snr: Positive = 100.0
     search: Share = 0.15
@@ -75,8 +76,8 @@ def _expect_ascending(name: str, low: float, high: float) -> None:
 class WatchedBand(_Part, frozen=True):
     """A narrow band of which only the acceleration level is reported."""
 
-    low_hz: Positive
-    high_hz: Positive
+    low_hz: Annotated[Positive, Meta(examples=[1950])]
+    high_hz: Annotated[Positive, Meta(examples=[2050])]
 
     def __post_init__(self) -> None:
         _expect_ascending("the band", self.low_hz, self.high_hz)
@@ -85,7 +86,7 @@ class WatchedBand(_Part, frozen=True):
 class Limit(_Part, frozen=True):
     """Value below which a health parameter is worn out."""
 
-    below: Positive
+    below: Annotated[Positive, Meta(examples=[0.6])]
 
 
 class ParameterSpec(_Part, frozen=True):
@@ -95,11 +96,11 @@ class ParameterSpec(_Part, frozen=True):
     word by which verdict.csv names its loss.
     """
 
-    name: Name
+    name: Annotated[Name, Meta(examples=["guide_preload"])]
     prior: Prior
     baseline: Positive = 1.0
     unit: Name = ""
-    limit: Limit | None = None
+    limit: Annotated[Limit | None, Meta(examples=[{"below": 0.6}])] = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
     verdict: Name = ""
 
@@ -130,23 +131,24 @@ class ParameterSpec(_Part, frozen=True):
 class MapSpec(_Part, frozen=True):
     """File of the modal map and relative standard deviation of its sensitivities."""
 
-    file: Name
+    file: Annotated[Name, Meta(examples=["my-stage.map.csv"])]
     model_std: Annotated[float, Meta(ge=0, lt=1)] = 0.05
 
 
 class Order(_Part, frozen=True):
     """A spectral line at velocity / wavelength."""
 
-    name: Name
-    wavelength_mm: Positive
+    name: Annotated[Name, Meta(examples=["ball pass"])]
+    wavelength_mm: Annotated[Positive, Meta(examples=[4.0])]
 
 
 class ChannelSpec(_Part, frozen=True):
     """Place of a sensor in m and the direction that it measures, for drawings of mode shapes."""
 
-    name: Name
-    position_m: tuple[float, float, float]
-    direction: tuple[float, float, float]  # of any length but 0
+    name: Annotated[Name, Meta(examples=["acc_pitch"])]
+    position_m: Annotated[tuple[float, float, float], Meta(examples=[[0.1, 0.0, 0.25]])]
+    # Of any length but 0.
+    direction: Annotated[tuple[float, float, float], Meta(examples=[[0, 0, 1]])]
 
     def __post_init__(self) -> None:
         if not any(self.direction):
@@ -160,9 +162,9 @@ class Covariate(_Part, frozen=True):
     ``curvature_std`` that of its quadratic coefficient per unit squared.
     """
 
-    name: Name
-    reference: float
-    prior_std: Positive
+    name: Annotated[Name, Meta(examples=["temperature_c"])]
+    reference: Annotated[float, Meta(examples=[21.0])]
+    prior_std: Annotated[Positive, Meta(examples=[0.001])]
     curvature_std: Annotated[float, Meta(ge=0)] = 0.0
 
 
@@ -205,7 +207,7 @@ class Usage(_Part, frozen=True):
 class Description(_Part, frozen=True):
     """The stage description as written; ``source`` and ``loop`` are accepted, not used."""
 
-    name: Name
+    name: Annotated[Name, Meta(examples=["my stage"])]
     mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
@@ -244,7 +246,7 @@ class ScatterPrior:
     deviation: tuple[float, ...]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Stage:
     """A checked stage description with its modal map, None when there is no health parameter.
 
@@ -256,6 +258,11 @@ class Stage:
     modal_map: ModalMap | None
     digest: str
     scatter: ScatterPrior | None = None
+
+    def __repr__(self) -> str:
+        modes = ", ".join(f"{mode.name} {mode.frequency_hz:g} Hz" for mode in self.modes)
+        parameters = ", ".join(parameter.name for parameter in self.parameters)
+        return f"Stage {self.name}: modes {modes}; parameters {parameters or 'none'}"
 
     @property
     def name(self) -> str:
@@ -408,3 +415,20 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
             f"tracked [[mode]] ({described})"
         )
+    at = np.exp(modal_map.ln_frequency(np.log([[p.baseline for p in description.parameter]]))[0])
+    free = {
+        name.casefold(): (name, f)
+        for name, f in zip(modal_map.modes, at.tolist(), strict=True)
+        if name not in described
+    }
+    for k, mode in enumerate(description.mode):
+        if not mode.tracked or mode.name in modal_map.modes:
+            continue
+        for near in get_close_matches(mode.name.casefold(), free):
+            name, f = free[near]
+            if abs(f / mode.frequency_hz - 1) <= mode.search:
+                raise BadStage(
+                    f"{path}: mode[{k}].name: {mode.name!r} is not on the map, whose {name!r} at "
+                    f"{f:.4g} Hz no [[mode]] describes; write {name!r}, or, if these are two "
+                    "modes, describe both"
+                )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -25,8 +26,8 @@ class _Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
     """Lognormal distribution by its median and the standard deviation of the logarithm."""
 
-    median: float
-    sigma: float
+    median: Annotated[float, msgspec.Meta(examples=[1.0])]
+    sigma: Annotated[float, msgspec.Meta(examples=[0.3])]
 
     def __post_init__(self) -> None:
         if not (0 < self.median < np.inf and 0 < self.sigma < np.inf):
@@ -65,8 +66,8 @@ class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
 class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
     """Normal distribution."""
 
-    mean: float
-    std: float
+    mean: Annotated[float, msgspec.Meta(examples=[1.0])]
+    std: Annotated[float, msgspec.Meta(examples=[0.3])]
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and 0 < self.std < np.inf):
@@ -101,8 +102,8 @@ class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
 class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     """Uniform distribution between low and high."""
 
-    low: float
-    high: float
+    low: Annotated[float, msgspec.Meta(examples=[0.3])]
+    high: Annotated[float, msgspec.Meta(examples=[1.0])]
 
     def __post_init__(self) -> None:
         if not -np.inf < self.low < self.high < np.inf:

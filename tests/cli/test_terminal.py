@@ -8,6 +8,7 @@ import logging
 import math
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
@@ -46,6 +47,20 @@ def test_a_bar_appears_on_a_terminal_after_its_delay(
     with progress_bars(delay) as report:
         report("fitting", 1, 3)
     assert ("fitting" in terminal.getvalue()) == shown
+
+
+def test_a_bar_appears_while_nothing_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Work that is silent after its first report is shown all the same."""
+    terminal = io.StringIO()
+    monkeypatch.setattr(terminal, "isatty", lambda: True, raising=False)
+    monkeypatch.setattr(sys, "stderr", terminal)
+    with progress_bars(0.3) as report:
+        report("logs", 0, 1)
+        assert "logs" not in terminal.getvalue()
+        end = time.monotonic() + 20
+        while "logs" not in terminal.getvalue() and time.monotonic() < end:
+            time.sleep(0.05)
+        assert "logs" in terminal.getvalue()
 
 
 def test_prose_is_wrapped_between_words(capsys: pytest.CaptureFixture[str]) -> None:

@@ -163,6 +163,20 @@ def test_a_map_without_any_tracked_mode_is_refused(tmp_path: Path) -> None:
         load(tmp_path, text)
 
 
+@pytest.mark.parametrize("slip", ["pich", "Pitch"])
+def test_a_misspelt_mode_is_refused(tmp_path: Path, slip: str) -> None:
+    """A name like that of a mode of the map in its search, which nothing else describes."""
+    text = stage_text()
+    assert 'name = "pitch"' in text
+    with pytest.raises(
+        BadStage, match=rf"mode\[1\]\.name: '{slip}' is not on the map, whose 'pitch'"
+    ):
+        load(tmp_path, text.replace('name = "pitch"', f'name = "{slip}"'))
+    elsewhere = f'name = "{slip}"\nsearch = 0.001\nfrequency_hz = 300.0 #'
+    found = text.replace('name = "pitch"\nfrequency_hz =', elsewhere)
+    assert found != text and load(tmp_path, found).modes[1].name == slip
+
+
 def test_a_file_that_is_not_there_and_a_name_nobody_knows(tmp_path: Path) -> None:
     """A missing path is named; for an unknown name the shipped ones are listed."""
     with pytest.raises(BadStage, match=r"gone\.toml"):
