@@ -24,8 +24,8 @@ picture: .venv/installed
 # The notebooks with the results of their cells, as pages in demo/notebooks.
 notebooks: .venv/installed
 	@mkdir -p $(DEMO)/notebooks
-	$(BIN)/jupytext --set-kernel python3 --to ipynb --execute --run-path . notebooks/*.py
-	@mv notebooks/*.ipynb $(DEMO)/notebooks/
+	$(BIN)/jupytext --set-kernel python3 --to ipynb --execute --run-path . studies/notebooks/*.py
+	@mv studies/notebooks/*.ipynb $(DEMO)/notebooks/
 	$(BIN)/jupyter nbconvert --to html $(DEMO)/notebooks/*.ipynb
 
 # Linters, types, layers of the packages.

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-NOTEBOOKS = sorted((Path(__file__).parents[1] / "notebooks").glob("*.py"))
+NOTEBOOKS = sorted((Path(__file__).parents[1] / "studies" / "notebooks").glob("*.py"))
 LONGEST_S = 1200  # of a cell, on a busy machine
 
 

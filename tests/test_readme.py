@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 _LINK = re.compile(r"\[[^]]*\]\(([^)#:\s]+)(?:#[^)]*)?\)")
 _PAGES = sorted(
     path.relative_to(ROOT).as_posix()
-    for top in ("lmshealth", "models", "notebooks", "studies")
+    for top in ("lmshealth", "models", "studies")
     for path in (ROOT / top).rglob("README.md")
 )
 
