@@ -50,7 +50,6 @@ def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> 
             s.frequency,
             s.periodogram[:, None, None] + 0j,
             s.duration,
-            float("nan"),
             np.ones(s.frequency.size, dtype=bool),
             (),
             s.count,
