@@ -22,12 +22,12 @@ from lmshealth.batch.status import coming_states, make_status
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Notice, Refusal
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal, Normal

@@ -8,7 +8,7 @@ spectrum. All power spectral densities are one-sided.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -17,7 +17,8 @@ import numpy as np
 
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata
 from lmshealth.modal.modes import Modes
-from lmshealth.signal.spectra import Spectrum
+from lmshealth.signal.segments import Segment
+from lmshealth.signal.spectra import CrossSpectrum, ResonanceRange, transform_segment
 from lmshealth.stage.description import Description, ModeSpec, Order, Stage
 
 _KINDS: dict[str, ChannelKind] = {"delta": "displacement", "current": "current"}
@@ -152,12 +153,43 @@ def make_stage(
     return Stage(description, None, "0" * 64)
 
 
-def expected_spectrum(
-    modes: Sequence[Mode], duration: float, low: float, high: float, noise: float
+@dataclass(frozen=True)
+class Spectrum:
+    """Periodogram of one channel: Hz, ordinates, duration of a segment in s, segments averaged."""
+
+    frequency: np.ndarray
+    periodogram: np.ndarray
+    duration: float
+    count: int = 1
+
+
+def of_channel(spectrum: CrossSpectrum, index: int = 0) -> Spectrum:
+    """Return the spectrum of one channel."""
+    power = spectrum.powers()[:, index].copy()
+    return Spectrum(spectrum.frequency, power, spectrum.duration, spectrum.count)
+
+
+def periodogram(
+    channel: Channel, rate: float, top: float = np.inf, *, ceiling: float = np.inf
 ) -> Spectrum:
-    """Return a periodogram that equals its density: data without any scatter."""
-    frequency = np.arange(np.ceil(low * duration), high * duration) / duration
-    return Spectrum(frequency, density(modes, frequency, noise), duration, float("nan"))
+    """Return the periodogram of all samples, of which no sinusoid is removed."""
+    segment, anywhere = Segment(0, channel.values.size, 0.1), [ResonanceRange(0.0, np.inf, 0.0)]
+    own = transform_segment([channel], segment, rate, top, ceiling=ceiling, resonances=anywhere)
+    return of_channel(own)
+
+
+def cut_band(spectrum: Spectrum, low: float, high: float) -> Spectrum:
+    """Return the ordinates of a band."""
+    own = (spectrum.frequency >= low) & (spectrum.frequency < high)
+    return replace(
+        spectrum, frequency=spectrum.frequency[own], periodogram=spectrum.periodogram[own]
+    )
+
+
+def mean_ordinate(spectrum: Spectrum, low: float, high: float) -> tuple[float, int]:
+    """Return the mean ordinate of a band, and its degrees of freedom."""
+    own = cut_band(spectrum, low, high).periodogram
+    return float(own.mean()), 2 * spectrum.count * own.size
 
 
 def deviations(modes: Modes, name: str, frequency: float, damping: float) -> np.ndarray:

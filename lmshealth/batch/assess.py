@@ -19,6 +19,7 @@ from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import Epoch, epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.io.log import Notice
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import (
     EndedLife,
     FleetContribution,
@@ -33,7 +34,6 @@ from lmshealth.prognosis.life_posterior import LifeStart
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise
-from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notices
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
@@ -122,7 +122,7 @@ def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) ->
         refused=(*not_excited, *refused),
         notices=tuple(notices),
         seed=machine.seed,
-        waterfall=Waterfall.stack([(reading.levels, reading.modes.lines) for reading in used]),
+        waterfall=Waterfall.stack([(reading.spectra, reading.modes.lines) for reading in used]),
         latest=used[-1] if used else None,
         at_baseline=used[history.baseline] if used else None,
     )

@@ -21,10 +21,8 @@ from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.mode_shapes import mode_shapes
-from lmshealth.modal.spectra_summary import summarise
-from lmshealth.signal.constants import WATERFALL_BINS
+from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
 from lmshealth.signal.following_error import loop_error
-from lmshealth.signal.waterfall import relative_spectrum, shown_band
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import LogEstimates
 
@@ -305,11 +303,8 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> I
         reading = read_ambient(log, described)
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
-        rms, levels = loop_error(log), relative_spectrum(log, described)
-        shapes = mode_shapes(modes, reading.fitted)
-        found = LogEstimates(
-            log.name, log.digest, log.metadata, modes, rms, levels, spectra, shapes
-        )
+        rms, shapes = loop_error(log), mode_shapes(modes, reading.fitted)
+        found = LogEstimates(log.name, log.digest, log.metadata, modes, rms, spectra, shapes)
         return Identified(found, by, stage, asked)
     except BadLog as error:
         refusal = Refusal(task.name, error.reason, error.detail)

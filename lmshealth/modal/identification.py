@@ -18,7 +18,7 @@ from lmshealth.modal import constants
 from lmshealth.modal.ambient.cluster_fit import (
     bin_cluster,
     fit_cluster,
-    fit_found,
+    fit_modes,
     locate,
     needed_ordinates,
     shows_more,
@@ -46,9 +46,7 @@ from lmshealth.signal.spectra import (
     ANY_RESONANCE,
     LogSpectra,
     ResonanceRange,
-    Spectrum,
     cross_spectra,
-    transform_segment,
 )
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND_HALF_WIDTH, LEAST_RESOLUTION
@@ -337,18 +335,13 @@ def _search(
         for line in find_lines(channel, (longest,), log.sample_rate, (low, high)).tolist()
     ]
     frequencies = [frequency for _, frequency, _ in tested]
-    reach = band[1] if band else np.inf
-    own = transform_segment(channels, longest, log.sample_rate, reach, ceiling=_CEILING * reach)
-    silent = Spectrum(own.frequency, np.zeros_like(own.frequency), own.duration, np.nan)
-    clear = own.free & silent.clear_of(frequencies)
-    recording = own._replace(transforms=own.transforms * clear[:, None])
-    cut = spectra.without(frequencies)
+    cut = spectra.each(lambda spectrum: spectrum.without(frequencies))
     edges = _edges(low, high, 20 / duration)
     parts: list[Found] = []
     for k, (first, last) in enumerate(pairwise(edges)):
         progress("searching", k, len(edges) - 1)
         ends = max(low, first / _BEYOND), min(high, last * _BEYOND)
-        part = search(cut, recording, *ends, frequencies, suspected)
+        part = search(cut, *ends, frequencies, suspected)
         number = 1 + sum(len(one.modes) for one in parts)
         modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, number)]
         if parts:
@@ -438,7 +431,7 @@ def _fit_group(
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    fit = fit_found(found.around(near, low, high), binned, near, (low, high))
+    fit = fit_modes(found.around(near, low, high), binned, near, (low, high))
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

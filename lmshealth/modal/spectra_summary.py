@@ -1,7 +1,8 @@
-"""Spectra of a log in bins, with what the fit of its modes expects there, for figures."""
+"""Spectra of logs in bins for figures: of one with the fit of its modes, and of all of a life."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,8 +11,9 @@ from scipy.ndimage import uniform_filter1d
 from lmshealth._arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.modes import Modes
-from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum
-from lmshealth.signal.waterfall import bin_density
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
+from lmshealth.signal.spectral_lines import Line
+from lmshealth.stage.description import Stage
 
 # Bins have at least so many ordinates of a segment, which average their scatter, but are not wider
 # than this share of the half-power bandwidth of a mode.
@@ -21,6 +23,8 @@ _LEAST_BINS = 8
 WIDE = 6.0
 # Ordinates per channel that the matrices of singular values average at least.
 _PER_CHANNEL = 2
+# Bins of a waterfall, and the share of a channel's median below which power is rounding.
+WATERFALL_BINS, _LEAST_SHARE = 160, 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -107,8 +111,7 @@ def _binned(spectrum: CrossSpectrum, edges: FloatArray) -> ComplexArray:
     parts = cut.matrix.reshape(cut.frequency.size, -1)
     for k in range(n * n):
         for part, unit in ((parts[:, k].real, 1.0), (parts[:, k].imag, 1j)):
-            one = Spectrum(cut.frequency, part.copy(), cut.duration, cut.velocity)
-            binned[:, k // n, k % n] += unit * bin_density(one, edges)
+            binned[:, k // n, k % n] += unit * bin_density(cut, part, edges)
     for channel, frequency, amplitude in cut.lines:
         k = int(np.searchsorted(edges, frequency)) - 1
         if 0 <= k < len(binned):
@@ -126,9 +129,24 @@ def _expected(fit: FittedSpectrum, edges: FloatArray) -> FloatArray:
     rows = []
     for row in density:
         whole = np.interp(frequency, frequency[known], row[known])
-        one = Spectrum(frequency, whole, fit.spectrum.duration, np.nan)
-        rows.append(np.where(covered, bin_density(one, edges), np.nan))
+        rows.append(np.where(covered, bin_density(fit.spectrum, whole, edges), np.nan))
     return np.array(rows)
+
+
+def bin_density(spectrum: CrossSpectrum, density: FloatArray, edges: FloatArray) -> FloatArray:
+    """Average a density at the ordinates of a spectrum within bins, shape ``(n_bins,)``.
+
+    An ordinate is the density within half a spacing: narrow bins have a value, and power is kept.
+    """
+    half = 0.5 / spectrum.duration
+    places = np.append(spectrum.frequency - half, spectrum.frequency[-1] + half)
+    return _mean_density(places, density / spectrum.duration, edges)
+
+
+def _mean_density(places: FloatArray, power: FloatArray, edges: FloatArray) -> FloatArray:
+    """Return the mean density within edges of power that lies between places, all in Hz."""
+    below = np.append(0.0, np.cumsum(power))
+    return np.asarray(np.diff(np.interp(edges, places, below)) / np.diff(edges))
 
 
 def _singular_values(matrix: ComplexArray, count: float, most: int) -> NDArray[np.float16]:
@@ -147,3 +165,58 @@ def _decibel(density: FloatArray) -> NDArray[np.float16]:
     """Return levels; NaN where the density is not positive."""
     positive = np.where(density > 0, density, np.nan)
     return np.asarray(10 * np.log10(positive), dtype=np.float16)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Waterfall:
+    """Relative spectra and lines of the logs of a machine.
+
+    Edges of the bins in Hz, shape ``(n_bins + 1,)``; levels in dB, NaN where a log has none,
+    ``(n_logs, n_bins)``; and the lines of each log within the band.
+    """
+
+    edges: FloatArray
+    level: FloatArray
+    lines: tuple[tuple[Line, ...], ...]
+
+    def __post_init__(self) -> None:
+        freeze(self, ("level", len(self.lines), self.edges.size - 1))
+
+    @classmethod
+    def stack(cls, logs: Sequence[tuple[SpectraSummary | None, Sequence[Line]]]) -> Self | None:
+        """Stack logs of one description; None without any spectrum."""
+        summaries = [summary for summary, _ in logs if summary is not None]
+        if not summaries:
+            return None
+        low, high = min(one.low for one in summaries), max(one.high for one in summaries)
+        edges = np.geomspace(low, high, WATERFALL_BINS + 1)
+        return cls(
+            edges=edges,
+            level=np.stack([_relative_level(summary, edges) for summary, _ in logs]),
+            lines=tuple(
+                tuple(line for line in lines if low <= line.frequency <= high) for _, lines in logs
+            ),
+        )
+
+
+def shown_band(stage: Stage) -> tuple[float, float]:
+    """Return the band in Hz in which the tracked modes of a stage are searched."""
+    modes = [mode for mode in stage.modes if mode.tracked] or stage.modes
+    low = min(mode.frequency_hz * (1 - mode.search) for mode in modes)
+    return low, max(mode.frequency_hz * (1 + mode.search) for mode in modes)
+
+
+def _relative_level(summary: SpectraSummary | None, edges: FloatArray) -> FloatArray:
+    """Return the mean in dB of all channels over their medians; NaN where a log has no values."""
+    total = np.zeros(edges.size - 1)
+    if summary is None:
+        return np.full(total.size, np.nan)
+    known = edges[1:] <= (1 + 1e-9) * summary.high
+    for level in summary.level.astype(float):
+        power = np.nan_to_num(10 ** (level / 10)) * np.diff(summary.edges)
+        density = _mean_density(summary.edges, power, edges)
+        middle = float(np.median(density[known]))
+        if middle > 0:
+            total += density / middle
+    decibel = 10 * np.log10((total / len(summary.channels)).clip(_LEAST_SHARE))
+    return np.where(known & total.any(), decibel, np.nan)

@@ -17,12 +17,12 @@ from lmshealth.health.verdict import (
     undeclared_events,
 )
 from lmshealth.io.log import Notice, Refusal
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report import constants
 from lmshealth.report.text import km, quantiles, spell
-from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.history import History, LogEstimates
 from lmshealth.tracking.track import Track

@@ -23,11 +23,11 @@ from lmshealth.errors import BadQuestion
 from lmshealth.health.results import Health
 from lmshealth.io.log import SI_UNITS, Log
 from lmshealth.modal.modes import Modes
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants
 from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
-from lmshealth.signal.waterfall import Waterfall
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track

@@ -66,8 +66,3 @@ MODE_BAND_HALF_WIDTH = 2.5
 SIGNIFICANCE = 0.05
 # Least number of harmonics in a band.
 LEAST_ORDINATES = 3
-
-# --- Waterfall ----------------------------------------------------------------------------------
-# Bins of the band, and periods of its lowest frequency that a segment must hold.
-WATERFALL_BINS = 160
-WATERFALL_PERIODS = 20

@@ -26,9 +26,7 @@ class Harmonics:
     size: int
 
     def __post_init__(self) -> None:
-        if not self.frequency.shape == self.amplitude.shape == self.phase.shape:
-            raise ValueError("frequency, amplitude and phase differ in shape")
-        freeze(self)
+        freeze(self, ("amplitude phase", *self.frequency.shape))
 
     @property
     def power(self) -> FloatArray:

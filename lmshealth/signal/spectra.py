@@ -2,7 +2,8 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple, Self
+from functools import partial
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy import fft
@@ -13,7 +14,7 @@ from lmshealth.io.buffers import MINUTE
 from lmshealth.io.log import Channel
 from lmshealth.signal import constants
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.tone_removal import Sinusoid, remove_sinusoids
+from lmshealth.signal.tone_removal import remove_sinusoids
 
 # Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
@@ -24,84 +25,24 @@ _LEAST_PART = MINUTE // 2
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Spectrum:
-    """Periodogram of one channel as acceleration, over one segment or the mean over several."""
-
-    # frequency, periodogram: fourier frequencies in Hz, and one-sided periodogram in
-    # (m/s²)²/Hz: the power spectral density times the mean of ``count`` exponential
-    # variables, shape ``(n_ordinates,)``.
-    frequency: FloatArray
-    periodogram: FloatArray
-    # duration, velocity: of a segment in s, and set velocity in m/s, NaN where unknown.
-    duration: float
-    velocity: float
-    count: int = 1  # number of averaged segments
-
-    def __post_init__(self) -> None:
-        if self.frequency.shape != self.periodogram.shape:
-            raise ValueError("frequency and periodogram differ in shape")
-        freeze(self)
-
-    @property
-    def observed(self) -> float:
-        """Total duration of its segments in s."""
-        return self.count * self.duration
-
-    def band(self, low: float, high: float) -> Self:
-        """Return the ordinates from low to high Hz."""
-        first, last = np.searchsorted(self.frequency, [low, high])
-        cut = slice(int(first), int(last))
-        return replace(self, frequency=self.frequency[cut], periodogram=self.periodogram[cut])
-
-    def near(self, line: float) -> slice:
-        """Return the ordinates of a line: its relative width, at least two to either side."""
-        half = max(constants.LINE_WIDTH * line, 2 / self.duration)
-        first, last = np.searchsorted(self.frequency, [line - half, line + half])
-        return slice(int(first), int(last))
-
-    def clear_of(self, lines: Sequence[float]) -> BoolArray:
-        """Return which ordinates lie outside lines at these frequencies in Hz."""
-        clear = np.ones(self.frequency.size, dtype=bool)
-        for line in lines:
-            clear[self.near(line)] = False
-        return clear
-
-    def density(self, low: float, high: float) -> tuple[float, int]:
-        """Return the mean ordinate from low to high Hz and its degrees of freedom."""
-        cut = self.band(low, high).periodogram
-        return float(cut.mean()) if cut.size else float("nan"), 2 * self.count * cut.size
-
-    def sine(self, first: int, last: int) -> tuple[float, float]:
-        """Return frequency in Hz and amplitude of a sine in some ordinates: Σ I = A² T / 2."""
-        ordinates = self.periodogram[first:last]
-        amplitude = np.sqrt(2 * ordinates.sum() / self.duration)
-        return float(self.frequency[first + int(np.argmax(ordinates))]), float(amplitude)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class CrossSpectrum:
-    """All channels as acceleration over one segment, or the mean over several of one length.
+    """All channels as acceleration over one segment, or the mean over several of one length."""
 
-    Frequencies, duration, velocity and count are those of `Spectrum`.
-    """
-
-    frequency: FloatArray
+    frequency: FloatArray  # Fourier frequencies in Hz, shape ``(n_ordinates,)``
     # F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms
-    # in (m/s²)²/Hz, shape ``(n_ordinates, n_channels, n_channels)``.
+    # in (m/s²)²/Hz: the power spectral density times the mean of ``count`` exponential variables,
+    # shape ``(n_ordinates, n_channels, n_channels)``.
     matrix: ComplexArray
-    duration: float
-    velocity: float
+    duration: float  # of a segment in s
     free: BoolArray  # ordinates without a removed or masked line, shape ``(n_ordinates,)``
     # Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     lines: tuple[tuple[int, float, float], ...] = ()
-    count: int = 1
+    count: int = 1  # number of averaged segments
     foreign: ComplexArray | None = None  # expectation of what no mode causes, as the matrix
     transforms: ComplexArray | None = None  # F of each segment, (count, n_ordinates, n_channels)
 
     def __post_init__(self) -> None:
-        if self.matrix.shape[:1] != self.frequency.shape:
-            raise ValueError("frequency and matrix differ in length")
-        freeze(self)
+        freeze(self, ("matrix", self.frequency.size, *self.matrix.shape[1:]))
 
     @property
     def observed(self) -> float:
@@ -123,17 +64,26 @@ class CrossSpectrum:
         )
 
     def without(self, lines: Sequence[float]) -> Self:
-        """Mask the ordinates of lines at these frequencies in Hz."""
-        return replace(self, free=self.free & self.channel(0).clear_of(lines))
+        """Mask lines at these frequencies in Hz: their width, at least two ordinates to a side."""
+        free = self.free.copy()
+        for line in lines:
+            half = max(constants.LINE_WIDTH * line, 2 / self.duration)
+            first, last = np.searchsorted(self.frequency, [line - half, line + half])
+            free[first:last] = False
+        return replace(self, free=free)
 
-    def with_foreign(self, added: ComplexArray) -> Self:
-        """Add an expectation that is of the shape of ``matrix``."""
+    def without_band(self, low: float, high: float) -> Self:
+        """Mask the ordinates from low to high Hz."""
+        return replace(self, free=self.free & ((self.frequency < low) | (self.frequency > high)))
+
+    def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> Self:
+        """Add an expectation, of the shape of ``matrix``, that is a function of frequency in Hz."""
+        added = expected(self.frequency)
         return replace(self, foreign=added if self.foreign is None else self.foreign + added)
 
-    def channel(self, index: int) -> Spectrum:
-        """Return the spectrum of one channel."""
-        own = self.matrix[:, index, index].real.copy()
-        return Spectrum(self.frequency, own, self.duration, self.velocity, self.count)
+    def powers(self) -> FloatArray:
+        """Return the periodograms of all channels, shape ``(n_ordinates, n_channels)``."""
+        return np.asarray(np.diagonal(self.matrix, axis1=1, axis2=2).real)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -155,17 +105,21 @@ class LogSpectra:
     @property
     def duration(self) -> float:
         """Duration of the longest segment in s."""
-        return max(spectrum.duration for spectrum in self.spectra)
+        return self.longest.duration
+
+    @property
+    def longest(self) -> CrossSpectrum:
+        """The spectrum with the longest segments."""
+        return max(self.spectra, key=lambda spectrum: spectrum.duration)
 
     @property
     def removed_lines(self) -> list[tuple[str, float, float]]:
         """Channel, frequency in Hz and amplitude in m/s² of lines subtracted from the samples."""
         return [(self.channels[c], f, a) for s in self.spectra for c, f, a in s.lines]
 
-    def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> Self:
-        """Add an expectation that is a function of the frequency in Hz."""
-        spectra = tuple(s.with_foreign(expected(s.frequency)) for s in self.spectra)
-        return replace(self, spectra=spectra)
+    def each(self, change: Callable[[CrossSpectrum], CrossSpectrum]) -> Self:
+        """Return the spectra after a change of each of them."""
+        return replace(self, spectra=tuple(map(change, self.spectra)))
 
     def select(self, kept: Sequence[int]) -> Self:
         """Return some of the channels."""
@@ -182,16 +136,6 @@ class LogSpectra:
         )
         channels, sources = (tuple(x[c] for c in kept) for x in (self.channels, self.sources))
         return replace(self, channels=channels, sources=sources, spectra=spectra)
-
-    def without_band(self, low: float, high: float) -> Self:
-        """Exclude the ordinates from low to high Hz."""
-        outside = [(s.frequency < low) | (s.frequency > high) for s in self.spectra]
-        pairs = zip(self.spectra, outside, strict=True)
-        return replace(self, spectra=tuple(replace(s, free=s.free & own) for s, own in pairs))
-
-    def without(self, frequencies: Sequence[float]) -> Self:
-        """Exclude the ordinates that lines at these frequencies in Hz may reach."""
-        return replace(self, spectra=tuple(s.without(frequencies) for s in self.spectra))
 
 
 def median_ordinate(count: int) -> float:
@@ -231,36 +175,12 @@ def cross_spectra(
     statistic. Short moves stay separate, so that a line is masked in each at its own frequency.
 
     Channels are displacements or accelerations; sample rate, top and ceiling are in Hz, as in
-    `periodogram`. Where a segment does not resolve possible resonances no sinusoid is removed.
+    `transform_segment`. Where a segment does not resolve possible resonances no sinusoid is
+    removed.
     """
-
-    def transformed(part: Segment) -> CrossSpectrum:
-        own = transform_segment(
-            channels, part, sample_rate, top, ceiling=ceiling, resonances=resonances
-        )
-        step = sample_rate / round(own.duration * sample_rate)
-        lines = tuple(
-            # Σ I = A² T / 2 over the ordinates of a sine.
-            (one.channel, (one.ordinate + 1) * step, float(np.sqrt(2 * one.power * step)))
-            for one in own.sinusoids
-        )
-        matrix = own.transforms[:, :, None] * own.transforms[:, None].conj()
-        return CrossSpectrum(
-            own.frequency, matrix, own.duration, part.velocity, own.free, lines,
-            transforms=own.transforms[None],
-        )  # fmt: skip
-
-    return tuple(_mean(map(transformed, group)) for group in _exchangeable(segments))
-
-
-class SegmentTransforms(NamedTuple):
-    """Transforms of all channels over one segment, without the strong sinusoids."""
-
-    frequency: FloatArray  # in Hz, (n_ordinates,)
-    transforms: ComplexArray  # squared magnitudes are periodograms, (n_ordinates, n_channels)
-    duration: float  # in s
-    free: BoolArray  # ordinates without a sinusoid
-    sinusoids: tuple[Sinusoid, ...]
+    options: dict[str, Any] = {"ceiling": ceiling, "resonances": resonances}
+    transform = partial(transform_segment, channels, sample_rate=sample_rate, top=top, **options)
+    return tuple(_mean(map(transform, group)) for group in _exchangeable(segments))
 
 
 def transform_segment(
@@ -271,8 +191,14 @@ def transform_segment(
     *,
     ceiling: float = np.inf,
     resonances: Sequence[ResonanceRange] = ANY_RESONANCE,
-) -> SegmentTransforms:
-    """Transform one segment of all channels; arguments as in `cross_spectra`."""
+) -> CrossSpectrum:
+    """Transform one segment of all channels as acceleration; arguments as in `cross_spectra`.
+
+    Mean and linear trend are removed. Of a displacement the second difference is transformed,
+    over a lag that the top of the band permits, so that neither its large slow part nor its
+    amplified fast noise leaks into the band. Ordinates reach from the first Fourier frequency to
+    below Nyquist, the ceiling, and with a displacement four times ``top``, all in Hz.
+    """
     parts = [as_acceleration(channel, segment, sample_rate, top) for channel in channels]
     # A second difference has no values at the ends; the other channels are cut there, too.
     short = max(lag for _, lag in parts)
@@ -290,7 +216,13 @@ def transform_segment(
     duration = n / sample_rate
     protected = np.any([r.unresolved(frequency, duration) for r in resonances], axis=0)
     rest, free, sinusoids = remove_sinusoids(transforms, duration, protected)
-    return SegmentTransforms(frequency, rest, duration, free, sinusoids)
+    lines = tuple(
+        # Σ I = A² T / 2 over the ordinates of a sine.
+        (one.channel, (one.ordinate + 1) / duration, float(np.sqrt(2 * one.power / duration)))
+        for one in sinusoids
+    )
+    matrix = rest[:, :, None] * rest[:, None].conj()
+    return CrossSpectrum(frequency, matrix, duration, free, lines, transforms=rest[None])
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
@@ -329,31 +261,6 @@ def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
     return replace(
         first, matrix=total / count, free=free, lines=lines, count=count, transforms=transforms
     )
-
-
-def periodogram(
-    channel: Channel,
-    segment: Segment,
-    sample_rate: float,
-    top: float = np.inf,
-    *,
-    ceiling: float = np.inf,
-) -> Spectrum:
-    """Compute the one-sided periodogram of a channel as acceleration.
-
-    Mean and linear trend are removed. Of a displacement the second difference is transformed,
-    over a lag that the top of the band permits, so that neither its large slow part nor its
-    amplified fast noise leaks into the band. Ordinates reach from the first Fourier frequency to
-    below Nyquist, the ceiling, and for a displacement four times ``top``, all in Hz. ``top`` is the
-    highest frequency of interest, which sets the lag; by default Nyquist, at the price of leakage.
-    """
-    x, lag = as_acceleration(channel, segment, sample_rate, top)
-    if lag:
-        ceiling = min(ceiling, 4 * top)
-    frequency = _frequencies(x.size, sample_rate, ceiling)
-    transform = _transform(x, lag, frequency, sample_rate)
-    power = transform.real**2 + transform.imag**2
-    return Spectrum(frequency, power, x.size / sample_rate, segment.velocity)
 
 
 def _transform(x: FloatArray, lag: int, frequency: FloatArray, sample_rate: float) -> ComplexArray:

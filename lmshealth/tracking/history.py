@@ -16,7 +16,6 @@ from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
-from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
@@ -224,8 +223,6 @@ class LogEstimates:
         The estimates.
     loop_error : float or None
         RMS of the following error from 1 to 40 Hz in m; None where unknown.
-    levels : RelativeSpectrum or None
-        Spectrum about the tracked modes, for plots; None where the log has none.
     spectra : SpectraSummary or None
         Spectrum of each channel with the fit of the modes, for plots; None if it was not kept.
     shapes : ModeShapes or None
@@ -254,7 +251,6 @@ class LogEstimates:
     metadata: Metadata
     modes: Modes
     loop_error: float | None = None
-    levels: RelativeSpectrum | None = None
     spectra: SpectraSummary | None = None
     shapes: ModeShapes | None = None
 

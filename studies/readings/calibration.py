@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from itertools import pairwise
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.stats import chi2, expon, kstest
@@ -11,14 +11,14 @@ from scipy.stats import chi2, expon, kstest
 from lmshealth.io.log import Channel
 from lmshealth.signal.harmonics import decompose
 from lmshealth.signal.segments import Segment
-from lmshealth.signal.spectra import Spectrum, periodogram
+from lmshealth.signal.spectra import ResonanceRange, transform_segment
 from studies.harness.study import Row
 from studies.readings.checks import Check, below, control, likely, unbiased
 
 Array = np.ndarray[Any, Any]
 
 RATE = 20_000.0
-# From here on `periodogram` promises that its trend takes less than 1e-6.
+# From here on `transform_segment` promises that its trend takes less than 1e-6.
 FROM = 780
 ORDINATES = (1, 2, 5, 10, 20, 50, 100, 200, 400, FROM, 1500, 3000, 7000)
 PHASES = np.pi * np.arange(8) / 8
@@ -27,6 +27,8 @@ LEVEL = 3.7e-4
 TOP, LOW = 250.0, 10.0
 DISPLACEMENT_RATE = 4000.0
 BAND = (100.0, 150.0)
+# No sinusoid is removed where a resonance may be as narrow.
+ANYWHERE = (ResonanceRange(0.0, np.inf, 0.0),)
 
 
 def calibrate(quick: bool) -> tuple[dict[str, Check], Row]:
@@ -41,12 +43,32 @@ def calibrate(quick: bool) -> tuple[dict[str, Check], Row]:
     return checks, curves
 
 
+class Spectrum(NamedTuple):
+    """Periodogram of one channel."""
+
+    frequency: Array  # in Hz
+    periodogram: Array
+    duration: float  # in s
+
+    def amplitude(self, k: int) -> float:
+        """Return the amplitude of a sine of k periods: I = A² T / 2."""
+        return float(np.sqrt(2 * self.periodogram[k - 1] / self.duration))
+
+
 def spectrum(
     values: Array, kind: str = "acceleration", rate: float = RATE, top: float = np.inf
 ) -> Spectrum:
     """Return the periodogram of all samples."""
     channel = Channel("x", kind, np.array(values))  # type: ignore[arg-type]
-    return periodogram(channel, Segment(0, values.size, float("nan")), rate, top)
+    segment = Segment(0, values.size, float("nan"))
+    own = transform_segment([channel], segment, rate, top, resonances=ANYWHERE)
+    return Spectrum(own.frequency, own.powers()[:, 0], own.duration)
+
+
+def mean_ordinate(found: Spectrum, low: float, high: float) -> tuple[float, int]:
+    """Return the mean ordinate of a band, and its degrees of freedom."""
+    own = found.periodogram[(found.frequency >= low) & (found.frequency < high)]
+    return float(own.mean()) if own.size else float("nan"), 2 * own.size
 
 
 def cosine(k: int, n: int, phase: float, size: int) -> Array:
@@ -57,7 +79,7 @@ def cosine(k: int, n: int, phase: float, size: int) -> Array:
 def sines() -> tuple[dict[str, Check], Row]:
     """Read sines of whole numbers of periods: odd and even records, eight phases."""
     read = [
-        [(spectrum(x).sine(k - 1, k)[1], decompose(x, RATE).amplitude[k - 1])
+        [(spectrum(x).amplitude(k), decompose(x, RATE).amplitude[k - 1])
          for n in (16_000, 16_001) for x in (cosine(k, n, phase, n) for phase in PHASES)]
         for k in ORDINATES
     ]  # fmt: skip
@@ -76,7 +98,7 @@ def sines() -> tuple[dict[str, Check], Row]:
             worst[:, 1].max(), 1e-6
         ),
         "control: a Hann window left uncorrected, sine reads A": control(
-            below(abs(windowed.sine(FROM - 1, FROM)[1] - 1), 1e-6)
+            below(abs(windowed.amplitude(FROM) - 1), 1e-6)
         ),
     }
     curve = {"ordinate": list(ORDINATES), "sines_each": 2 * PHASES.size,
@@ -140,7 +162,7 @@ def displacements(quick: bool) -> tuple[dict[str, Check], Row]:
     for k in range(FROM, round(TOP * period / rate) + 1, 5):
         for phase in PHASES[::2]:
             x = cosine(k, period, phase, period + lost)
-            read = spectrum(x, "displacement", rate, TOP).sine(k - 1, k)[1]
+            read = spectrum(x, "displacement", rate, TOP).amplitude(k)
             off.append(read / (2 * np.pi * k * rate / period) ** 2 - 1)
     # Impulses of acceleration, twice summed; beside it impulses of the encoder.
     frequency = spectrum(np.zeros(size), "displacement", rate, TOP).frequency
@@ -204,7 +226,7 @@ def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], Row]:
         ),
     }
     cuts = np.geomspace(20.0, RATE / 2, 17)
-    bands = [whole.density(low, high) for low, high in pairwise(cuts)]
+    bands = [mean_ordinate(whole, low, high) for low, high in pairwise(cuts)]
     tail = np.geomspace(1.0, 5 / m, 60)
     return checks, {
         "noise_bands": {
@@ -230,8 +252,8 @@ def freedom(rng: np.random.Generator, records: int) -> tuple[dict[str, Check], R
     found = np.empty((2, records))
     for i in range(records):
         x = rng.standard_normal(n) * np.sqrt(LEVEL * RATE / 2)
-        found[0, i], dof = spectrum(x).density(*BAND)
-        found[1, i], _ = spectrum(window * x).density(*BAND)
+        found[0, i], dof = mean_ordinate(spectrum(x), *BAND)
+        found[1, i], _ = mean_ordinate(spectrum(window * x), *BAND)
     ratio = found / LEVEL
 
     def agrees(values: Array, freedom: float) -> Check:

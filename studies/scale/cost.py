@@ -31,7 +31,6 @@ import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
 from lmshealth.signal.following_error import loop_error
-from lmshealth.signal.waterfall import relative_spectrum
 from lmshealth.stage.description import Stage
 from studies.common.cost import cpu_s, in_own_process
 from studies.harness.claims import Claim
@@ -72,7 +71,7 @@ class Meter(Steps):
         log = read_log(path)
         read = time.process_time()
         identified = cpu_s(lambda: identify(log, self._stage))
-        other = cpu_s(lambda: (loop_error(log), relative_spectrum(log, self._stage)))
+        other = cpu_s(lambda: loop_error(log))
         return read - start, identified, other
 
 

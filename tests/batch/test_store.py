@@ -36,10 +36,10 @@ from lmshealth.batch.store import (
 )
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.modes import Modes
+from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.signal.waterfall import RelativeSpectrum
 from lmshealth.tracking.history import LogEstimates
 from studies.harness.servers import Postgres
 from tests.assessments import leaves, worn
@@ -76,8 +76,11 @@ def reading(n: int = 2, log: str = "a.h5") -> LogEstimates:
         baseline=True,
         description="small",
     )
-    levels = RelativeSpectrum(100 / 3, 200 / 3, rng.choice([np.nan, 1 / 3], 5))
-    return LogEstimates(log, "d" * 64, metadata, modes, 1e-6 / 3, levels)
+    level = rng.choice([np.nan, 1 / 3], (1, 5)).astype(np.float16)
+    spectra = SpectraSummary(
+        ("acc_x",), (False,), 100 / 3, 200 / 3, level, level, level[:0], level[0]
+    )
+    return LogEstimates(log, "d" * 64, metadata, modes, 1e-6 / 3, spectra)
 
 
 @pytest.fixture
@@ -127,7 +130,7 @@ def test_missing_metadata_stay_missing(url: str) -> None:
     assert isinstance(got, LogEstimates)
     assert got.metadata == Metadata()
     assert got.loop_error is None
-    assert got.levels is None
+    assert got.spectra is None
 
 
 def test_refusals_come_back_under_the_present_name(url: str) -> None:

@@ -20,7 +20,7 @@ from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
 from lmshealth.modal.ambient import cluster_fit
-from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_cluster, fit_found
+from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_cluster, fit_modes
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
@@ -550,10 +550,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         band: tuple[float, float],
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_found(view, binned, targets, band)
+        return fit_modes(view, binned, targets, band)
 
     monkeypatch.setattr(modal, "fit_cluster", spy)
-    monkeypatch.setattr(modal, "fit_found", spy_found)
+    monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen
 
 

@@ -1,12 +1,22 @@
-"""Spectra and their fit in bins."""
+"""Spectra and their fit in bins; waterfall of many logs."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from lmshealth.io.log import Log
 from lmshealth.modal.identification import read_ambient
-from lmshealth.modal.spectra_summary import summarise
+from lmshealth.modal.spectra_summary import (
+    WATERFALL_BINS,
+    SpectraSummary,
+    Waterfall,
+    bin_density,
+    shown_band,
+    summarise,
+)
+from lmshealth.signal.spectra import CrossSpectrum
+from lmshealth.signal.spectral_lines import Line
 from tests.signals import Mode, accelerations, density, make_log, make_stage, sine, white
 
 RATE, N, NOISE = 500.0, 64000, 0.5
@@ -50,3 +60,103 @@ def test_a_channel_without_power_has_no_level() -> None:
     assert summary.singular.shape == (0, summary.count.size)
     assert np.isfinite(summary.level).all()
     assert np.isnan(summary.fitted).all()
+
+
+# Waterfall
+
+WIDE, RATE_W, QUIET = 40_000, 1000.0, 1e-4
+STAGE = make_stage([("roll", 100.0, 0.02), ("yaw", 160.0, 0.02)])
+MODES = (Mode(104.0, 0.02, shape=(1.0, 0.3)), Mode(155.0, 0.02, shape=(0.3, 1.0)))
+
+
+def summarised(log: Log) -> SpectraSummary:
+    """Return the spectra of a log as a batch keeps them."""
+    reading = read_ambient(log, STAGE)
+    band = shown_band(STAGE)
+    return summarise(reading.spectra, reading.fitted, reading.modes, band, WATERFALL_BINS)
+
+
+def stacked(*logs: Log) -> Waterfall:
+    """Return the waterfall of logs without lines."""
+    found = Waterfall.stack([(summarised(log), ()) for log in logs])
+    assert found is not None
+    return found
+
+
+def resonant(factor: float = 1.0) -> Log:
+    """Make a log of two accelerometers that see two modes, the first ``factor`` times as loud."""
+    values = accelerations(np.random.default_rng(1), MODES, WIDE, RATE_W, QUIET)
+    return make_log({"acc_a": factor * values[0], "acc_b": values[1]}, RATE_W)
+
+
+def test_band_is_where_tracked_modes_are_looked_for() -> None:
+    """It reaches from the lowest search to the highest."""
+    assert shown_band(STAGE) == pytest.approx((85.0, 184.0))
+
+
+def test_binning_keeps_the_power() -> None:
+    """Bins narrower and wider than the resolution hold the same power together."""
+    rng = np.random.default_rng(2)
+    frequency = np.arange(1, 400) / 2.0
+    density, free = rng.exponential(size=frequency.size), np.ones(frequency.size, dtype=bool)
+    matrix = density[:, None, None] + 0j
+    spectrum = CrossSpectrum(frequency, matrix, 2.0, free)
+    wide, narrow = np.array([50.25, 150.25]), np.geomspace(50.25, 150.25, 1001)
+    inside = (frequency > 50.25) & (frequency < 150.25)
+    power = density[inside].sum() / spectrum.duration
+    np.testing.assert_allclose(bin_density(spectrum, density, wide) * 100, power, rtol=1e-12)
+    np.testing.assert_allclose(
+        bin_density(spectrum, density, narrow) @ np.diff(narrow), power, rtol=1e-12
+    )
+
+
+def test_resonances_and_lines_stand_out_where_they_are() -> None:
+    """The highest bins are those of the modes; a line makes its own bin the highest of all."""
+    (noise,) = accelerations(np.random.default_rng(2), MODES[:1], WIDE, RATE_W, QUIET)[:1]
+    line = make_log({"acc_a": noise + sine(WIDE, RATE_W, 120.0, 100.0)}, RATE_W)
+    waterfall = stacked(resonant(), line)
+    edges = waterfall.edges
+    centre = np.sqrt(edges[1:] * edges[:-1])
+    for low, high, truth in ((85, 130, 104.0), (130, 184, 155.0)):
+        own = (centre > low) & (centre < high)
+        peak = centre[own][np.argmax(waterfall.level[0][own])]
+        assert peak == pytest.approx(truth, rel=0.02)
+    assert abs(int(np.argmax(waterfall.level[1])) - np.searchsorted(edges, 120.0) + 1) <= 1
+
+
+def test_level_is_that_of_white_noise_about_its_median() -> None:
+    """White noise is at 0 dB, as far as the number of ordinates in a bin allows."""
+    noise = white(np.random.default_rng(3), QUIET, 8 * WIDE, RATE_W)
+    level = stacked(make_log({"acc_a": noise}, RATE_W)).level
+    # A bin of 0.5 Hz holds 160 ordinates: 4.5 of its standard deviations are 1.5 dB.
+    assert np.abs(level).max() < 1.6
+
+
+def test_loudness_and_unit_of_a_channel_do_not_matter() -> None:
+    """A channel a thousand times as loud gives the same picture; absolute levels are lost."""
+    one, other = stacked(resonant()), stacked(resonant(1e3))
+    np.testing.assert_allclose(one.level, other.level, atol=0.1)
+
+
+def test_a_band_above_half_of_the_sample_rate_is_missing() -> None:
+    """A log of a lower rate has no level where another one has."""
+    values = accelerations(np.random.default_rng(1), MODES[:1], WIDE, 250.0, QUIET)
+    reading = read_ambient(make_log({"acc_a": values[0]}, 250.0), band=(85.0, 112.0))
+    slow = summarise(reading.spectra, (), reading.modes, shown_band(STAGE), WATERFALL_BINS)
+    waterfall = Waterfall.stack([(slow, ()), (summarised(resonant()), ())])
+    assert waterfall is not None
+    gone = np.isnan(waterfall.level[0])
+    assert gone.any() and not gone.all()
+    assert (waterfall.edges[1:][gone] > slow.high).all()
+    assert np.isfinite(waterfall.level[1]).all()
+
+
+def test_logs_stand_side_by_side_with_their_lines() -> None:
+    """A log without levels is a row of NaN; only lines within the band are kept."""
+    lines = [Line(f, 1e-3, "m/s²", "mains", "acc_a") for f in (50.0, 100.0, 150.0, 200.0)]
+    waterfall = Waterfall.stack([(summarised(resonant()), lines), (None, ())])
+    assert waterfall is not None
+    assert np.isfinite(waterfall.level[0]).all()
+    assert np.isnan(waterfall.level[1]).all()
+    assert [[line.frequency for line in own] for own in waterfall.lines] == [[100.0, 150.0], []]
+    assert Waterfall.stack([(None, lines)]) is None

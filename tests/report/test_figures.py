@@ -17,11 +17,11 @@ from matplotlib.figure import Figure
 
 from lmshealth._arrays import FloatArray
 from lmshealth.health.results import Health
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.text import plain
-from lmshealth.signal.waterfall import Waterfall
 from lmshealth.stage.description import Decision
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History

@@ -94,5 +94,5 @@ def test_between_leaves_out_its_edges() -> None:
 
 def test_arrays_that_differ_in_shape_are_no_harmonics() -> None:
     """Amplitudes without phases are refused."""
-    with pytest.raises(ValueError, match="differ in shape"):
+    with pytest.raises(ValueError, match="has shape"):
         Harmonics(0.0, np.ones(3), np.ones(3), np.ones(2), 1.0, 6)

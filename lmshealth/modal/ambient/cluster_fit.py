@@ -29,7 +29,7 @@ from lmshealth.modal.modes import Modes, Rejection, paired
 from lmshealth.modal.naming import is_near, shift_cost
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
-from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum, median_ordinate
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
 from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Steps of the common shift and of the shift of each mode.
@@ -129,7 +129,7 @@ def bin_spectra(
     size, n_larger = divmod(frequency.size, n_bins)
     larger, smaller = np.split(order, [n_larger * (size + 1)])
     parts = [larger.reshape(n_larger, size + 1), smaller.reshape(n_bins - n_larger, size)]
-    ordinates = np.concatenate([_powers(s) / median_ordinate(s.count) for s in cut])
+    ordinates = np.concatenate([s.powers() / median_ordinate(s.count) for s in cut])
     level = np.concatenate([np.median(ordinates[part], axis=1) for part in parts])
     return BinnedSpectra(
         np.concatenate([frequency[part].mean(axis=1) for part in parts]),
@@ -137,11 +137,6 @@ def bin_spectra(
         np.concatenate([count[part].sum(axis=1) for part in parts]),
         neighbours,
     )
-
-
-def _powers(spectrum: CrossSpectrum) -> FloatArray:
-    """Return the periodograms of all channels, shape ``(n_ordinates, n_channels)``."""
-    return np.asarray(np.diagonal(spectrum.matrix, axis1=1, axis2=2).real)
 
 
 def fit_strengths(
@@ -259,7 +254,7 @@ def fit_cluster(
     if present:
         low = min(target.band(BAND_HALF_WIDTH)[0] for target in present)
         high = max(target.band(BAND_HALF_WIDTH)[1] for target in present)
-        fit = _fit(prepare(spectra, binned, present, (low, high)), present, gains)
+        fit = fit_modes(spectra, binned, present, (low, high), gains)
         modes, rejected = fit.modes, fit.rejected
     names = {*rejected, *(() if modes is None else modes.names)}
     absent = {
@@ -275,25 +270,23 @@ def fit_cluster(
     return ClusterFit(modes, absent | rejected)
 
 
-def fit_found(
-    spectra: LogSpectra,
-    binned: BinnedSpectra,
-    targets: tuple[Target, ...],
-    band: tuple[float, float],
-) -> ClusterFit:
-    """Fit modes that a search found in a band in Hz, and drop those without evidence."""
-    return _fit(prepare(spectra, binned, targets, band), targets)
-
-
 def needed_ordinates(n_modes: int) -> int:
     """Return the least number of Fourier frequencies of a fit."""
     return 10 + 6 * n_modes
 
 
-def _fit(
-    data: ClusterData, targets: tuple[Target, ...], gains: dict[str, float] | None = None
+def fit_modes(
+    spectra: LogSpectra,
+    binned: BinnedSpectra,
+    targets: tuple[Target, ...],
+    band: tuple[float, float],
+    gains: dict[str, float] | None = None,
 ) -> ClusterFit:
-    """Mask lines, fit, and drop modes without evidence; ``gains`` as in `_fit_and_prune`."""
+    """Fit modes in a band in Hz: mask lines, and drop modes without evidence.
+
+    ``gains`` as in `_fit_and_prune`, which has none for modes that a search found.
+    """
+    data = prepare(spectra, binned, targets, band)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -455,7 +448,7 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
         if spectrum.count > 1:
-            ratio = _powers(spectrum) / level / median_ordinate(spectrum.count)
+            ratio = spectrum.powers() / level / median_ordinate(spectrum.count)
             level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
         levels.append(level)
     return _mask_above(data, levels)
@@ -468,7 +461,7 @@ def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
     masks = []
     for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
         highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
-        lines = mask & (_powers(spectrum) > highest * level).any(axis=1)
+        lines = mask & (spectrum.powers() > highest * level).any(axis=1)
         reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
         masks.append(mask & ~reached)
     # A band that would lose more than half of its ordinates holds no lines.
@@ -603,8 +596,9 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         )
     n, (f, zeta) = len(targets), np.exp(estimate).reshape(2, -1)
     ratio = likelihood.signal_to_noise(p)
-    residual = _residual(data, expected)
-    dispersion = _dispersion(residual, f, zeta)
+    spectrum = data.spectra.spectra[data.longest]
+    duration = spectrum.duration
+    dispersion = _dispersion(*_residual(data, expected), f, zeta)
     channels, shapes = data.spectra.channels, likelihood.shapes(p).T
     observed = data.spectra.spectra, data.masks, expected
     unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
@@ -613,7 +607,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     strength = data.unit**2 @ likelihood.strength(p)
     each = zip(targets, f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
     flags = tuple(
-        _flags(*one, residual.duration, unsteady=force.is_clear)
+        _flags(*one, duration, unsteady=force.is_clear)
         for one, force in zip(each, unsteady, strict=True)
     )
     modes = Modes(
@@ -633,7 +627,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         refused=(),
     )
     judged = [
-        _incredible(modes, i, one, residual.duration) or _outside(modes, i, one, residual.frequency)
+        _incredible(modes, i, one, duration) or _outside(modes, i, one, spectrum.frequency)
         for i, one in enumerate(targets)
     ]
     rejected = {
@@ -643,15 +637,14 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     ordinates = masked_ordinates(data)
-    for k in np.searchsorted(residual.frequency, f[narrow]).tolist():
+    for k in np.searchsorted(spectrum.frequency, f[narrow]).tolist():
         ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
     lines = tuple(read_line(data, first, last) for first, last in ordinates)
-    longest = data.longest
-    fitted = FittedSpectrum(channels, data.unit, data.spectra.spectra[longest], expected[longest])
+    fitted = FittedSpectrum(channels, data.unit, spectrum, expected[data.longest])
     fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
-    modes = _averaged(modes, colour, wider, targets, residual.duration)
-    found = ClusterModes(modes, np.array(_losses(optimum)), lines, residual, fitted)
+    modes = _averaged(modes, colour, wider, targets, duration)
+    found = ClusterModes(modes, np.array(_losses(optimum)), lines, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
 
 
@@ -684,23 +677,26 @@ def _unit_shapes(shapes: FloatArray) -> FloatArray:
     return np.asarray(shapes * np.sign(largest))
 
 
-def _residual(data: ClusterData, expected: list[ComplexArray]) -> Spectrum:
-    """Divide the ordinates of the longest observation by their expectation: tr E⁻¹ W."""
+def _residual(
+    data: ClusterData, expected: list[ComplexArray]
+) -> tuple[FloatArray, FloatArray, int]:
+    """Divide the ordinates of the longest observation by their expectation: tr E⁻¹ W.
+
+    Returns frequencies in Hz and ratios without lines, and how many exponentials they average.
+    """
     spectrum, mask = data.spectra.spectra[data.longest], data.masks[data.longest]
-    n_channels = data.unit.size
-    ratio = np.ones(mask.size)
     white = np.linalg.solve(expected[data.longest][mask], spectrum.matrix[mask])
-    ratio[mask] = np.trace(white, axis1=1, axis2=2).real / n_channels
-    count = spectrum.count * n_channels
-    return Spectrum(spectrum.frequency, ratio, spectrum.duration, spectrum.velocity, count)
+    ratio = np.trace(white, axis1=1, axis2=2).real / data.unit.size
+    return spectrum.frequency[mask], ratio, spectrum.count * data.unit.size
 
 
-def _dispersion(residual: Spectrum, f: FloatArray, zeta: FloatArray) -> FloatArray:
+def _dispersion(
+    frequency: FloatArray, ratio: FloatArray, count: int, f: FloatArray, zeta: FloatArray
+) -> FloatArray:
     """Return the variance of the residual within two half-power bandwidths over that of noise."""
-    off = np.abs(residual.frequency - f[:, None])
-    near = (off < 2 * (zeta * f)[:, None]) & (residual.periodogram != 1.0)
-    squares = residual.count * (residual.periodogram - 1.0) ** 2
+    near = np.abs(frequency - f[:, None]) < 2 * (zeta * f)[:, None]
     n = near.sum(axis=1)
+    squares = count * (ratio - 1.0) ** 2
     return np.where(n >= constants.LEAST_ORDINATES, near @ squares / n.clip(1), np.nan)
 
 
@@ -734,9 +730,12 @@ def masked_ordinates(data: ClusterData) -> list[tuple[int, int]]:
 def read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
     """Read a line within some ordinates of the longest observation, in its strongest channel."""
     spectrum = data.spectra.spectra[data.longest]
-    c = int(np.argmax(_powers(spectrum)[first:last].sum(axis=0)))
-    frequency, amplitude = spectrum.channel(c).sine(first, last)
-    return LineEstimate(data.spectra.channels[c], frequency, amplitude * float(data.unit[c]))
+    powers = spectrum.powers()[first:last]
+    c = int(np.argmax(powers.sum(axis=0)))
+    frequency = float(spectrum.frequency[first + int(np.argmax(powers[:, c]))])
+    # Σ I = A² T / 2 over the ordinates of a sine.
+    amplitude = float(np.sqrt(2 * powers[:, c].sum() / spectrum.duration) * data.unit[c])
+    return LineEstimate(data.spectra.channels[c], frequency, amplitude)
 
 
 def _outside(modes: Modes, i: int, target: Target, band: FloatArray) -> Rejection | None:

@@ -13,7 +13,7 @@ from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection
-from lmshealth.signal.spectra import CrossSpectrum, Spectrum
+from lmshealth.signal.spectra import CrossSpectrum
 
 
 class LineEstimate(NamedTuple):
@@ -41,8 +41,6 @@ class ClusterModes:
     modes: Modes  # with shapes over the channels that show any of them
     clarity: FloatArray  # loss of log likelihood without each, the others fixed, (n_modes,)
     lines: tuple[LineEstimate, ...]  # excluded from the fit
-    # ordinates of the longest observation over their expectation, mean over channels
-    residual: Spectrum
     fitted: FittedSpectrum
 
     @property

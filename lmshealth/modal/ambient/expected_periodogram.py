@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
-from lmshealth.signal.spectra import CrossSpectrum, Spectrum
+from lmshealth.signal.spectra import CrossSpectrum
 
 # Half-power bandwidths times duration below which the expected periodogram replaces the density,
 # per segment: the bias of many is common, and their scatter smaller.
@@ -59,21 +59,21 @@ class Kernel:
 
 
 def make_kernel(
-    spectrum: Spectrum | CrossSpectrum, keep: BoolArray, finer: int, margin: int
+    frequency: FloatArray, duration: float, keep: BoolArray, finer: int, margin: int
 ) -> Kernel:
-    """Prepare the expected periodogram of some ordinates of a spectrum.
+    """Prepare the expected periodogram of some Fourier frequencies of a record.
 
-    ``keep`` selects ordinates, shape ``(n_ordinates,)``; the grid has ``finer`` frequencies per
-    Fourier frequency and ends ``margin`` Fourier frequencies outside the band.
+    In Hz and s; ``keep`` selects ordinates, shape ``(n_ordinates,)``; the grid has ``finer``
+    frequencies per Fourier frequency and ends ``margin`` Fourier frequencies outside the band.
     """
-    first, last = np.rint(spectrum.frequency[[0, -1]] * spectrum.duration).astype(int).tolist()
+    first, last = np.rint(frequency[[0, -1]] * duration).astype(int).tolist()
     index = np.arange(max((first - margin) * finer, 1), (last + margin) * finer)
     size = 2 * fft.next_fast_len(index.size)
     # Even about its centre: its transform is real.
     off = np.minimum(np.arange(size), size - np.arange(size))
     transform = fft.fft(np.sinc(off / finer) ** 2).real
     kernel = Kernel(
-        grid=index / (finer * spectrum.duration),
+        grid=index / (finer * duration),
         place=np.arange(first, last + 1)[keep] * finer - index[0],
         transform=transform,
         norm=np.ones(int(keep.sum())),
@@ -127,7 +127,7 @@ def average_ordinates(
     n_segments = sum(spectrum.count for spectrum in spectra)
     if resolution < _RESOLVED * n_segments:
         finer = np.clip(np.ceil(_SAMPLES_PER_BANDWIDTH / resolution), _LEAST_FINER, _MOST_FINER)
-        kernel = make_kernel(first, kept, int(finer), _MARGIN)
+        kernel = make_kernel(first.frequency, first.duration, kept, int(finer), _MARGIN)
         return MeanOrdinates(frequency, total / count[:, None, None], count, kernel, foreign)
     if near is not None:
         # The mean over the r-th part of the half-power bandwidth B is below the peak by the share

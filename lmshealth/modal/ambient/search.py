@@ -9,7 +9,8 @@ search is repeated.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -30,7 +31,7 @@ from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, near_line
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
-from lmshealth.signal.spectra import LogSpectra, SegmentTransforms
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Width of the bins at a resonance in damping ratios, of which the least counts, and the widest as a
@@ -67,17 +68,16 @@ class Found:
 
     def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
         """Return the spectra from low to high Hz, with the other modes as foreign."""
-        spectra = tuple(s.band(low, high) for s in self.spectra.spectra)
-        cut = replace(self.spectra, spectra=spectra)
+        cut = self.spectra.each(lambda spectrum: spectrum.band(low, high))
         others = ~np.isin(self.model.f, [target.frequency for target in near])
         if not others.any():
             return cut
-        return cut.with_foreign(lambda frequency: self.model.modal(others, frequency))
+        expected = partial(self.model.modal, others)
+        return cut.each(lambda spectrum: spectrum.with_foreign(expected))
 
 
 def search(
     spectra: LogSpectra,
-    recording: SegmentTransforms,
     low: float,
     high: float,
     lines: Sequence[float] = (),
@@ -85,16 +85,15 @@ def search(
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    ``recording`` is the longest segment, to recognise harmonics. Lines are masked in both. There
-    may be further ones where ``suspected``. Channels that no common modes explain are left out.
+    Lines are masked in the spectra. There may be further ones where ``suspected``. Channels that no
+    common modes explain are left out.
     """
     every = spectra.channels
     while True:
-        model, harmonics, after, poles = _explain(spectra, recording, low, high, suspected)
+        model, harmonics, after, poles = _explain(spectra, low, high, suspected)
         kept = _consistent(model)
         if len(kept) == len(spectra.channels):
             break
-        recording = recording._replace(transforms=recording.transforms[:, kept])
         spectra = spectra.select(kept)
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
@@ -116,13 +115,13 @@ def search(
 
 def _explain(
     spectra: LogSpectra,
-    recording: SegmentTransforms,
     low: float,
     high: float,
     suspected: Sequence[float],
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
+    recording = spectra.longest
     while True:
         stable, poles = find_candidates(spectra, low, high)
         candidates = [
@@ -135,9 +134,11 @@ def _explain(
             return model, tuple(harmonics), spectra, poles
         harmonics.append(harmonic)
         if len(spectra.channels) == 1:
-            spectra = spectra.without_band(harmonic.low, harmonic.high)
+            spectra = spectra.each(
+                partial(CrossSpectrum.without_band, low=harmonic.low, high=harmonic.high)
+            )
         else:
-            spectra = spectra.with_foreign(harmonic.expected)
+            spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=harmonic.expected))
 
 
 def _consistent(model: JointModel) -> list[int]:

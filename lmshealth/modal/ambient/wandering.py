@@ -18,7 +18,7 @@ from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import JointModel
 from lmshealth.signal.constants import LINE_WIDTH
-from lmshealth.signal.spectra import SegmentTransforms
+from lmshealth.signal.spectra import CrossSpectrum
 
 # Half widths of the filter, and the widest search for its edges, as fractions of the frequency.
 _WIDTHS = (0.015, 0.03)
@@ -52,14 +52,14 @@ class Harmonic:
 
 def find_harmonic(
     model: JointModel,
-    recording: SegmentTransforms,
+    recording: CrossSpectrum,
     known: Sequence[Harmonic] = (),
     lines: Sequence[float] = (),
 ) -> Harmonic | None:
     """Return the clearest harmonic that wanders among the modes; None if there is none.
 
-    Lines that Thomson's test found are masked in the recording. Less evidence is needed in the
-    bands of known harmonics, whose direction may vary, and at other lines, in Hz.
+    They are recognised in the first segment of the recording, without its lines. Less evidence is
+    needed in the bands of known harmonics, whose direction may vary, and at other lines, in Hz.
     """
     at_line = near_lines(model.f, model.zeta, lines)
     found = [
@@ -81,7 +81,7 @@ def near_lines(f: FloatArray, zeta: FloatArray, lines: Sequence[float]) -> BoolA
     return np.asarray((apart < LINE_WIDTH + zeta[:, None]).any(axis=1))
 
 
-def _test(model: JointModel, i: int, recording: SegmentTransforms) -> tuple[float, Harmonic] | None:
+def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, Harmonic] | None:
     """Return by how many standard deviations the amplitude is too constant for noise."""
     f0 = model.f[i]
     shape = model.phi / np.linalg.norm(model.phi, axis=0)
@@ -98,7 +98,9 @@ def _test(model: JointModel, i: int, recording: SegmentTransforms) -> tuple[floa
     if frequency.size < _LEAST_ORDINATES:
         return None
     weights = np.stack([np.interp(frequency, model.data.frequency, w) for w in weight.T], axis=1)
-    z = np.sum(weights.conj() * recording.transforms[first:last] / model.data.scale, axis=1)
+    assert recording.transforms is not None  # spectra of logs have them
+    transforms = recording.transforms[0, first:last] * recording.free[first:last, None]
+    z = np.sum(weights.conj() * transforms / model.data.scale, axis=1)
     noise = np.interp(frequency, model.data.frequency, 1 / precision)
     width = int(0.5 * model.zeta[i] * f0 * recording.duration) | 1
     width = min(max(5, width), (z.size - 1) | 1)

@@ -17,6 +17,7 @@ README.md of this folder derives the model; `marginalise` integrates the nuisanc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property, lru_cache
 from itertools import product
@@ -265,50 +266,39 @@ class Likelihood:
 
         The search ends below the decrement ``arrived``.
         """
-        # The optimiser evaluates value, gradient and Hessian in an order of its own, and returns to
-        # the point before where a step was too long.
-        points = lru_cache(maxsize=1)(lambda raw: self._at(np.frombuffer(raw)))
 
-        @lru_cache(maxsize=1)
-        def both(raw: bytes) -> tuple[FloatArray, FloatArray]:
+        @lru_cache(maxsize=2)  # the point of a step, and the one before, to which it may return
+        def at(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
             p = np.frombuffer(raw)
-            try:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    slope, curvature = self.derivatives(p, points(raw))
-            except np.linalg.LinAlgError:
-                curvature = np.array(np.nan)
-            if np.isfinite(curvature).all() and np.isfinite(slope).all():
-                return slope, curvature
+            points = self._at(p)
+            slope, curvature = np.full(p.size, np.nan), np.eye(p.size)
+            with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
+                slope, curvature = self.derivatives(p, points)
+            if np.isfinite(slope).all() and np.isfinite(curvature).all():
+                return self.value(p, points), slope, curvature
             # Overflow far away: the optimiser takes derivatives before it sees that the value is
             # infinite and refuses the step.
-            return np.full(p.size, np.nan), np.eye(p.size)
+            return np.inf, np.full(p.size, np.nan), np.eye(p.size)
 
-        def value(p: FloatArray) -> float:
-            slope, _ = both(p.tobytes())
-            return self.value(p, points(p.tobytes())) if np.isfinite(slope).all() else np.inf
-
-        def gradient(p: FloatArray) -> FloatArray:
-            return both(p.tobytes())[0]
+        def value(p: FloatArray) -> tuple[float, FloatArray]:
+            return at(p.tobytes())[:2]
 
         def hessian(p: FloatArray) -> FloatArray:
-            return both(p.tobytes())[1]
+            return at(p.tobytes())[2]
 
         steps = iter(range(1, 1000))
 
         def check(intermediate_result: OptimizeResult) -> None:
             near = arrived if next(steps) < _MANY_STEPS else _NEARLY
-            slope, curvature = both(intermediate_result.x.tobytes())
-            try:
-                decrement = float(slope @ cho_solve(cho_factor(curvature), slope))
-            except np.linalg.LinAlgError:
-                return  # no minimum near
-            if decrement < near:
-                raise StopIteration
+            _, slope, curvature = at(intermediate_result.x.tobytes())
+            with suppress(np.linalg.LinAlgError):  # no minimum near
+                if float(slope @ cho_solve(cho_factor(curvature), slope)) < near:
+                    raise StopIteration
 
         found = minimize(
             value,
             start,
-            jac=gradient,
+            jac=True,
             hess=hessian,
             method="trust-exact",
             callback=check,

@@ -44,12 +44,68 @@ _ROUGH = 0.02
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Optimum:
-    """Maximum of the likelihood."""
+class DecayFit:
+    """Poles of the decays in a band, at the maximum of the likelihood."""
 
+    likelihood: TransientLikelihood
     p: FloatArray  # (n_parameters,)
     at: Evaluation
-    decrement: float  # gain in log likelihood that the last step predicted
+
+    @property
+    def frequency(self) -> FloatArray:
+        """Natural frequencies in Hz, shape ``(n_modes,)``."""
+        return np.exp(self.p[: self.likelihood.n_modes])
+
+    @property
+    def damping_ratio(self) -> FloatArray:
+        """Damping ratios, shape ``(n_modes,)``."""
+        m = self.likelihood.n_modes
+        return np.exp(self.p[m : 2 * m])
+
+    def is_line(self) -> BoolArray:
+        """Return which modes do not decay over the record, shape ``(n_modes,)``."""
+        m, p = self.likelihood.n_modes, self.p
+        return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
+
+    def sizes(self, mode: int) -> list[ComplexArray]:
+        """Return the complex size of a mode's transient, per block ``(n_channels, n_segments)``."""
+        k = 2 * (mode - self.likelihood.n_modes)  # columns of the modes are the last ones
+        return [fit.sizes[:, k] + 1j * fit.sizes[:, k + 1] for fit in self.at.fits]
+
+    def white_level(self) -> FloatArray:
+        """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
+        m, n = self.likelihood.n_modes, self.likelihood.n_channels
+        return np.exp(self.p[3 * m : 3 * m + n])
+
+    def snr(self, mode: int) -> FloatArray:
+        """Return the largest mean ordinate of a mode's decays over the noise, ``(n_channels,)``.
+
+        It corresponds to S / (4 ζ² S_e) of an ambient response.
+        """
+        block, size = self.likelihood.blocks[0], self.sizes(mode)[0]
+        own = slice(mode, mode + 1)
+        top = np.abs(transient(block, self.frequency[own], self.damping_ratio[own])).max()
+        n_samples = block.sample_rate * block.duration
+        mean = np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2
+        return np.asarray(mean / self.white_level())
+
+    def excitation(self, mode: int, level: float) -> float:
+        """Return the mean square of a vibration at the stops over that of the ambient response.
+
+        ``level`` is the ambient response h of the mode.
+        """
+        f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
+        exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
+        shape = self.likelihood.shapes[mode]
+        squares = []
+        for block, size in zip(self.likelihood.blocks, self.sizes(mode), strict=True):
+            start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
+            # Projection on the mode's shape, every channel in units of its noise.
+            along = (shape / self.white_level()) @ start / (shape**2 / self.white_level()).sum()
+            squares.append(np.abs(along) ** 2)
+        # Twice the variance π f S / (4 ζ) of the response to a force of density S.
+        ambient = np.pi * f / (2 * zeta) * level**2 / self.likelihood.units[mode]
+        return float(np.mean(np.concatenate(squares)) / ambient)
 
 
 def maximise(
@@ -58,17 +114,16 @@ def maximise(
     free: IntArray,
     *,
     tolerance: float = _STEP_TOLERANCE,
-) -> Optimum:
+) -> DecayFit:
     """Maximise over the free parameters by quasi-Newton steps from the Fisher information.
 
     The search ends where a step gains less than ``tolerance`` in log likelihood.
     """
     at = likelihood.evaluate(p)
-    metric, fresh, decrement = likelihood.metric(at), True, np.inf
+    metric, fresh = likelihood.metric(at), True
     for _ in range(_MOST_STEPS):
         step = _step(metric, at.gradient, likelihood.movable(p, at.gradient, free))
-        decrement = float(-at.gradient @ step) / 2
-        if decrement < tolerance:
+        if -at.gradient @ step / 2 < tolerance:
             break
         reach = likelihood.reach(p)
         moved = _shorten(likelihood, p, np.clip(step, -reach, reach), at)
@@ -83,7 +138,7 @@ def maximise(
         if seen >= 1e-2 * expected:  # the update of Broyden, Fletcher, Goldfarb and Shanno
             metric = metric - np.outer(along, along) / expected + np.outer(change, change) / seen
         p, at = moved
-    return Optimum(p, at, decrement)
+    return DecayFit(likelihood, p, at)
 
 
 def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArray:
@@ -135,7 +190,7 @@ def average_ambient(
     weights, most = softmax(weight), int(np.argmax(weight))
     inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
     # The Hessian is costly: its ratio to the Fisher information is that of the best level.
-    wide = np.linalg.cholesky(invert(likelihood, levels[most], free))
+    wide = np.linalg.cholesky(invert(levels[most], free))
     stretch = wide @ np.linalg.inv(np.linalg.cholesky(inverses[most]))
     where = np.array([level.p for level in levels])
     mean = weights @ where
@@ -146,13 +201,13 @@ def average_ambient(
 
 def _average_levels(
     likelihood: TransientLikelihood, p: FloatArray, place: int, free: IntArray, step: float
-) -> tuple[FloatArray, list[Optimum]]:
+) -> tuple[FloatArray, list[DecayFit]]:
     """Maximise at levels in both directions from a first one, until they are unlikely.
 
     Returns the log posterior of each level on a log grid, the other parameters integrated, and the
     maximum at each level.
     """
-    found: list[tuple[float, Optimum]] = []
+    found: list[tuple[float, DecayFit]] = []
     for way in (1, -1):
         at = p.copy()
         if way < 0:
@@ -172,13 +227,13 @@ def _average_levels(
     return np.array([weight for weight, _ in kept]), [level for _, level in kept]
 
 
-def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) -> FloatArray:
+def invert(found: DecayFit, free: IntArray) -> FloatArray:
     """Invert the Hessian, or the Fisher information where that has no inverse.
 
     Returns the covariance of the free parameters, shape ``(n_free, n_free)``.
     """
-    p = optimum.p
-    scale, reach = 1 / np.sqrt(np.diag(likelihood.metric(optimum.at))), likelihood.reach(p)
+    likelihood, p = found.likelihood, found.p
+    scale, reach = 1 / np.sqrt(np.diag(likelihood.metric(found.at))), likelihood.reach(p)
     rows = []  # differences of the gradient
     for j in free:
         step = np.zeros(p.size)
@@ -188,72 +243,8 @@ def invert(likelihood: TransientLikelihood, optimum: Optimum, free: IntArray) ->
     try:
         factor = np.linalg.cholesky(np.add(rows, np.transpose(rows)) / 2)
     except np.linalg.LinAlgError:
-        factor = np.linalg.cholesky(optimum.at.fisher[np.ix_(free, free)])
+        factor = np.linalg.cholesky(found.at.fisher[np.ix_(free, free)])
     return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class DecayFit:
-    """Poles of the decays in a band, at the maximum of the likelihood."""
-
-    likelihood: TransientLikelihood
-    optimum: Optimum
-
-    @property
-    def frequency(self) -> FloatArray:
-        """Natural frequencies in Hz, shape ``(n_modes,)``."""
-        return np.exp(self.optimum.p[: self.likelihood.n_modes])
-
-    @property
-    def damping_ratio(self) -> FloatArray:
-        """Damping ratios, shape ``(n_modes,)``."""
-        m = self.likelihood.n_modes
-        return np.exp(self.optimum.p[m : 2 * m])
-
-    def is_line(self) -> BoolArray:
-        """Return which modes do not decay over the record, shape ``(n_modes,)``."""
-        m, p = self.likelihood.n_modes, self.optimum.p
-        return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
-
-    def sizes(self, mode: int) -> list[ComplexArray]:
-        """Return the complex size of a mode's transient, per block ``(n_channels, n_segments)``."""
-        k = 2 * (mode - self.likelihood.n_modes)  # columns of the modes are the last ones
-        return [fit.sizes[:, k] + 1j * fit.sizes[:, k + 1] for fit in self.optimum.at.fits]
-
-    def white_level(self) -> FloatArray:
-        """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
-        m, n = self.likelihood.n_modes, self.likelihood.n_channels
-        return np.exp(self.optimum.p[3 * m : 3 * m + n])
-
-    def snr(self, mode: int) -> FloatArray:
-        """Return the largest mean ordinate of a mode's decays over the noise, ``(n_channels,)``.
-
-        It corresponds to S / (4 ζ² S_e) of an ambient response.
-        """
-        block, size = self.likelihood.blocks[0], self.sizes(mode)[0]
-        own = slice(mode, mode + 1)
-        top = np.abs(transient(block, self.frequency[own], self.damping_ratio[own])).max()
-        n_samples = block.sample_rate * block.duration
-        mean = np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2
-        return np.asarray(mean / self.white_level())
-
-    def excitation(self, mode: int, level: float) -> float:
-        """Return the mean square of a vibration at the stops over that of the ambient response.
-
-        ``level`` is the ambient response h of the mode.
-        """
-        f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
-        exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
-        shape = self.likelihood.shapes[mode]
-        squares = []
-        for block, size in zip(self.likelihood.blocks, self.sizes(mode), strict=True):
-            start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
-            # Projection on the mode's shape, every channel in units of its noise.
-            along = (shape / self.white_level()) @ start / (shape**2 / self.white_level()).sum()
-            squares.append(np.abs(along) ** 2)
-        # Twice the variance π f S / (4 ζ) of the response to a force of density S.
-        ambient = np.pi * f / (2 * zeta) * level**2 / self.likelihood.units[mode]
-        return float(np.mean(np.concatenate(squares)) / ambient)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -277,7 +268,7 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
     levels = np.log(np.mean(medians, axis=0) / np.log(2))
     likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
     start = np.concatenate([levels, np.zeros(n)])
-    found = DecayFit(likelihood, maximise(likelihood, start, np.arange(2 * n)))
+    found = maximise(likelihood, start, np.arange(2 * n))
     sizes = [block.ordinates.shape for block in blocks]
     # All ordinates constrain a pole and its ambient response; those of a segment its sizes.
     total = sum(2 * s * k * n for s, k, _ in sizes)
@@ -285,7 +276,7 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
     needed = 1.5 * np.log(total) + own / 2 + constants.DECAY_EVIDENCE_MARGIN
     while found.likelihood.n_modes < constants.DECAY_MOST_POLES:
         more = _add_pole(found, *_best_pole(found))
-        gain = found.optimum.at.profile - more.optimum.at.profile
+        gain = found.at.profile - more.at.profile
         if gain < needed:
             break
         found = more
@@ -300,7 +291,7 @@ def _best_pole(found: DecayFit) -> tuple[float, float]:
     f, zeta = (values.ravel() for values in np.meshgrid(grid, _DAMPINGS))
     gain = np.zeros(f.size)
     for block in found.likelihood.blocks:
-        density = found.likelihood.density(block, found.optimum.p)
+        density = found.likelihood.density(block, found.p)
         known = [block.base, transient(block, found.frequency, found.damping_ratio)]
         tried = transient(block, f, zeta)
         for c in range(density.shape[1]):
@@ -319,29 +310,29 @@ def _best_pole(found: DecayFit) -> tuple[float, float]:
 def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
     """Fit one more pole, first without its ambient response, then with the shape of its decays."""
     before, m = found.likelihood, found.likelihood.n_modes
-    start = np.insert(found.optimum.p, [m, 2 * m, 3 * m], [np.log(f), np.log(zeta), 0.0])
+    start = np.insert(found.p, [m, 2 * m, 3 * m], [np.log(f), np.log(zeta), 0.0])
     size = max(block.duration for block in before.blocks)
     unit = unit_level(f, zeta, size, displacement=before.displacement)
     shapes, units = np.vstack([before.shapes, np.ones(before.n_channels)]), [*before.units, unit]
     likelihood = replace(before, shapes=shapes, units=np.array(units))
     without, start = np.delete(np.arange(start.size), 3 * m + 2), likelihood.clip(start)
-    first = DecayFit(likelihood, maximise(likelihood, start, without, tolerance=_ROUGH))
+    first = maximise(likelihood, start, without, tolerance=_ROUGH)
     # The real shape that its decays have in common.
     scale, sizes = np.sqrt(first.white_level()), np.concatenate(first.sizes(m), axis=1)
     seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
     shape = np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale
     likelihood = replace(likelihood, shapes=np.vstack([before.shapes, shape]))
-    start = first.optimum.p + 0.0
+    start = first.p + 0.0
     start[3 * m + 2] = _FIRST_LEVEL
     free = np.arange(start.size)
-    return DecayFit(likelihood, maximise(likelihood, start, free, tolerance=_ROUGH))
+    return maximise(likelihood, start, free, tolerance=_ROUGH)
 
 
 def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstimate:
     """Estimate modes of a band, by default all, averaged over their ambient responses."""
     likelihood, m = found.likelihood, found.likelihood.n_modes
     modes = range(m) if modes is None else modes
-    p = found.optimum.p.copy()
+    p = found.p.copy()
     at_bound = m + np.flatnonzero(found.is_line())
     free = np.setdiff1d(np.arange(p.size), [*range(2 * m, 3 * m), *at_bound])
     averages = []
@@ -352,7 +343,7 @@ def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstima
     own = paired(modes, m)
     n = len(modes)
     inverse = np.zeros((p.size, p.size))
-    inverse[np.ix_(free, free)] = invert(likelihood, maximise(likelihood, p, free), free)
+    inverse[np.ix_(free, free)] = invert(maximise(likelihood, p, free), free)
     joint = inverse[np.ix_(own, own)]
     mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
     for k, (average, cov) in enumerate(averages):
@@ -374,7 +365,7 @@ def stationarity(found: DecayFit) -> float:
     """
     n = found.likelihood.n_channels
     seen, expected, variance = np.zeros((3, 2))  # of the products, real and imaginary
-    for fit in found.optimum.at.fits:
+    for fit in found.at.fits:
         n_rows, n_segments = fit.residual.shape
         for k, turn in enumerate((1.0, -1j)):
             moved = _neighbours(fit.removed, n, turn)

@@ -16,9 +16,18 @@ from lmshealth.modal.ambient.cluster_fit import (
     locate,
 )
 from lmshealth.modal.targets import Target
-from lmshealth.signal.segments import Segment
-from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, Spectrum, periodogram
-from tests.signals import Mode, accelerations, density, make_log, sine, white
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
+from tests.signals import (
+    Mode,
+    Spectrum,
+    accelerations,
+    cut_band,
+    density,
+    make_log,
+    periodogram,
+    sine,
+    white,
+)
 
 RATE = 1000.0
 
@@ -26,7 +35,7 @@ RATE = 1000.0
 def spectra(values: np.ndarray) -> tuple:  # type: ignore[type-arg]
     """Transform a channel."""
     (channel,) = make_log({"acc_a": values}, RATE).channels
-    return (periodogram(channel, Segment(0, values.size, float("nan")), RATE),)
+    return (periodogram(channel, RATE),)
 
 
 def joined(*channels: BinnedSpectra) -> BinnedSpectra:
@@ -41,7 +50,6 @@ def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> 
             s.frequency,
             s.periodogram[:, None, None] + 0j,
             s.duration,
-            s.velocity,
             np.ones(s.frequency.size, dtype=bool),
             (),
             s.count,
@@ -78,8 +86,8 @@ def test_bins_read_the_density_from_means_too(count: int) -> None:
     """Bins of single segments and means over parts estimate the density, each with its weight."""
     rng, n = np.random.default_rng(3), 40_000
     frequency = np.arange(1, n + 1) / n * 500.0
-    single = Spectrum(frequency, 3.0 * rng.exponential(size=n), n / 500.0, 0.1)
-    mean = Spectrum(frequency, 3.0 * rng.gamma(count, 1 / count, size=n), n / 500.0, 0.1, count)
+    single = Spectrum(frequency, 3.0 * rng.exponential(size=n), n / 500.0)
+    mean = Spectrum(frequency, 3.0 * rng.gamma(count, 1 / count, size=n), n / 500.0, count)
     for spectra_, weight in (((mean,), count), ((single, mean), count + 1)):
         bins = binned(spectra_, 0.0, 600.0, 1.0)
         assert bins.count.sum() == weight * n
@@ -96,7 +104,7 @@ def test_a_line_does_not_move_the_bins() -> None:
     clean, dirty = (binned(spectra(v), 100, 200, 2.0) for v in (values, lined))
     assert (dirty.level / clean.level).max() < 2
     # Negative control: a mean would be moved tenfold.
-    ordinates = spectra(lined)[0].band(149, 151).periodogram
+    ordinates = cut_band(spectra(lined)[0], 149, 151).periodogram
     assert ordinates.mean() > 10
 
 

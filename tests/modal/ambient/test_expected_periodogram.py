@@ -15,8 +15,6 @@ from lmshealth.modal.ambient.expected_periodogram import (
     make_kernel,
 )
 from lmshealth.modal.ambient.whittle import Likelihood
-from lmshealth.signal.segments import Segment
-from lmshealth.signal.spectra import Spectrum, periodogram
 from tests.bands import (
     MODES,
     block_of,
@@ -29,7 +27,7 @@ from tests.bands import (
     scatter_free,
     spectrum_of,
 )
-from tests.signals import Mode, accelerations, density
+from tests.signals import Mode, Spectrum, accelerations, cut_band, density, periodogram
 
 
 @pytest.mark.slow
@@ -169,15 +167,13 @@ def kernel_of(
     frequency: np.ndarray, duration: float, *, margin: int = 60, keep: np.ndarray | None = None
 ) -> Kernel:
     """Prepare the expectation of all ordinates, eight samples of the density each."""
-    spectrum = Spectrum(frequency.copy(), np.ones(frequency.size), duration, float("nan"))
     keep = np.ones(frequency.size, dtype=bool) if keep is None else keep
-    return make_kernel(spectrum, keep, 8, margin)
+    return make_kernel(frequency, duration, keep, 8, margin)
 
 
 def whole(values: np.ndarray) -> Spectrum:
     """Transform a record."""
-    segment = Segment(0, values.size, float("nan"))
-    return periodogram(Channel("x", "acceleration", values), segment, RATE)
+    return periodogram(Channel("x", "acceleration", values), RATE)
 
 
 def autocovariance(mode: Mode, noise: float, n: int) -> np.ndarray:
@@ -211,7 +207,8 @@ def test_short_records_average_to_the_expected_periodogram() -> None:
     mode, noise, n, n_records = Mode(100.0, 0.01), 0.5, 4000, 400
     rng = np.random.default_rng(8)
     spectra = [
-        whole(accelerations(rng, [mode], n, RATE, noise)[0]).band(90, 110) for _ in range(n_records)
+        cut_band(whole(accelerations(rng, [mode], n, RATE, noise)[0]), 90, 110)
+        for _ in range(n_records)
     ]
     mean = np.mean([spectrum.periodogram for spectrum in spectra], axis=0)
     frequency, duration = spectra[0].frequency, spectra[0].duration
@@ -262,8 +259,7 @@ def test_the_transform_is_as_exact_as_the_sum(
     """Near a resonance a million times above the floor both agree to 10⁻⁹, with gaps."""
     frequency = np.arange(low, high) / duration
     keep = np.random.default_rng(1).random(frequency.size) > 0.1
-    spectrum = Spectrum(frequency, np.ones(frequency.size), duration, float("nan"))
-    kernel = make_kernel(spectrum, keep, finer, 20)
+    kernel = make_kernel(frequency, duration, keep, finer, 20)
     weights = np.sinc(duration * (frequency[keep][:, None] - kernel.grid)) ** 2
     values = density([Mode(100.0, 0.002)], kernel.grid, 0.05)
     naive = weights @ values / weights.sum(axis=1)

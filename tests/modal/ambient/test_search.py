@@ -9,7 +9,7 @@ from lmshealth import identify
 from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import find_harmonic
 from lmshealth.modal.ambient.whittle import response
-from lmshealth.signal.spectra import SegmentTransforms
+from lmshealth.signal.spectra import CrossSpectrum
 from studies.blind_modes.worlds import FAMILIES, World, log_of
 
 RATE, SECONDS = 128.0, 300.0
@@ -71,7 +71,8 @@ def test_a_constant_amplitude_distinguishes_a_harmonic_from_a_mode(harmonic: boo
     poles = np.array([20.0]), np.array([0.01])
     model = JointModel(data, floor, *poles, phi, np.zeros_like(phi), np.eye(1)).refined(6)
     free = np.ones(FREQUENCY.size, dtype=bool)
-    recording = SegmentTransforms(FREQUENCY, transforms, SECONDS, free, ())
+    matrix = transforms[:, :, None] * transforms[:, None].conj()
+    recording = CrossSpectrum(FREQUENCY, matrix, SECONDS, free, transforms=transforms[None].copy())
     found = find_harmonic(model, recording)
     assert (found is not None) == harmonic
     if found is not None:
