@@ -466,11 +466,11 @@ def _annotate(
         name = spell(modes.names[k] or "unnamed")
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
     sought = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
-    for at in sought.values():
+    place = panels[-1].get_xaxis_transform()
+    for declared in sought.values():
         style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
-        if band[0] <= at <= band[1]:
-            place = panels[-1].get_xaxis_transform()
-            panels[-1].plot(at, 0, "^", transform=place, label="declared frequency", **style)
+        if band[0] <= declared <= band[1]:
+            panels[-1].plot(declared, 0, "^", transform=place, label="declared frequency", **style)
     for refusal in modes.refused:
         at = refusal.frequency or sought.get(refusal.mode)
         if at is not None and band[0] <= at <= band[1]:

@@ -293,7 +293,7 @@ def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, f
         size = spectra_size(latest.spectra, latest.modes)
         found["latest"] = partial(plot, stage=stage, before=before), size
     if latest.shapes is not None and (size := shapes_size(latest.shapes, stage))[1]:
-        earlier = before and before.shapes
+        earlier = before.shapes if before is not None else None
         found["shapes"] = (
             partial(plot_shapes, shapes=latest.shapes, stage=stage, before=earlier),
             size,
