@@ -111,7 +111,7 @@ def frequencies(duration: float) -> np.ndarray:
 def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpectrum:
     """Wrap matrices of all frequencies of the band."""
     f = frequencies(duration)
-    return CrossSpectrum(f, matrix, duration, np.ones(f.size, dtype=bool), (), count)
+    return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
 
 
 def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> MeanOrdinates:

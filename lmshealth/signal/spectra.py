@@ -34,6 +34,7 @@ class CrossSpectrum:
     # shape ``(n_ordinates, n_channels, n_channels)``.
     matrix: ComplexArray
     duration: float  # of a segment in s
+    velocity: float  # set velocity in m/s, NaN where unknown
     free: BoolArray  # ordinates without a removed or masked line, shape ``(n_ordinates,)``
     # Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     lines: tuple[tuple[int, float, float], ...] = ()
@@ -222,7 +223,8 @@ def transform_segment(
         for one in sinusoids
     )
     matrix = rest[:, :, None] * rest[:, None].conj()
-    return CrossSpectrum(frequency, matrix, duration, free, lines, transforms=rest[None])
+    velocity = segment.velocity
+    return CrossSpectrum(frequency, matrix, duration, velocity, free, lines, transforms=rest[None])
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:

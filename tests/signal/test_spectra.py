@@ -195,7 +195,7 @@ def test_the_diagonal_holds_the_periodograms_of_the_channels() -> None:
     rng, n = np.random.default_rng(14), 8000
     values = {"acc_a": rng.normal(size=n), "acc_b": rng.normal(size=n) + np.linspace(0, 9, n)}
     (found,) = transform(values, [Segment(0, n, 0.3)])
-    assert (found.duration, found.count) == (n / RATE, 1)
+    assert (found.duration, found.velocity, found.count) == (n / RATE, 0.3, 1)
     for index, name in enumerate(values):
         alone, own = whole(values[name]), of_channel(found, index)
         np.testing.assert_array_equal(own.frequency, alone.frequency)
@@ -257,7 +257,7 @@ def test_long_parts_of_one_velocity_are_averaged_and_short_ones_are_not() -> Non
     values = {"acc_a": np.random.default_rng(17).normal(size=4 * n)}
     parts = [Segment(k * n, (k + 1) * n, v) for k, v in enumerate((0.2, -0.2, 0.4, 0.2))]
     pooled, fast = transform(values, parts, ceiling=400.0)
-    assert (pooled.count, fast.count) == (3, 1)
+    assert (pooled.count, fast.count, fast.velocity) == (3, 1, 0.4)
     assert pooled.observed == 3 * n / RATE
     single = [transform(values, [part], ceiling=400.0)[0] for part in parts]
     mean = (single[0].matrix + single[1].matrix + single[3].matrix) / 3
@@ -303,7 +303,7 @@ def test_a_line_in_one_part_of_a_mean_is_masked_in_the_mean() -> None:
 def test_cross_spectrum_refuses_arrays_that_differ_in_length() -> None:
     """Frequencies without matrices are no spectrum."""
     with pytest.raises(ValueError, match="has shape"):
-        CrossSpectrum(np.arange(3.0), np.zeros((4, 1, 1)) + 0j, 1.0, np.ones(3, dtype=bool))
+        CrossSpectrum(np.arange(3.0), np.zeros((4, 1, 1)) + 0j, 1.0, 0.0, np.ones(3, dtype=bool))
 
 
 # Means over segments

@@ -435,7 +435,7 @@ def spectrum(
             x[k, channel] += size
         matrix += x[:, :, None] * x[:, None].conj() / count
     free = np.ones(frequency.size, dtype=bool)
-    return CrossSpectrum(frequency, matrix, SECONDS, free, (), count)
+    return CrossSpectrum(frequency, matrix, SECONDS, 0.2, free, (), count)
 
 
 def band_of(*spectra: CrossSpectrum) -> ClusterData:

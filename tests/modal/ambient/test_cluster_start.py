@@ -50,6 +50,7 @@ def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> 
             s.frequency,
             s.periodogram[:, None, None] + 0j,
             s.duration,
+            float("nan"),
             np.ones(s.frequency.size, dtype=bool),
             (),
             s.count,
