@@ -443,24 +443,24 @@ def draw(result: Result, what: str = "", ax: Axes | None = None) -> Axes:
         raise BadQuestion(f"{result.title()}: nothing is called {what!r}; there are {names}")
     style: Any = _STYLE | {"axes.facecolor": PAPER}
     # The first figure starts the backend, whose settings must outlast those of this one.
-    figure = None if ax else pyplot.figure(figsize=SIZE, layout="constrained")
+    figure = ax.figure if ax else pyplot.figure(figsize=SIZE, layout="constrained")
     with matplotlib.rc_context(style):
-        ax = figure.add_subplot() if figure else ax
+        axes = ax or figure.add_subplot()
         match result:
             case Log():
-                return plot_log(ax, result, what)
+                return plot_log(axes, result, what)
             case Modes():
-                return plot_modes(ax, result)
+                return plot_modes(axes, result)
             case History():
-                return plot_frequencies(ax, result, None, what or names[0])
+                return plot_frequencies(axes, result, None, what or names[0])
             case Track():
-                return plot_track(ax, result, what or names[0])
+                return plot_track(axes, result, what or names[0])
             case Health():
-                return plot_health(ax, result, what or names[0], None)
+                return plot_health(axes, result, what or names[0], None)
             case Prognosis() if what not in ("", "any"):
-                return plot_life(ax, result, what)
+                return plot_life(axes, result, what)
             case Prognosis():
-                return plot_survival(ax, result)
+                return plot_survival(axes, result)
     raise TypeError(f"a {type(result).__name__} has no plot")
 
 

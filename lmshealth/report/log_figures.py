@@ -472,12 +472,12 @@ def _annotate(
         if band[0] <= declared <= band[1]:
             panels[-1].plot(declared, 0, "^", transform=place, label="declared frequency", **style)
     for refusal in modes.refused:
-        at = refusal.frequency or sought.get(refusal.mode)
-        if at is not None and band[0] <= at <= band[1]:
+        refused = refusal.frequency or sought.get(refusal.mode)
+        if refused is not None and band[0] <= refused <= band[1]:
             style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
-                ax.axvline(at, **style, label="refused, or not found")
-            labels.append((at, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
+                ax.axvline(refused, **style, label="refused, or not found")
+            labels.append((refused, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
     panels[-1].set_xlabel("frequency in Hz")
     panels[-1].set_xlim(*band)
     if band[1] > WIDE * band[0] > 0:
