@@ -40,11 +40,12 @@ log
 # %%
 axes = log.plot()
 _ = axes.set_xlim(0, 400)
+
 # %% [markdown]
-# The picture shows the power spectral density of both accelerations. The peaks between 120 and 160
-# Hz are three modes in which the platform turns on its guide: roll, pitch and yaw. Their
-# frequencies fall when the guide or the mount becomes softer. The description `lms-y` states where
-# to look for them.
+# The picture shows the power spectral density of both accelerations. Narrow peaks at multiples of
+# 50 Hz are the mains. The peaks between 120 and 160 Hz are three modes in which the platform turns
+# on its guide: roll, pitch and yaw. Their frequencies fall when the guide or the mount becomes
+# softer. The description `lms-y` states where to look for them.
 
 # %%
 stage = lh.load_stage("lms-y")
@@ -64,11 +65,14 @@ found = lh.analyse(logs, stage, epochs=6)
 found
 
 # %%
-_ = found.track.plot("pitch")
+axes = found.history.plot("pitch")
+_ = found.track.plot("pitch", ax=axes)
+found.track
+
 # %% [markdown]
-# Points are the estimates of single logs, bars two standard deviations, the band is the filter. The
-# frequency of pitch falls by six percent, far more than its uncertainty, and the alarm marks the
-# log from which no known influence, such as temperature, explains the change.
+# Points are the estimates of single logs, the line and its band are those of the filter. The
+# frequency of pitch falls by six percent, far more than its uncertainty. The track has an alarm: no
+# known influence, such as temperature, explains the change.
 #
 # ## Health
 
