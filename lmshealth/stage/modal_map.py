@@ -1,14 +1,12 @@
 """Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
 from dataclasses import dataclass
-from functools import reduce
 from io import BytesIO
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
-from numpy.polynomial.chebyshev import chebder, chebvander
-from scipy.linalg import khatri_rao
+from numpy.polynomial.chebyshev import chebder
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth._files import read_table
@@ -147,8 +145,13 @@ def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
 
 
 def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
-    rows = (chebvander(x, degree).T for x, degree in zip(unit.T, degrees, strict=True))
-    return np.asarray(reduce(khatri_rao, rows).T)
+    """Return products of Chebyshev polynomials at points, a column for each set of degrees."""
+    angle = np.arccos(np.clip(unit, -1.0, 1.0))  # rounding may leave the range
+    each = np.cos(angle[:, :, None] * np.arange(max(degrees) + 1))
+    basis = np.ones((len(unit), 1))
+    for j, degree in enumerate(degrees):
+        basis = (basis[:, :, None] * each[:, j, None, : degree + 1]).reshape(len(unit), -1)
+    return basis
 
 
 def _choose_degrees(

@@ -281,7 +281,7 @@ def update(
     off = value - bank.mean @ matrix.T
     centre, cov = mixture(bank.weight, off, total)
     standardised = centre / np.sqrt(cov.diagonal())
-    found = [_condition(bank, crossed, off, total)]
+    found = [condition(bank, crossed, off, total)]
     mode, own = model.mode_of[rows], errors.diagonal(axis1=1, axis2=2)
     wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
     hypotheses = _outliers(mode, standardised) if outliers else []
@@ -289,7 +289,7 @@ def update(
         wider = total.copy()
         more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
         _diagonal(wider, slice(0, value.size))[:] += np.where(outlying, more, 0.0)
-        other = _condition(bank, crossed, off, wider)
+        other = condition(bank, crossed, off, wider)
         found.append(replace(other, log_weight=other.log_weight + np.log(chance)))
     updated, share = _merged(found)
     masks = np.array([rows for rows, _, _ in hypotheses], dtype=float).reshape(-1, value.size)
@@ -318,7 +318,7 @@ def _outliers(mode: np.ndarray, standardised: FloatArray) -> list[tuple[BoolArra
     return found
 
 
-def _condition(
+def condition(
     bank: FilterBank, crossed: FloatArray, off: FloatArray, total: FloatArray
 ) -> FilterBank:
     """Update filters by innovations of a covariance; `crossed` is that with the state."""

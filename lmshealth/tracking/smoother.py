@@ -3,7 +3,6 @@
 from dataclasses import dataclass
 
 import numpy as np
-from filterpy.kalman import KalmanFilter
 
 from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
@@ -11,6 +10,7 @@ from lmshealth.tracking.filter_bank import (
     FilterBank,
     FilterModel,
     Hyperparameters,
+    condition,
     initial,
     predict,
     update,
@@ -23,6 +23,8 @@ from lmshealth.tracking.track import Track
 _SHARE = 1e-3
 # Eigenvalues of correlations below this are rounding.
 _SINGULAR = 1e-10
+# Entries of the covariances of all logs that are smoothed at a time: 120 MB in all.
+_MOST_ENTRIES = 7_500_000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -55,13 +57,17 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     share = bank.weight * (1 + variance / (bank.weight @ variance)) / 2
     order = np.argsort(share)
     bank = bank[order[np.cumsum(share[order]) > _SHARE]]
-    weight = bank.weight
-    runs = [smooth_one(model, bank.hyperparameters[[g]], trust) for g in range(weight.size)]
-    mean = np.einsum("g,gki->ki", weight, [run[0] for run in runs])
-    cov = np.einsum("g,gkij->kij", weight, [run[1] for run in runs])
-    for share, (own, _) in zip(weight, runs, strict=True):
-        off = own - mean
-        cov += share * off[:, :, None] * off[:, None, :]
+    weight, means, cov = bank.weight, [], np.zeros((len(trust), space.size, space.size))
+    some = max(1, _MOST_ENTRIES // cov.size)
+    for first in range(0, weight.size, some):
+        part = slice(first, first + some)
+        own, covs = smooth_filters(model, bank.hyperparameters[part], trust)
+        means.append(own)
+        cov += np.einsum("g,kgij->kij", weight[part], covs)
+    each = np.concatenate(means, axis=1)
+    mean = np.einsum("g,kgi->ki", weight, each)
+    off = each - mean[:, None]
+    cov += np.swapaxes(off, 1, 2) @ (weight[:, None] * off)
     contrast = space.drift()
     size = contrast.shape[1]
     drift = mean[:, :size] @ contrast.T
@@ -81,54 +87,56 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     )
 
 
-def smooth_one(
+def smooth_filters(
     model: FilterModel, own: Hyperparameters, trust: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Filter and smooth with one set of hyperparameters: states ``(n, size)`` and covariances.
+    """Filter and smooth: states ``(n_logs, n_filters, size)`` and their covariances.
 
-    `trust`, ``(n, 2 n_series)``, is the probability that an estimate is no outlier: the share of
-    its information that counts.
+    `trust`, ``(n_logs, 2 n_series)``, is the probability that an estimate is no outlier: the share
+    of its information that counts.
     """
-    space = model.space
-    n, size = len(space.history.logs), space.size
-    kalman = KalmanFilter(dim_x=size, dim_z=1)
-    start = initial(model, own)
-    kalman.x, kalman.P = start.mean[0], start.cov[0]
-    means, covs = np.empty((n, size)), np.empty((n, size, size))
-    moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
-    for k in range(n):
-        moves[k], noises[k] = _transition(model, own, k)
-        kalman.predict(F=moves[k], Q=noises[k])
+    space, bank = model.space, initial(model, own)
+    mean, cov = (np.empty((len(trust), *part.shape)) for part in (bank.mean, bank.cov))
+    predicted_mean, predicted_cov = np.empty_like(mean), np.empty_like(cov)
+    for k in range(len(trust)):
+        bank = predict(model, bank, k)
+        predicted_mean[k], predicted_cov[k] = bank.mean, bank.cov
         rows = np.flatnonzero(model.there[k])
         if rows.size:
-            scale = own.scales[0, model.scale_of[rows]] / np.sqrt(trust[k, rows])
-            noise = space.history.cov[k][np.ix_(rows, rows)] * np.outer(scale, scale)
+            scale = own.scales[:, model.scale_of[rows]] / np.sqrt(trust[k, rows])
+            noise = space.history.cov[k][np.ix_(rows, rows)] * scale[:, :, None] * scale[:, None]
             noise += np.diag(model.extra[k, rows])
-            kalman.update(model.values[k, rows], R=noise, H=space.matrix(k)[rows])
-        means[k], covs[k] = kalman.x, kalman.P
-    smoothed = kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
-    return smoothed[0], smoothed[1]
+            matrix = space.matrix(k)[rows]
+            crossed = bank.cov @ matrix.T
+            off = model.values[k, rows] - bank.mean @ matrix.T
+            bank = condition(bank, crossed, off, matrix @ crossed + noise)
+        mean[k], cov[k] = bank.mean, bank.cov
+    for k in range(len(trust) - 2, -1, -1):
+        gain = cov[k] @ _transitions(model, own, k + 1) @ _inverse(predicted_cov[k + 1])
+        mean[k] += (gain @ (mean[k + 1] - predicted_mean[k + 1])[:, :, None])[:, :, 0]
+        cov[k] += gain @ (cov[k + 1] - predicted_cov[k + 1]) @ np.swapaxes(gain, 1, 2)
+    return mean, cov
+
+
+def _transitions(model: FilterModel, own: Hyperparameters, k: int) -> FloatArray:
+    """Return transposed transition matrices into log k: `predict` of unit states."""
+    size, n = model.space.size, len(own.rate_std)
+    unit = FilterBank(
+        own[np.repeat(np.arange(n), size)],
+        np.zeros(n * size),
+        np.tile(np.eye(size), (n, 1)),
+        np.zeros((n * size, size, size)),
+    )
+    return predict(model, unit, k).mean.reshape(n, size, size)
 
 
 def _inverse(cov: FloatArray) -> FloatArray:
-    """Invert a covariance where it is not singular.
+    """Invert covariances, ``(n, size, size)``, where they are not singular.
 
-    An exact copy of ℓ, and steps that are still to come, make it singular. The correlations are
+    An exact copy of ℓ, and steps that are still to come, make them singular. The correlations are
     inverted, because variances of ln ζ are ten orders of magnitude above process noise of ln f.
     """
-    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
-    scale = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+    std = np.sqrt(np.maximum(np.einsum("gii->gi", cov), 0.0))
+    std = np.where(std > 0, std, 1.0)
+    scale = std[:, :, None] * std[:, None]
     return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
-
-
-def _transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[FloatArray, FloatArray]:
-    """Return transition matrix and process noise into log k: `predict` of exactly known states."""
-    size = model.space.size
-    unit = FilterBank(
-        own[np.zeros(size + 1, dtype=int)],
-        np.zeros(size + 1),
-        np.vstack([np.eye(size), np.zeros(size)]),
-        np.zeros((size + 1, size, size)),
-    )
-    unit = predict(model, unit, k)
-    return unit.mean[:-1].T, unit.cov[-1]

@@ -12,6 +12,7 @@ import numpy as np
 
 from lmshealth._serialize import fingerprint
 from lmshealth.batch import run as running
+from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
@@ -60,7 +61,7 @@ def run_with(logs: list[LogEstimates], stage: Stage, store: Store, out: Path) ->
     with processes(1) as pool:
         resources = Resources(store, pool)
         assert not assess_all([machine], resources)
-        running._report([machine], (), resources, out)
+        running._report([machine], (), resources, out, Alerts())
     found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
     assert found is not None and found.prognosis is not None
     return found

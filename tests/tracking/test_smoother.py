@@ -10,7 +10,7 @@ import pytest
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.filter_bank import FilterModel
-from lmshealth.tracking.smoother import smooth, smooth_one
+from lmshealth.tracking.smoother import smooth, smooth_filters
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
 from tests.lives import (
@@ -49,7 +49,8 @@ def test_one_setting_is_the_joint_gaussian_given_all_logs(
     history = awkward_history(np.random.default_rng(1))
     space = StateSpace(history, stage, history.steps)
     model = FilterModel(space, reopened)
-    mean, cov = smooth_one(model, one(wander, model.sources), np.ones(model.values.shape))
+    own, trust = one(wander, model.sources), np.ones(model.values.shape)
+    mean, cov = (found[:, 0] for found in smooth_filters(model, own, trust))
     book = batch(history, wander, replace(KNOWN, reopened=reopened), smoothed=True)
     variance = np.einsum("kpipi->kpi", book.cov)
     std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
