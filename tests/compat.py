@@ -44,8 +44,8 @@ def _environment(version: str, resolution: str) -> str:
     install = [uv, "pip", "install", "--quiet", "--python", str(own), "--resolution", resolution]
     commands = (
         [uv, "venv", "--quiet", "--allow-existing", "--python", python, str(folder)],
-        [*install, *packages, "-e", f"{ROOT}[models,formats]", "pytest", "pytest-xdist",
-         "hypothesis", "pytest-benchmark"],
+        [*install, *packages, "-e", f"{ROOT}[models,formats]", "filterpy", "pytest",
+         "pytest-xdist", "hypothesis", "pytest-benchmark"],
     )  # fmt: skip
     for command in commands:
         if subprocess.run(command, capture_output=True, check=False).returncode:

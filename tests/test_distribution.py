@@ -68,7 +68,7 @@ def test_licences_of_dependencies() -> None:
     """All dependencies have a permissive licence, or are named; a strong copyleft is refused."""
     found: dict[str, Distribution] = {}
     needed("lmshealth", frozenset(EXTRAS), found)
-    assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= set(found)
+    assert {"numpy", "scipy", "pandas", "emcee", "jinja2"} <= set(found)
     licences = {name: licence(one) for name, one in found.items()}
     unstated = {"partd"}  # its licence is a file: BSD-3-Clause
     assert not refused({k: v for k, v in licences.items() if k not in unstated})

@@ -46,7 +46,9 @@ from tests.lives import (
     since,
 )
 from tests.oracles import JUMPS, Known, Wander, binomial_band, filterpy_loop
-from tests.tracking.test_filter_bank import KNOWN, SETTINGS, one
+from tests.tracking.test_filter_bank import KNOWN, SETTINGS, few, one
+
+__all__ = ["few"]  # a fixture
 
 PUBLISHED = (
     "ln_frequency",
@@ -335,6 +337,7 @@ def long_life(seed: int) -> History:
     return replace(history, steps=(retuned,))
 
 
+@pytest.mark.usefixtures("few")
 @pytest.mark.parametrize("n", [150, 179])
 def test_a_track_goes_on_as_from_nothing(
     stage: Stage, monkeypatch: pytest.MonkeyPatch, n: int
