@@ -37,7 +37,8 @@ from tests.assessments import (
     make_track,
     make_waterfall,
 )
-from tests.lives import cut, make_history
+from tests.lives import cut
+from tests.lives import make_history as make_life
 
 
 @pytest.fixture(scope="module")
@@ -379,7 +380,7 @@ def test_hints_of_dense_pictures_are_thinned() -> None:
 def test_figures_of_long_histories_are_as_small_as_of_short_ones() -> None:
     """Of a thousand logs 250 are drawn, the last among them, each as marker, bar and hint."""
     level = np.log(200.0) + 1e-3 * np.sin(np.arange(1000.0))[:, None]
-    own = make_history(level)
+    own = make_life(level)
     text = plots.svg(lambda ax: plots.plot_frequencies(ax, own, None, own.modes[0]), salt="a")
     found = titles(text)
     assert len(found) == 250 and found[-1].startswith(f"{own.logs[-1]}\n")
