@@ -174,6 +174,7 @@ def _fix_layout(figure: Figure) -> None:
 def _fill_figure(ax: Axes) -> None:
     """Place the only Axes of a figure as constrained layout does, mostly in one pass of its two."""
     figure: Any = ax.figure
+    measured: Any = ax.get_tightbbox
     size = figure.bbox.size
     renderer, pad = figure._get_renderer(), _PAD * figure.dpi / size
     ends, before = np.array(_USUAL_ENDS), None
@@ -182,7 +183,7 @@ def _fill_figure(ax: Axes) -> None:
         ticks = [axis.get_majorticklocs().tolist() for axis in (ax.xaxis, ax.yaxis)]
         if ticks == before:
             return
-        box = ax.get_tightbbox(renderer, for_layout_only=True).get_points() / size
+        box = measured(renderer, for_layout_only=True).get_points() / size
         ends, before = ends - box + np.array([pad, 1 - pad]), ticks
 
 
