@@ -37,7 +37,12 @@ from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notices
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
-from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
+from lmshealth.tracking.track import (
+    TrackStart,
+    accepted_estimates,
+    continue_track,
+    outlier_refusals,
+)
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -138,7 +143,11 @@ def _with_results(
     history, stage = made.history, made.stage
     seed = seed_of(made.seed, history.stage, stage.digest)
     try:
-        tracked = track(history, stage)
+        track_key = fingerprint(VERSION, "track", stage.digest)
+        start = unpack_or_none(parts.known.get(track_key), TrackStart)
+        tracked, start = continue_track(history, stage, start)
+        if start is not None:
+            parts.used[track_key] = pack(start)
         doubt = doubt_of_names(stage, history, tracked, readings)
         refused = (*made.refused, *outlier_refusals(history, tracked))
         made = replace(made, track=tracked, refused=refused, doubt=doubt)
@@ -157,8 +166,8 @@ def _with_results(
         made = replace(made, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
         if life is None:
             return made
-        prognosis, evidence, start = next(iter(life))
-        parts.used[life_key] = pack(start)
+        prognosis, evidence, life_start = next(iter(life))
+        parts.used[life_key] = pack(life_start)
         return replace(made, prognosis=prognosis, evidence=evidence)
     except LmshealthError as error:
         why = str(error)

@@ -41,8 +41,8 @@ DRAWS_SHOWN = 1500
 COURSE_POINTS = 24
 # Months of the calendar of services.
 CALENDAR_MONTHS = 12
-# Titles that appear under the pointer, per figure.
-HINTS = 300
+# Points per figure, of logs spaced evenly up to the last: more would cover each other.
+POINTS = 300
 # Epochs with an interval drawn next to a life curve.
 EPOCHS_SHOWN = 20
 # A terminal describes so many machines one by one, and lists so many in a table.

@@ -180,8 +180,9 @@ def hints(ax: Axes, x: FloatArray, y: FloatArray, texts: Sequence[str]) -> None:
 
 
 def _thinned(n: int) -> slice:
-    """Return a slice that selects at most `constants.HINTS` of n points, evenly."""
-    return slice(None, None, -(-n // constants.HINTS) or 1)
+    """Return a slice that selects at most `constants.POINTS` of n points, evenly, and the last."""
+    step = -(-n // constants.POINTS) or 1
+    return slice((n - 1) % step, None, step)
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
@@ -595,7 +596,8 @@ def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> 
 
 def plot_nis(ax: Axes, track: Track) -> Axes:
     """Plot the normalised innovation squared of each epoch with its 95 % chi-square band."""
-    seen = (track.nis_dof > 0) & np.isfinite(track.nis)
+    seen = np.flatnonzero((track.nis_dof > 0) & np.isfinite(track.nis))
+    seen = seen[_thinned(seen.size)]
     x, nis = track.travel[seen] / _KM, track.nis[seen]
     low, high = chi_square_band(track.nis_dof[seen])
     ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label="95 % band")
@@ -603,7 +605,7 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label="inside")
     texts = [
         f"{title(track, k)}\nNIS {value:.1f}; expected {a:.1f} to {b:.1f}"
-        for k, value, a, b in zip(np.flatnonzero(seen).tolist(), nis, low, high, strict=True)
+        for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
     ]
     hints(ax, x, nis, texts)
     if not inside.all():
@@ -660,7 +662,9 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     Changes are in % of the frequency at the covariate's reference, without wear and all other
     known effects. A linear effect has a 95 % band.
     """
-    x, before, after = influence.values, 100 * influence.measured, 100 * influence.corrected
+    some = _thinned(influence.values.size)
+    epochs, x = influence.epochs[some].tolist(), influence.values[some]
+    before, after = 100 * influence.measured[some], 100 * influence.corrected[some]
     grid = np.linspace(float(x.min()), float(x.max()), 60)
     line, std = 100 * influence.explained(grid), influence.explained_std(grid)
     if std is not None:
@@ -673,7 +677,7 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     texts = [
         f"{title(history, k)}\n{name} {value:.4g}{GAP}{unit}\n"
         f"as measured {signed(a, 2)}{GAP}%, corrected {signed(b, 2)}{GAP}%"
-        for k, value, a, b in zip(influence.epochs.tolist(), x, before, after, strict=True)
+        for k, value, a, b in zip(epochs, x, before, after, strict=True)
     ]
     hints(ax, x, before, texts)
     ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
@@ -692,6 +696,7 @@ def _logs(
     """Draw logarithmic estimates ± 2 std in a unit (factor, name); return the top of the bars."""
     std, (per, name) = np.sqrt(history.cov[:, row, row]), unit
     seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
+    seen = seen[_thinned(seen.size)]
     bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
     bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
     texts = [
@@ -711,6 +716,7 @@ def _filtered(
     ax: Axes, travel: FloatArray, level: FloatArray, std: FloatArray, unit: float
 ) -> None:
     """Draw the filtered line with its 95 % band, above the logs."""
+    travel, level, std = (one[_thinned(one.size)] for one in (travel, level, std))
     x, reach = travel / _KM, 1.96 * std
     low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
     ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
@@ -769,7 +775,8 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
 
 def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
     """Mark the spectral lines of every log; each kind has its own marker."""
-    seen = [(line, k) for k, lines in enumerate(waterfall.lines) for line in lines]
+    logs = range(len(waterfall.lines))[_thinned(len(waterfall.lines))]
+    seen = [(line, k) for k in logs for line in waterfall.lines[k]]
     kinds = sorted({line.kind for line, _ in seen})
     for marker, kind in zip(cycle("_x+1|"), kinds, strict=False):
         own = [(line, k) for line, k in seen if line.kind == kind]

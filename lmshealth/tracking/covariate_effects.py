@@ -7,6 +7,7 @@ import numpy as np
 
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
+from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import Regressor, regressors
 from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
@@ -58,14 +59,15 @@ def find_covariate_effects(
     """Return the effect of every described covariate on every mode, without outliers of the track.
 
     The order is that of the description; a covariate that is unknown or never left its reference
-    has no effect.
+    has no effect. In a long history the level is the filtered one.
     """
     columns = regressors(history.covariates, stage, history.recorded_at)
     if not columns:
         return ()
     taken = accepted_estimates(history, track)
     known = {(e.mode, e.covariate): e for e in track.effects}
-    level = smooth(taken, track, stage).ln_frequency
+    short = len(taken.logs) <= constants.MOST_SMOOTHED
+    level = (smooth(taken, track, stage) if short else track).ln_frequency
     moved, mode_of = covariate_shifts(history, track, stage), taken.mode_of()
     rest = taken.ln_frequency - level[:, mode_of] - moved[:, mode_of] - _offsets(taken, known)
     found = []

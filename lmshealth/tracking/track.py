@@ -13,8 +13,9 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth._result import Result
+from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
@@ -279,13 +280,71 @@ def track(history: History, stage: Stage | None = None) -> Track:
     >>> [(event.kind, f"{track.recorded_at[event.epoch]:%d %B}") for event in track.events]
     [('alarm', '05 April')]
     """
+    return continue_track(history, stage)[0]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class TrackStart(ReadOnly):
+    """State after some logs, from which a track goes on when others follow: as in `_Tracker`.
+
+    Arrays have a row for each of these logs, or for those from `kept` on where it says so.
+    """
+
+    key: str  # fingerprint of all that the state depends on
+    n_logs: int
+    kept: int  # log of the bank: the first checkpoint
+    bank: FilterBank
+    first: int
+    steps: tuple[Step, ...]  # detected ones
+    changes: tuple[tuple[Change, int], ...]  # theirs
+    alarms: tuple[Event, ...]
+    alarmed: bool
+    open: Change | None
+    weighed: tuple[int, int]
+    outlying: tuple[tuple[int, tuple[int, ...]], ...]  # logs and their rows
+    sums: FloatArray  # before log `kept`, and after each from it on
+    nis: FloatArray
+    innovations: FloatArray
+    mean: FloatArray
+    variance: FloatArray
+    drift_cov: FloatArray
+    noise_scale: FloatArray
+    widening: FloatArray
+
+
+# Fields of a start with a row per log.
+_PER_LOG = ("nis", "innovations", "mean", "variance", "drift_cov", "noise_scale")
+
+
+def continue_track(
+    history: History, stage: Stage | None, before: TrackStart | None = None
+) -> tuple[Track, TrackStart | None]:
+    """Track a history from the state after its first logs, as `track` does from nothing.
+
+    The result is the same, bit for bit: a state of other logs, or of another model, is not used.
+    Returned is the state after all logs, too; a short history is tracked faster than it is stored.
+    """
     if not np.isfinite(history.ln_frequency).any():
         raise NotEnoughData(
             f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
             "a mode without a name is known once three logs show it"
         )
-    model = FilterModel(StateSpace(history, stage, history.steps))
-    return _Tracker(model).run()
+    space = StateSpace(history, stage, history.steps)
+    tracker = _Tracker(FilterModel(space))
+    if before is not None and before.key == _inputs(space, before.n_logs):
+        tracker.resume(before)
+    found, n = tracker.run(), len(history.logs)
+    return found, tracker.start(_inputs(space, n)) if n >= 2 * N_CHECKPOINTS else None
+
+
+def _inputs(space: StateSpace, n: int) -> str:
+    """Return the fingerprint of all that the first n logs of a track depend on."""
+    if not space.history.baselines[0] < n <= len(space.history.logs):
+        return ""
+    columns = [
+        (one.name, one.prior_std, one.values[:n], one.unknown[:n]) for one in space.regressed
+    ]
+    return fingerprint(VERSION, space.history.first_logs(n), space.size, columns)
 
 
 class _Tracker:
@@ -308,8 +367,10 @@ class _Tracker:
         self.nis, self.innovations = np.zeros(n), np.full((n, n_rows), np.nan)
         self.outlying: dict[int, BoolArray] = {}
         self.sums = np.zeros((n + 1, 2, n_rows + 2))
-        # Published: mean, covariance, noise scales, factor on standard deviations.
-        self.mean, self.cov = np.empty((n, size)), np.empty((n, size, size))
+        # Published: mean, variance, covariance of drifts, noise scales; factor on standard
+        # deviations of the first logs, which later ones do not change any more.
+        self.mean, self.variance = np.empty((n, size)), np.empty((n, size))
+        self.drift_cov = np.empty((n, size // 4, size // 4))
         self.noise_scale = np.empty((n, len(model.sources)))
         self.widening = np.empty(0)
         self.loop_changes = unexplained_loop_changes(self.history.loop_error, model.space.steps)
@@ -320,10 +381,56 @@ class _Tracker:
         # A significant change whose kind is not settled, and the last suspicion that was weighed.
         self.open: Change | None = None
         self.weighed = (-1, -1)
+        self.next = 0  # log that is filtered next
+
+    def resume(self, before: TrackStart) -> None:
+        """Take over a state; the logs after its first checkpoint are filtered again."""
+        n, kept, length = before.n_logs, before.kept, len(self.history.logs)
+        for name in _PER_LOG:
+            getattr(self, name)[:n] = getattr(before, name)
+        self.sums[kept : n + 1], self.widening = before.sums, before.widening
+        every = np.arange(self.innovations.shape[1])
+        self.outlying = {k: np.isin(every, rows) for k, rows in before.outlying}
+        for step in before.steps:
+            own = Step.found(step.kind, step.first, length, step.source)
+            self.model = self.model.with_step(own)
+        steps = self.model.space.steps
+        found = range(len(steps) - len(before.steps), len(steps))
+        self.changes = dict(zip(found, before.changes, strict=True))
+        self.loop_changes = unexplained_loop_changes(self.history.loop_error, steps)
+        self.first, self.open, self.weighed = before.first, before.open, before.weighed
+        self.alarms, self.alarmed = list(before.alarms), before.alarmed
+        self.bank = self.checkpoints[kept] = before.bank
+        for again in range(kept + 1, n):
+            self._filter(again)
+        self.next = n
+
+    def start(self, key: str) -> TrackStart:
+        """Return the state after all logs."""
+        kept = min(self.checkpoints)
+        return TrackStart(
+            key=key,
+            n_logs=len(self.history.logs),
+            kept=kept,
+            bank=self.checkpoints[kept],
+            first=self.first,
+            steps=tuple(step for step in self.model.space.steps if not step.declared),
+            changes=tuple(self.changes.values()),
+            alarms=tuple(self.alarms),
+            alarmed=self.alarmed,
+            open=self.open,
+            weighed=self.weighed,
+            outlying=tuple(
+                (k, tuple(np.flatnonzero(rows).tolist())) for k, rows in self.outlying.items()
+            ),
+            sums=self.sums[kept:].copy(),
+            widening=self.widening,
+            **{name: getattr(self, name).copy() for name in _PER_LOG},
+        )
 
     def run(self) -> Track:
-        """Filter all logs."""
-        for k in range(len(self.history.logs)):
+        """Filter all logs that are left."""
+        for k in range(self.next, len(self.history.logs)):
             if k in self.resets and k:
                 self._begin_regime(self.bank, k, anew=True)
                 self.alarmed = False
@@ -403,7 +510,7 @@ class _Tracker:
             self.changes[len(steps) - 1] = (change, k)
             self.loop_changes = unexplained_loop_changes(self.history.loop_error, steps)
             before = before.padded(self.model.space.size)
-        self._extend_widening(k, self._dof())
+        self.widening = self._widened(k, self._dof())
         self._begin_regime(before, j + 1)
         for again in range(j, k + 1):
             self._filter(again)
@@ -440,7 +547,9 @@ class _Tracker:
                 before = self.checkpoints[first - 1]
                 other, evidence = begun(self.model, self.checkpoints, k, first, before)
                 mean, cov = self._mixed(other, expit(evidence + logit(constants.BEGUN_PROBABILITY)))
-        self.mean[k], self.cov[k] = mean, cov
+        contrast = self.model.space.drift()
+        self.mean[k], self.variance[k] = mean, np.diag(cov)
+        self.drift_cov[k] = contrast @ cov @ contrast.T
         self.noise_scale[k] = self.bank.weight @ self.bank.hyperparameters.scales
 
     def _mixed(self, other: FilterBank, chance: float) -> tuple[FloatArray, FloatArray]:
@@ -458,10 +567,10 @@ class _Tracker:
             there[:, np.r_[own, own + len(history.series)]] &= seen[:, None]
         return np.asarray(there.sum(axis=1), dtype=float)
 
-    def _extend_widening(self, n: int, dof: FloatArray) -> None:
-        """Fix the widening of the first n logs, before some of them are filtered again."""
+    def _widened(self, n: int, dof: FloatArray) -> FloatArray:
+        """Return the widening of the first n logs; it is fixed before logs are filtered again."""
         factor = _widening(self.nis[:n], dof[:n], self.innovations[:n])
-        self.widening = np.append(self.widening, factor[self.widening.size :])
+        return np.append(self.widening, factor[self.widening.size :])
 
     def _undetected(self) -> BoolArray:
         """Mark entries of the state before the first estimate of their mode, (n_logs, 4 m)."""
@@ -472,12 +581,11 @@ class _Tracker:
         return np.hstack([ln_f, ln_f, ln_zeta, ln_f])
 
     def _track(self) -> Track:
-        history, space, mean = self.history, self.model.space, self.mean
-        drift, drift_cov = _drifts(space, mean, self.cov)
+        history, space, mean = self.history, self.model.space, self.mean.copy()
+        drift, drift_cov = _drifts(space, mean, self.drift_cov)
         dof = self._dof()
-        self._extend_widening(len(history.logs), dof)
-        widening = self.widening
-        std = np.sqrt(np.maximum(np.einsum("kii->ki", self.cov), 0.0)) * widening[:, None]
+        widening = self._widened(len(history.logs), dof)
+        std = np.sqrt(np.maximum(self.variance, 0.0)) * widening[:, None]
         undetected = self._undetected()
         mean[undetected], std[undetected] = np.nan, np.nan
         return Track(
@@ -543,11 +651,11 @@ class _Tracker:
         return events
 
 
-def _drifts(space: StateSpace, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _drifts(
+    space: StateSpace, mean: FloatArray, drift_cov: FloatArray
+) -> tuple[FloatArray, FloatArray]:
     """Return the drifts of all epochs, ``(n, m)``, and their covariances; NaN before a baseline."""
-    history, contrast = space.history, space.drift()
-    drift = mean @ contrast.T
-    drift_cov = np.einsum("mi,kij,nj->kmn", contrast, cov, contrast)
+    history, drift, drift_cov = space.history, mean @ space.drift().T, drift_cov.copy()
     early = np.arange(len(history.logs)) < history.baselines[0]
     drift[early], drift_cov[early] = np.nan, np.nan
     # At a baseline, and at its place on the clock until a step, ℓ and ℓ₀ are equal.

@@ -12,6 +12,7 @@ import numpy as np
 
 from lmshealth._serialize import fingerprint
 from lmshealth.batch import run as running
+from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
@@ -49,18 +50,23 @@ def readings(n: int) -> list[LogEstimates]:
     return found
 
 
-def run_with(logs: list[LogEstimates], stage: Stage, store: Store, out: Path) -> Assessment:
-    """Assess the machine with some of its logs, and write its page, as a run does."""
-    keys = []
-    for log in logs:
-        keys.append((log.log, fingerprint("key", log.digest)))
-        found = Identified(log, stage.digest, NAME)
-        store.put_identified([OutcomeRow.of(keys[-1][1], log.digest, found)])
+def run_with(
+    logs: list[LogEstimates], stored: int, stage: Stage, store: Store, out: Path
+) -> Assessment:
+    """Assess the machine with some of its logs, and write its page, as a run does.
+
+    As many of the logs are stored already.
+    """
+    keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
+    store.put_identified(
+        OutcomeRow.of(key, log.digest, Identified(log, stage.digest, NAME))
+        for (_, key), log in zip(keys[stored:], logs[stored:], strict=True)
+    )
     machine = Machine(NAME, tuple(keys), stage, NO_MAINTENANCE, EPOCHS, SEED)
     with processes(1) as pool:
         resources = Resources(store, pool)
         assert not assess_all([machine], resources)
-        running._report([machine], (), resources, out)
+        running._report([machine], (), resources, out, Alerts())
     found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
     assert found is not None and found.prognosis is not None
     return found
@@ -74,9 +80,9 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)
         with closing(Store(f"sqlite:///{out / 'store.sqlite'}")) as store:
-            parts = {"first": logs[:-1], "new": logs, "unchanged": logs}
+            parts = {"first": (logs[:-1], 0), "new": (logs, n - 1), "unchanged": (logs, n)}
             cost = {
-                name: cpu_s(lambda part=part: kept.append(run_with(part, stage, store, out)))
+                name: cpu_s(lambda part=part: kept.append(run_with(*part, stage, store, out)))
                 for name, part in parts.items()
             }
     peak = memory_bytes() / 2**20

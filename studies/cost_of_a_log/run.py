@@ -34,8 +34,8 @@ NOT_MET = {
     ),
     "a first run of 60 logs takes at most 45 s": "40 epochs are drawn, four of which emcee judges",
     "growth with the history": (
-        "association, tracker and page start from nothing, and the likelihood of a life grows with "
-        "its logs until they are condensed"
+        "association starts from nothing, short histories are smoothed for the page, and the "
+        "likelihood of a life grows with its logs until they are condensed"
     ),
     "memory": "the likelihood of a life holds a matrix for each choice of its nuisance terms",
 }

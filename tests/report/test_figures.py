@@ -38,6 +38,7 @@ from tests.assessments import (
     make_waterfall,
 )
 from tests.lives import cut
+from tests.lives import make_history as make_life
 
 
 @pytest.fixture(scope="module")
@@ -366,13 +367,24 @@ def test_hints_contain_the_values_of_points(history: History, track: Track) -> N
 
 
 def test_hints_of_dense_pictures_are_thinned() -> None:
-    """A thousand points have at most `constants.HINTS` hints."""
+    """A thousand points have at most `constants.POINTS` hints, the last among them."""
     x = np.arange(1000.0)
     text = plots.svg(
         lambda ax: plots.hints(ax, x, x, [f"point {k}" for k in range(1000)]), salt="a"
     )
     found = titles(text)
-    assert found[:2] == ["point 0", "point 4"] and len(found) == 250
+    assert found[:2] == ["point 3", "point 7"] and len(found) == 250
+    assert found[-1] == "point 999"
+
+
+def test_figures_of_long_histories_are_as_small_as_of_short_ones() -> None:
+    """Of a thousand logs 250 are drawn, the last among them, each as marker, bar and hint."""
+    level = np.log(200.0) + 1e-3 * np.sin(np.arange(1000.0))[:, None]
+    own = make_life(level)
+    text = plots.svg(lambda ax: plots.plot_frequencies(ax, own, None, own.modes[0]), salt="a")
+    found = titles(text)
+    assert len(found) == 250 and found[-1].startswith(f"{own.logs[-1]}\n")
+    assert text.count("<use") + text.count("<path") < 3 * 250 + 60
 
 
 @pytest.mark.slow
