@@ -81,6 +81,7 @@ def test_settings_are_averaged_by_their_evidence(stage: Stage) -> None:
             float(grid.wander[g]),
             float(grid.wander_keep[g]),
             float(grid.settling[g]),
+            float(grid.wander_common[g]),
         )
         book = batch(history, wander, replace(ALONE, covariates=()), smoothed=True)
         books.append(book)
