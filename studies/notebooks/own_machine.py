@@ -8,7 +8,7 @@
 # multisine for 20 s ([FdiTools](https://github.com/WataruOhnishi/FdiTools), W. Ohnishi, MIT
 # licence). The parameter of health is the stiffness of the coupling. The recording (2.5 MB) is
 # downloaded once and compared with its SHA-256. Run time: a minute on one processor.
-# [studies/new_machine](../studies/new_machine) does the same at the command line, with more
+# [studies/new_machine](../new_machine) does the same at the command line, with more
 # explanations.
 
 # %%
