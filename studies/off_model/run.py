@@ -35,11 +35,16 @@ from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.track import Track, track
-from studies.harness.claims import Claim, counted, number
+from studies.harness.claims import Claim, Older, counted, number
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import COURSES, DISTURBANCES, MODES, Array, life_of
 
 STEP = "track"
+OLDER = {
+    "result": Older(
+        "32e0e778f0a2", "wander could be common to all modes, and disturbances last for logs"
+    )
+}
 
 LIVES, QUICK_LIVES = 100, 2
 LOSING = ", losing 5 %"
