@@ -161,7 +161,8 @@ def attack(folder: Path, base: Columns, url: str, password: str, _kind: str, *, 
         "every machine is told as it is named": sorted({*machines} ^ {*reported}),
         "every reaching log is refused": sorted({*refused} - lost),
         "pages have names of their own": guards.bad_names(names)
-        + ([] if len(names) == len(machines) + 1 else [f"{len(names)} pages"]),
+        # Beside those of machines the one of all, and the examples.
+        + ([] if len(names) == len(machines) + 2 else [f"{len(names)} pages"]),
         "no command is run": [str(p) for p in folder.rglob(hostile.MARK)],
         "links are replaced and not followed": [str(link) for link in links if link.is_symlink()],
         "the exit status is that of refused logs": []

@@ -200,6 +200,7 @@ def displacements(quick: bool) -> tuple[dict[str, Check], Row]:
 
 def sampled(rng: np.random.Generator, n: int) -> tuple[dict[str, Check], Row]:
     """Read one long record of noise: Parseval's identity, mean, variance and distribution."""
+    n = 3 ** int(np.log(n) / np.log(3))  # odd, and of a length to which no long record is cut
     x = rng.standard_normal(n) * np.sqrt(LEVEL * RATE / 2)
     whole = spectrum(x)
     t = np.arange(n) - (n - 1) / 2

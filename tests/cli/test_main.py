@@ -10,6 +10,7 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+import tomllib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -849,14 +850,15 @@ def test_a_store_that_cannot_be_opened_is_status_1(
     assert len(result.stderr.splitlines()) == 1
 
 
-def test_a_bad_description_is_status_1_with_one_line(folder: Path, tmp_path: Path) -> None:
-    """A typing slip in a description is named."""
+def test_a_bad_description_is_status_1_with_what_to_copy(folder: Path, tmp_path: Path) -> None:
+    """A typing slip in a description is named with the key most like it, and a whole table shown."""
     bad = tmp_path / "bad.toml"
     bad.write_text('name = "x"\n[[mode]]\nname = "roll"\nfrequenzy_hz = 3\ndamping_ratio = 0.1\n')
     result = call("modes", folder / "good" / "log-00.h5", "--stage", bad)
     assert result.exit_code == 1
-    assert "frequenzy_hz" in result.stderr
-    assert len(result.stderr.splitlines()) == 1
+    assert "frequenzy_hz" in result.stderr and "most like it is frequency_hz" in result.stderr
+    _, block = result.stderr.split("To copy and edit:")
+    assert set(tomllib.loads(block)["mode"][0]) == {"name", "frequency_hz", "damping_ratio"}
 
 
 # report
