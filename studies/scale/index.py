@@ -132,7 +132,7 @@ def measure(paths: Mapping[str, Path], repeats: int) -> dict[str, dict[str, floa
 def main() -> None:
     """Run the study, or a small form of it."""
     study = Study(__file__, __doc__)
-    n, repeats = (300, 1) if study.quick else (1000, 15)
+    n, repeats = (300, 5) if study.quick else (1000, 15)
     with tempfile.TemporaryDirectory() as folder:
         pages = measure(write_pages(Path(folder), n), repeats)
     page, control, plain = pages["page"], pages["all laid out"], pages["bare"]

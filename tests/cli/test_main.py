@@ -851,7 +851,7 @@ def test_a_store_that_cannot_be_opened_is_status_1(
 
 
 def test_a_bad_description_is_status_1_with_what_to_copy(folder: Path, tmp_path: Path) -> None:
-    """A typing slip in a description is named with the key most like it, and a whole table shown."""
+    """A typing slip in a description is named with the key most like it and a whole table."""
     bad = tmp_path / "bad.toml"
     bad.write_text('name = "x"\n[[mode]]\nname = "roll"\nfrequenzy_hz = 3\ndamping_ratio = 0.1\n')
     result = call("modes", folder / "good" / "log-00.h5", "--stage", bad)
