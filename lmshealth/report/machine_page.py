@@ -21,8 +21,7 @@ from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
 from lmshealth.prognosis.maintenance_decision import Service, day_after, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, Summary, first_limit, limit_of
-from lmshealth.report.changes import changes
+from lmshealth.report.assessment import Assessment, Summary, changes, first_limit, limit_of
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.notices import notices
 from lmshealth.report.rendering import render

@@ -51,7 +51,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     for k in range(len(history.logs)):
         bank, found = update(model, predict(model, bank, k), k, before=last)
         trust[k, found.rows], bank = np.maximum(1 - found.outlying, _SINGULAR), bank.pruned()
-        last = np.isin(np.arange(trust.shape[1]), found.rows[found.outlying > 0.5])
+        last = np.isin(np.arange(model.mode_of.size), found.rows[found.outlying > 0.5])
     # An improbable filter may be as wide as to count.
     variance = np.einsum("gii->g", bank.cov[:, space.level, space.level])
     share = bank.weight * (1 + variance / (bank.weight @ variance)) / 2

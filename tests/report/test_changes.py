@@ -12,8 +12,14 @@ import pytest
 
 from lmshealth._serialize import pack, unpack
 from lmshealth.prognosis.maintenance_decision import Service
-from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, Summary, summarise
-from lmshealth.report.changes import changes
+from lmshealth.report.assessment import (
+    Life,
+    LimitLife,
+    ParameterHealth,
+    Summary,
+    changes,
+    summarise,
+)
 from lmshealth.stage.description import ParameterSpec, load_stage
 from lmshealth.stage.priors import Lognormal
 from tests.assessments import nothing, worn
