@@ -46,7 +46,6 @@ class Wander:
     size: float = 0.0
     keep: float = 0.0
     settling: float = 0.0
-    common: float = COMMON_WANDER
 
     def settled(self, history: History) -> FloatArray:
         """Give the variance by which ln f has settled up to each log, since every baseline anew."""
@@ -202,7 +201,7 @@ class Textbook:
         rates, wanders = self.all("rate"), self.all("wander")
         cov[np.ix_(rates, rates)] = self.wander.rate**2 * _alike(COMMON_RATE, m)
         std = self.wander.stds(history)
-        cov[np.ix_(wanders, wanders)] = np.outer(std, std) * _alike(self.wander.common, m)
+        cov[np.ix_(wanders, wanders)] = np.outer(std, std) * _alike(COMMON_WANDER, m)
         return x, cov
 
     def all(self, part: str) -> list[int]:
@@ -233,7 +232,7 @@ class Textbook:
             keep = wander.keep if np.isfinite(history.ln_frequency[k]).any() else 1.0
             std = (1 - keep**2) * np.outer(wander.stds(history), wander.stds(history))
             f[own, own] = keep
-            q[np.ix_(own, own)] = std * _alike(wander.common, m)
+            q[np.ix_(own, own)] = std * _alike(COMMON_WANDER, m)
         q += self._begun(k)
         if k in history.baselines:
             copy = np.eye(len(at))
@@ -388,7 +387,7 @@ def _between(
         for c, j in enumerate(mode_of):
             if i != j:
                 own[:, 0, i, :, 0, j] = cross[:, 0, i, :, 0, c] = shared
-            alike = std[i] * std[j] * (1.0 if i == j else wander.common) * kept
+            alike = std[i] * std[j] * (1.0 if i == j else COMMON_WANDER) * kept
             for a in np.flatnonzero(mode_of == i):
                 total[:, 0, a, :, 0, c] = alike + (shared if i != j else 0.0)
 

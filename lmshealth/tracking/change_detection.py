@@ -83,30 +83,24 @@ class Change:
     @property
     def significant(self) -> bool:
         """Whether no change is rejected at the declared false-alarm probability."""
-        return self.log_bayes_factor >= threshold(1.0)
+        return self.log_bayes_factor >= threshold(1)
 
     def settled(self, now: int) -> bool:
-        """Return whether its kind is clear, or no more logs are waited for.
-
-        A change of the machine is not, while one disturbance may have made all logs that show it.
-        """
+        """Return whether its kind is clear, or no more logs are waited for."""
         # A step that is in the model raises no alarm any more.
         clear = self.damage if self.kind == "step" else self.log_odds >= constants.KIND_LOG_ODDS
-        n_after = now - self.first
-        if self.kind in ("step", "drift") and n_after < constants.DISTURBED_LOGS:
-            return False
-        return clear or n_after >= constants.KIND_PATIENCE
+        return clear or now - self.first >= constants.KIND_PATIENCE
 
     @property
     def damage(self) -> bool:
         """Whether it is damage, and other kinds are rejected at the declared probability."""
-        least = threshold(constants.CHANGE_SHARE)
+        least = threshold()
         return self.kind in ("step", "drift") and min(self.log_bayes_factor, self.log_odds) >= least
 
 
-def threshold(share: float) -> float:
-    """Return the log Bayes factor that raises an alarm by a route with this share of all alarms."""
-    return -float(np.log(share * constants.FALSE_ALARM_PROBABILITY))
+def threshold(routes: int = constants.ALARM_ROUTES) -> float:
+    """Return the log Bayes factor that raises an alarm that may come by so many routes."""
+    return float(np.log(routes / constants.FALSE_ALARM_PROBABILITY))
 
 
 def weigh_changes(

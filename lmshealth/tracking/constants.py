@@ -8,16 +8,11 @@ import numpy as np
 
 # --- Alarms and change detection ----------------------------------------------------------------
 # Probability that a machine without damage ever raises an alarm, however many logs are judged. A
-# log Bayes factor of -ln(share of its route times probability) is required (Ville's inequality
-# [Ville1939]). It is no setting: the rates of alarms and detections in studies/tracking_lives hold
-# for this value only.
+# log Bayes factor of ln(routes / probability) is required (Ville's inequality [Ville1939]). It is
+# no setting: the rates of alarms and detections in studies/tracking_lives hold for this value only.
 FALSE_ALARM_PROBABILITY = 0.01
-# Shares of its routes: drift since the baseline, and each of drift that begins later and of a step.
-# Slow drift has most: its log Bayes factor grows by some tenths a log, that of a step by several.
-DRIFT_SHARE, CHANGE_SHARE = 0.7, 0.15
-# Logs in a row that one disturbance may change (a load, a loose sensor, the wrong machine): what no
-# later log confirms is no change of the machine.
-DISTURBED_LOGS = 3
+# An alarm has three routes: drift since the baseline, drift that begins later, and a step.
+ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
@@ -42,9 +37,6 @@ LOOP_LOGS, LOOP_FEWEST, LOOP_P_VALUE = 12, 3, 0.01
 # this factor more than stated, or as widely as the priors below. Modes whose standardised
 # innovations are inside the gate are no candidates: their odds would be below 1:10.
 OUTLIER_PROBABILITY, OUTLIER_SCALE, OUTLIER_GATE = 0.02, 6.0, 2.5
-# Probability that the modes that were outliers in one log are so in the next: a disturbance lasts
-# two logs on average.
-OUTLIER_PERSISTENCE = 0.5
 # Published standard deviations are widened once the innovations are less probable than this.
 WIDENING_P_VALUE = 5e-4
 # Below these p-values a filter is not consistent: overconfident, or too cautious. The second is
@@ -108,15 +100,12 @@ SOURCE_NOISE_SCALES = (
 # Combinations of scales of several sources that are less probable are left out.
 LEAST_SCALES_PROBABILITY = 1e-3
 # Wander of ln f from log to log that is no wear: size in errors of the estimates, correlation
-# length in logs, probability.
+# length in logs, probability; and the share of its variance that all modes have in common.
 WANDERS = (
     (0.0, 0.0, 0.7),
     *((size, logs, 0.3 / 9) for size in (0.7, 2.0, 5.0) for logs in (2.0, 6.0, 20.0)),
 )
-# Shares of its variance that all modes have in common, with probabilities. Causes outside the
-# machine (air, foundation, load) move all modes together, as damage does: were little in common for
-# sure, motion in common would count as evidence of damage.
-WANDER_COMMON = ((0.3, 0.5), (0.95, 0.5))
+WANDER_COMMON = 0.3
 MOST_SCALED_SOURCES = 3
 
 # --- Association: gates --------------------------------------------------------------------------

@@ -36,7 +36,6 @@ class Hyperparameters(Rows):
     rate_decay: FloatArray  # by which a rate decays exponentially, per life, ``(n,)``
     wander: FloatArray  # size of the wander in scaled errors of the first estimates, ``(n,)``
     wander_keep: FloatArray  # its correlation from one log to the next, ``(n,)``
-    wander_common: FloatArray  # share of its variance that all modes have in common, ``(n,)``
     settling: FloatArray  # of the random walk of ln f that ends after a few logs, ``(n,)``
 
     @property
@@ -47,7 +46,7 @@ class Hyperparameters(Rows):
     @property
     def disturbance(self) -> FloatArray:
         """Noise scales and wander of each set: of a machine, whatever regime it is in."""
-        return np.column_stack([self.scales, self.wander, self.wander_keep, self.wander_common])
+        return np.column_stack([self.scales, self.wander, self.wander_keep])
 
 
 def hyperparameter_grid(n_sources: int) -> Hyperparameters:
@@ -67,16 +66,13 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
     for course, scales, wander in product(courses, _scales(n_sources), constants.WANDERS):
         size, logs, p = wander
         keep = np.exp(-1 / logs) if logs else 0.0
-        for common, q in constants.WANDER_COMMON if size else ((0.0, 1.0),):
-            weight = course[5] * prod(chance for _, chance in scales) * p * q
-            rows.append((*course[:5], size, keep, common, weight, *(scale for scale, _ in scales)))
+        weight = course[5] * prod(chance for _, chance in scales) * p
+        rows.append((*course[:5], size, keep, weight, *(scale for scale, _ in scales)))
     table = np.array(rows)
-    prior = table[:, 8] / table[:, 8].sum()
-    walk, rate, drive, decay, settling, size, keep, common = table[:, :8].T
-    noise = table[:, 9:]
-    return Hyperparameters(
-        walk, rate, drive, noise, np.log(prior), decay, size, keep, common, settling
-    )
+    prior = table[:, 7] / table[:, 7].sum()
+    walk, rate, drive, decay, settling, size, keep = table[:, :7].T
+    noise = table[:, 8:]
+    return Hyperparameters(walk, rate, drive, noise, np.log(prior), decay, size, keep, settling)
 
 
 def _scales(n_sources: int) -> list[tuple[tuple[float, float], ...]]:
@@ -172,13 +168,13 @@ class FilterModel:
         self.extra = np.zeros((len(history.logs), 2 * r))
         for regressor in space.regressed:
             self.extra[:, :r] += regressor.unknown[:, None]
-        # Wander is in units of the errors of each mode's first estimate.
+        # Covariance of a wander as large as the errors of each mode's first estimate.
         std = np.zeros(space.n_modes)
         for i, mode in enumerate(history.modes):
             variance = np.einsum("kii->ki", history.cov)[:, history.columns(mode)]
             first = variance[np.isfinite(variance)][:1]
             std[i] = np.sqrt(first[0]) if first.size else 0.0
-        self.wander_std = std
+        self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
 
     def with_step(self, step: Step) -> Self:
@@ -202,10 +198,7 @@ def initial(model: FilterModel, grid: Hyperparameters | None = None) -> FilterBa
 def _wander_cov(model: FilterModel, own: Hyperparameters) -> FloatArray:
     """Return the stationary covariance of the wander, ``(n, n_modes, n_modes)``."""
     size = own.wander * np.exp(np.log(own.scales).mean(axis=1))
-    own_share = (1 - own.wander_common)[:, None, None] * np.eye(model.wander_std.size)
-    size = size[:, None] * model.wander_std
-    correlation = own.wander_common[:, None, None] + own_share
-    return np.asarray(size[:, :, None] * size[:, None, :] * correlation)
+    return np.asarray(size[:, None, None] ** 2 * model.wander_cov)
 
 
 def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
@@ -265,18 +258,12 @@ def _begin_step(space: StateSpace, cov: FloatArray, step: Step, j: int) -> None:
 
 
 def update(
-    model: FilterModel,
-    bank: FilterBank,
-    k: int,
-    *,
-    outliers: bool = True,
-    before: BoolArray | None = None,
+    model: FilterModel, bank: FilterBank, k: int, *, outliers: bool = True
 ) -> tuple[FilterBank, Innovation]:
     """Update filters that are predicted to log k with its estimates; nothing is pruned.
 
     Where innovations are large, the estimates of a mode or of all modes may be outliers: every
-    filter is the mixture of these hypotheses, reduced to its mean and covariance. `before` are the
-    rows that were outliers in the log before, ``(2 n_series,)``: a disturbance may go on.
+    filter is the mixture of these hypotheses, reduced to its mean and covariance.
     """
     rows: np.ndarray = np.flatnonzero(model.there[k])
     space = model.space
@@ -297,8 +284,7 @@ def update(
     found = [_condition(bank, crossed, off, total)]
     mode, own = model.mode_of[rows], errors.diagonal(axis1=1, axis2=2)
     wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
-    again = np.array([], dtype=int) if before is None else np.unique(model.mode_of[before])
-    hypotheses = _outliers(mode, standardised, again) if outliers else []
+    hypotheses = _outliers(mode, standardised) if outliers else []
     for outlying, chance, gross in hypotheses:
         wider = total.copy()
         more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
@@ -314,14 +300,11 @@ def update(
     return updated, Innovation(rows, standardised, outlying, nis)
 
 
-def _outliers(
-    mode: np.ndarray, standardised: FloatArray, again: np.ndarray
-) -> list[tuple[BoolArray, float, bool]]:
+def _outliers(mode: np.ndarray, standardised: FloatArray) -> list[tuple[BoolArray, float, bool]]:
     """List hypotheses of outliers: rows, prior probability, and whether they are gross errors.
 
     They are nested: the mode with the largest innovation, the two largest, up to the whole log,
-    which may be that of another machine. ``again`` are the modes that were outliers in the log
-    before.
+    which may be that of another machine.
     """
     modes = np.unique(mode)
     worst = np.array([np.abs(standardised[mode == m]).max() for m in modes])
@@ -331,8 +314,6 @@ def _outliers(
     for i in range(1, int(np.sum(worst > constants.OUTLIER_GATE)) + 1):
         rows = np.isin(mode, order[:i])
         share = chance if i == modes.size else chance**i
-        if np.array_equal(np.sort(order[:i]), again):
-            share = constants.OUTLIER_PERSISTENCE
         found += [(rows, share, False), (rows, share, True)]
     return found
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly
+from lmshealth._arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.filter_bank import (
     FilterBank,
@@ -47,11 +47,9 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     begun = {step.first for step in followed.steps if step.kind == "reset" or not step.declared}
     model = FilterModel(space, begun - {0})
     bank, trust = initial(model), np.ones(model.values.shape)
-    last: BoolArray | None = None
     for k in range(len(history.logs)):
-        bank, found = update(model, predict(model, bank, k), k, before=last)
+        bank, found = update(model, predict(model, bank, k), k)
         trust[k, found.rows], bank = np.maximum(1 - found.outlying, _SINGULAR), bank.pruned()
-        last = np.isin(np.arange(model.mode_of.size), found.rows[found.outlying > 0.5])
     # An improbable filter may be as wide as to count.
     variance = np.einsum("gii->g", bank.cov[:, space.level, space.level])
     share = bank.weight * (1 + variance / (bank.weight @ variance)) / 2

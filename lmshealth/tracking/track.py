@@ -452,8 +452,7 @@ class _Tracker:
         before = [self.outlying.get(k - j, np.zeros(0, bool)) for j in (1, 2, 3)]
         stays = all(rows.size for rows in before) and bool(np.logical_and.reduce(before).any())
         predicted = predict(self.model, self.bank, k)
-        last = before[0] if before[0].size else None
-        bank, found = update(self.model, predicted, k, outliers=not stays, before=last)
+        bank, found = update(self.model, predicted, k, outliers=not stays)
         most = constants.MOST_INNOVATION
         self.sums[k + 1] = add_to_sums(
             self.sums[k], found.rows, np.clip(found.standardised, -most, most)
@@ -486,12 +485,12 @@ class _Tracker:
                     self.open = change
                 elif self._adopt(change, k):
                     return
-        # A few logs that deviate may be disturbed or the first after a step, and an open change
+        # A single log that deviates may be an outlier or the first after a step, and an open change
         # need not be damage: later logs decide.
         waiting = self.open is not None and not self.open.settled(k)
         evidence = self.bank.log_bayes_factor()
-        lone = suspected is not None and k - suspected <= constants.DISTURBED_LOGS
-        if evidence >= threshold(constants.DRIFT_SHARE) and not waiting and not lone:
+        lone = suspected is not None and k - suspected <= 1
+        if evidence >= threshold() and not waiting and not lone:
             self._alarm(k, evidence)
 
     def _adopt(self, change: Change, k: int) -> bool:

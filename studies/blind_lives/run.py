@@ -47,15 +47,10 @@ from studies.blind_lives.estimated import blind_life
 from studies.blind_lives.lives import SEED, BlindPlan, agrees, analyse, plan_of, truth_of
 from studies.common.lives import HEALTHY
 from studies.common.metrics import clopper_pearson
-from studies.harness.claims import Claim, Older, number, share
+from studies.harness.claims import Claim, number, share
 from studies.harness.study import LEVEL, Row, Study, read_record
 
 STEP = "all of it, from raw logs to the report"
-OLDER = {
-    "result": Older(
-        "a3cb74205e78", "wander could be common to all modes, and disturbances last for logs"
-    )
-}
 NAMES = {
     "guide_preload": "preload",
     "mount_stiffness": "mount stiffness",

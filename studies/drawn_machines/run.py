@@ -45,16 +45,11 @@ from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.tracking.track import track
 from studies.common.metrics import clopper_pearson
 from studies.drawn_machines.machines import PARAMETERS, RISK, followed, identified, told
-from studies.harness.claims import Claim, Older, counted, number
+from studies.harness.claims import Claim, counted, number
 from studies.harness.provenance import code_of
 from studies.harness.study import Row, Study, judge_places, judge_scores, share_row
 
 STEP = "health, on machines outside the model"
-OLDER = {
-    "result": Older(
-        "fedf0c98c2ee", "wander could be common to all modes, and disturbances last for logs"
-    )
-}
 
 FIRST_SEED = 1000
 # Machines with all answers, healthy ones, per circumstance, raw, of the control; logs; raw logs.

@@ -38,16 +38,11 @@ from lmshealth.tracking.association import associate
 from lmshealth.tracking.history import History, LogEstimates, build_history
 from lmshealth.tracking.track import track
 from studies.common.histories import START
-from studies.harness.claims import Claim, Older, counted
+from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import Array
 
 STEP = "track"
-OLDER = {
-    "foreign": Older(
-        "eb1a52b12d33", "wander could be common to all modes, and disturbances last for logs"
-    )
-}
 
 
 SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50

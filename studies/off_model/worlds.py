@@ -51,9 +51,6 @@ class World:
     scatter: float = 1.0
     outliers: float = 0.0
     outlier_size: float = 10.0
-    # Mean number of disturbances in a life: three logs in a row, by 8 stated errors of one mode or
-    # of all.
-    bursts: float = 0.0
     student_dof: float = np.inf  # of the errors
     stated: float = 1.0  # factor on the standard deviations that the program states
     # Structure behind the sensor by first order in h, scatter of the sensor and its drift in K over
@@ -104,14 +101,10 @@ DISTURBANCES: dict[str, World] = {
     "wander 3 sd, 2 logs": replace(_QUIET, wander=3.0, wander_logs=2.0),
     "wander 3 sd, 12 logs": replace(_QUIET, wander=3.0, wander_logs=12.0),
     "wander 3 sd, 5 logs, in common": replace(_QUIET, wander=3.0, wander_common=0.9),
-    "wander 3 sd, 20 logs, in common": replace(
-        _QUIET, wander=3.0, wander_logs=20.0, wander_common=0.95
-    ),
     "scatter 4": replace(_QUIET, scatter=4.0),
     "stated 10 times too wide": replace(_QUIET, stated=10.0),
     "stated 10 times too narrow": replace(_QUIET, stated=0.1),
     "outliers 5 %, 10 sd": replace(_QUIET, outliers=0.05),
-    "disturbed for three logs": replace(_QUIET, bursts=1.5),
     "Student errors of 2.5": replace(_QUIET, student_dof=2.5),
     "lag 1 h": replace(_QUIET, lag_h=1.0, sensor_std=0.5),
     "lag 8 h": replace(_QUIET, lag_h=8.0, sensor_std=0.5),
@@ -279,10 +272,6 @@ def _estimates(
         errors *= np.sqrt(world.student_dof / rng.chisquare(world.student_dof, errors.shape))
     outlying = rng.random((N_LOGS, m)) < world.outliers
     errors[:, :m] = np.where(outlying, world.outlier_size, 1.0) * errors[:, :m]
-    if world.bursts:
-        for first in rng.integers(3, N_LOGS - 3, rng.poisson(world.bursts)).tolist():
-            own = rng.integers(m) if rng.random() < 0.5 else slice(m)
-            errors[first : first + 3, own] += rng.choice([-8.0, 8.0])
     errors = world.scatter * std * errors
     stated = world.stated * std
     values = (LN_F + ln_f + errors[:, :m], LN_ZETA + errors[:, m:])

@@ -18,6 +18,7 @@ from lmshealth.tracking.constants import (
     DAMPING_WALK,
     LOGS_PER_LIFE,
     RATE_COMMON,
+    WANDER_COMMON,
 )
 from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
@@ -145,10 +146,10 @@ def _wander(
 ) -> Array:
     """Draw the wander of both modes about their level, ``(n_logs, n_modes)``."""
     size = float(chosen.wander[0] * np.exp(np.log(chosen.scales[0]).mean())) * std
-    keep, common = float(chosen.wander_keep[0]), float(chosen.wander_common[0])
-    found = [size * _together(rng, common)]
+    keep = float(chosen.wander_keep[0])
+    found = [size * _together(rng, WANDER_COMMON)]
     for there in seen[1:]:
-        new = np.sqrt(1 - keep**2) * size * _together(rng, common)
+        new = np.sqrt(1 - keep**2) * size * _together(rng, WANDER_COMMON)
         found.append(keep * found[-1] + new if there else found[-1])
     return np.array(found)
 

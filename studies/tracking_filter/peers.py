@@ -19,6 +19,7 @@ from lmshealth.tracking.constants import (
     LN_F_STD,
     LN_ZETA_STD,
     LOGS_PER_LIFE,
+    WANDER_COMMON,
 )
 from lmshealth.tracking.covariates import Regressor
 from lmshealth.tracking.filter_bank import Hyperparameters
@@ -61,8 +62,7 @@ def filterpy_loop(
     common = constants.RATE_COMMON
     alike = common + (1 - common) * eye
     std = np.sqrt(np.diag(history.cov[0]))[:m] * setting.wander[0] * setting.scales[0, 0]
-    shared = float(setting.wander_common[0])
-    wander = np.outer(std, std) * (shared + (1 - shared) * eye)
+    wander = np.outer(std, std) * (WANDER_COMMON + (1 - WANDER_COMMON) * eye)
     kalman.P[rate, rate], kalman.P[own, own] = setting.rate_std[0] ** 2 * alike, wander
     decay, there = float(setting.rate_decay[0]), np.isfinite(history.ln_frequency).any(axis=1)
     states, covs = np.empty((n, size)), np.empty((n, size, size))
@@ -141,7 +141,7 @@ def one_setting() -> Hyperparameters:
         np.zeros(1),
         np.ones((1, 1)),
         np.zeros(1),
-        *np.zeros((5, 1)),
+        *np.zeros((4, 1)),
     )
 
 

@@ -98,7 +98,7 @@ def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind:
             if event.kind == kind:
                 assert not event.declared
                 assert PLACE < event.found_at <= PLACE + 3
-                assert event.evidence >= threshold(1.0)
+                assert event.evidence >= threshold(1)
                 z.append((event.size - size) / event.std)
     assert np.abs(z).max() < 4
     # Modes of one life are independent of one another.
@@ -171,7 +171,7 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
     assert len(found.alarms) == 1
     alarm = found.alarms[0]
     assert PLACE < alarm.epoch == alarm.found_at < N_LOGS
-    assert alarm.evidence >= threshold(constants.DRIFT_SHARE)
+    assert alarm.evidence >= threshold()
     i = found.modes.index(alarm.mode)
     assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
 
@@ -321,8 +321,8 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
 
 def test_changes_are_significant_at_the_declared_probability() -> None:
     """The bound of an event is 1 in 100; an alarm divides it among its three routes."""
-    assert threshold(1.0) == pytest.approx(np.log(100))
-    assert threshold(0.15) == pytest.approx(np.log(100 / 0.15))
+    assert threshold(1) == pytest.approx(np.log(100))
+    assert threshold() == pytest.approx(np.log(300))
     likely = Change("step", "", 3, np.log(200), 10.0)
     assert likely.significant and not likely.damage
     assert Change("step", "", 3, 10.0, 10.0).damage

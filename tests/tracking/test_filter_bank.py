@@ -68,7 +68,6 @@ def one(wander: Wander, sources: tuple[str, ...]) -> Hyperparameters:
         np.array([wander.decay]),
         np.array([wander.size]),
         np.array([wander.keep]),
-        np.array([wander.common]),
         np.array([wander.settling]),
     )
 
@@ -152,7 +151,6 @@ def every() -> list[Wander]:
             float(own.wander[0]),
             float(own.wander_keep[0]),
             float(own.settling[0]),
-            float(own.wander_common[0]),
         )
         for own in (grid[[g]] for g in range(grid.rate_std.size))
     ]
