@@ -607,7 +607,8 @@ def test_bad_inputs_injection(root: Path) -> None:
     """Some hostile names, files and addresses are text, reach nothing, and show no password."""
     answer = json.loads(run_study(root, "bad_inputs", "injection"))
     assert all(answer["passed"].values())
-    assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 2  # of all, and of examples
+    # Beside the pages of machines there are that of all and that of examples.
+    assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 2
 
 
 def test_faults_together(root: Path) -> None:
