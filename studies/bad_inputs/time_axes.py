@@ -38,13 +38,14 @@ import lmshealth
 from lmshealth.errors import BadLog
 from lmshealth.io import reading
 from studies.bad_inputs.logfiles import Archive, LogFile, write
-from studies.harness.claims import Claim, controls_seen, counted
+from studies.harness.claims import Claim, Older, controls_seen, counted
 from studies.harness.study import Row, Study
 
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
 STEP = "batch"
+OLDER = {"time_axes": Older("44a2253fbdf0", "segments of more than 24 lengths were shortened")}
 
 RATE, N, BASE = 500.0, 12_000, 4000.0
 N_EACH, N_SETS, N_QUICK, QUICK_KINDS = 8, 10, 1, 5

@@ -33,12 +33,15 @@ from lmshealth.io.formats import isolation
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
 from studies.common.cost import cpu_s, in_own_process, in_turns
-from studies.harness.claims import Claim, span
+from studies.harness.claims import Claim, Older, span
 from studies.harness.study import Row, Study, real_data
 from studies.read_throughput.files import BARE, RATE, signals, write
 from studies.read_throughput.samples import MAPS
 
 STEP = "read"
+OLDER = {
+    "result": Older("88b249d5d578", "times in ticks and days were read in the unit of their column")
+}
 
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
 # reader that searched for damage as slowly as it might took 3.0 times the library.
