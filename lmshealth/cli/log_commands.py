@@ -126,9 +126,7 @@ def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
     writer.writeheader()
     writer.writerows(row | {"file": row["file"].relative_to(folder).as_posix()} for row in rows)
     write_text(sheet, table.getvalue())
-    why = (
-        "stage is the folder where the file names none; `run` needs what is empty, remark says why"
-    )
+    why = "stage is the folder where the file names none; fill in what is empty (see remark)"
     terminal.print_notes([f"{sheet}: {why}"])
 
 

@@ -148,20 +148,14 @@ def read_ambient(
     """Identify modes as `identify` does; return them with the spectra and their fit."""
     log = limit_channels(log, channels)
     used = choose_channels(log)
-    targets = () if stage is None else choose_targets(stage, band)
-    short: list[Refusal] = []
+    targets, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
     while True:
         try:
             stretches, whole = _transform(log, used, targets, band)
             break
         except BadLog as error:
-            if error.reason != "too-short" or len(targets) < 2:
-                raise
-            # One narrow mode must not refuse the others.
-            least = min(targets, key=lambda target: target.damping_ratio * target.frequency)
-            targets = tuple(target for target in targets if target is not least)
-            named = Refusal(log.name, error.reason, error.detail, mode=least.name)
-            short.append(replace(named, frequency=least.frequency))
+            targets, refusal = _without_narrowest(targets, error)
+            short.append(refusal)
     tested: list[tuple[str, float, float]] = []
     sought: tuple[Found, ...] = ()
     if stage is None:
@@ -200,6 +194,21 @@ def read_ambient(
     if stage is None or not more or whole.duration * min(widths) < constants.SEARCHABLE:
         return reading
     return _with_undescribed(log, reading, known, targets)
+
+
+def _without_narrowest(
+    targets: tuple[Target, ...], error: BadLog
+) -> tuple[tuple[Target, ...], Refusal]:
+    """Refuse the mode for which a log is too short: it must not refuse the others.
+
+    Raises what was raised for the log if no other mode is left, or for another reason.
+    """
+    if error.reason != "too-short" or len(targets) < 2:
+        raise error
+    least = min(targets, key=lambda target: target.damping_ratio * target.frequency)
+    named = Refusal(error.log, error.reason, error.detail, mode=least.name)
+    others = tuple(target for target in targets if target is not least)
+    return others, replace(named, frequency=least.frequency)
 
 
 def _with_undescribed(

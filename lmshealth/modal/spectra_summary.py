@@ -55,6 +55,16 @@ class SpectraSummary:
         wide = self.high > WIDE * self.low > 0
         return (np.geomspace if wide else np.linspace)(self.low, self.high, self.count.size + 1)
 
+    @property
+    def centres(self) -> FloatArray:
+        """Centres of the bins in Hz, shape ``(n_bins,)``."""
+        return (self.edges[1:] + self.edges[:-1]) / 2
+
+
+def density(level: NDArray[np.floating]) -> FloatArray:
+    """Convert levels of a summary to densities in (m/s²)²/Hz, of the same shape."""
+    return np.asarray(10 ** (level.astype(float) / 10))
+
 
 def summarise(
     spectra: LogSpectra,
@@ -212,11 +222,11 @@ def _relative_level(summary: SpectraSummary | None, edges: FloatArray) -> FloatA
     if summary is None:
         return np.full(total.size, np.nan)
     known = edges[1:] <= (1 + 1e-9) * summary.high
-    for level in summary.level.astype(float):
-        power = np.nan_to_num(10 ** (level / 10)) * np.diff(summary.edges)
-        density = _mean_density(summary.edges, power, edges)
-        middle = float(np.median(density[known]))
+    for own in density(summary.level):
+        power = np.nan_to_num(own) * np.diff(summary.edges)
+        mean = _mean_density(summary.edges, power, edges)
+        middle = float(np.median(mean[known]))
         if middle > 0:
-            total += density / middle
+            total += mean / middle
     decibel = 10 * np.log10((total / len(summary.channels)).clip(_LEAST_SHARE))
     return np.where(known & total.any(), decibel, np.nan)

@@ -99,6 +99,12 @@ class Assessment:
         return tuple(dict.fromkeys(event.mode for event in alarms))
 
     @property
+    def compared(self) -> LogEstimates | None:
+        """The first log of the baseline, beside which the last is shown; None if it is the last."""
+        latest, before = self.latest, self.at_baseline
+        return before if latest and before and before.log != latest.log else None
+
+    @property
     def latest_health(self) -> Health | None:
         """The health as fractions of the baseline, if it has an epoch and a parameter."""
         return self._relative(self.health)

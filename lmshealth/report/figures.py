@@ -285,6 +285,15 @@ def plot_life(
     return ax
 
 
+def chance_left(remaining: FloatArray, travel: FloatArray) -> FloatArray:
+    """Return the probability in % of reaching no limit within each travel, ``(n,)``.
+
+    ``remaining`` are draws of the remaining travel in the same unit, ``(n_draws,)``.
+    """
+    past = np.searchsorted(np.sort(remaining), travel, side="right")
+    return np.asarray(100 * (1 - past / remaining.size))
+
+
 def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = None) -> Axes:
     """Plot the probability of not having reached a limit against the travel ahead.
 
@@ -294,21 +303,16 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     last = quantiles(prognosis.remaining[:, -1], (0.99,))[0] / _KM
     end = min(horizon, max(1.2 * last, horizon / 50)) if np.isfinite(last) else horizon
     ahead = np.linspace(0, end, 400)
-    ordered = np.sort(prognosis.remaining / _KM, axis=0)
+    left = prognosis.remaining / _KM
     dashes = ["--", "-.", ":", (0, (7, 2, 1, 2, 1, 2))]
     several = len(prognosis.parameters) > 2
-
-    def chance_after(travel: FloatArray, k: int) -> FloatArray:
-        past = np.searchsorted(ordered[:, k], travel, side="right")
-        return np.asarray(100 * (1 - past / ordered.shape[0]))
-
     for k, name in enumerate(prognosis.parameters[:-1] if several else ()):
         style: Any = {"color": MUTED, "lw": 1.2, "ls": dashes[k % len(dashes)]}
-        ax.plot(ahead, chance_after(ahead, k), label=_spell(name), **style)
+        ax.plot(ahead, chance_left(left[:, k], ahead), label=_spell(name), **style)
     label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
-    ax.plot(ahead, chance_after(ahead, -1), color=BLUE, lw=2.2, label=label)
+    ax.plot(ahead, chance_left(left[:, -1], ahead), color=BLUE, lw=2.2, label=label)
     some = np.linspace(0, end, 25)
-    chance = chance_after(some, -1)
+    chance = chance_left(left[:, -1], some)
     pairs = zip(_KM * some, chance, strict=True)
     hints(ax, some, chance, [f"after {whole_km(x)}: {y:.0f}{GAP}%" for x, y in pairs])
     if service is not None and service.kept_risk is not None:

@@ -10,15 +10,17 @@ import hashlib
 import json
 from base64 import b64encode
 from collections.abc import Iterator, Sequence
+from functools import cache
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import LmshealthError
+from lmshealth.modal.spectra_summary import density
 from lmshealth.report import constants
 from lmshealth.report.assessment import Assessment, limit_of
-from lmshealth.report.figures import BLUE, GREEN, INK, MUTED, RED
+from lmshealth.report.figures import BLUE, GREEN, INK, MUTED, RED, chance_left
 from lmshealth.report.rendering import render
 from lmshealth.report.text import moment, quantiles, spell
 from lmshealth.tracking.history import LogEstimates
@@ -82,14 +84,21 @@ def _library() -> _Bokeh:
         from bokeh.embed import json_item
         from bokeh.layouts import gridplot
         from bokeh.plotting import figure
-        from bokeh.resources import Resources
     except ImportError as error:
         raise InteractiveError(
             'interactive pages need Bokeh: pip install "lmshealth[interactive]"; the pages are '
             "written, and `lmshealth report --interactive` makes them of what the store keeps"
         ) from error
-    library = "\n".join(Resources(mode="inline", components=["bokeh"], log_level="warn").js_raw)
-    return _Bokeh(figure, gridplot, json_item, models, library.replace("</script", "<\\/script"))
+    return _Bokeh(figure, gridplot, json_item, models, _script())
+
+
+@cache
+def _script() -> str:
+    """Return the JavaScript of Bokeh; it is read once for all pages."""
+    from bokeh.resources import Resources
+
+    parts = Resources(mode="inline", components=["bokeh"], log_level="warn").js_raw
+    return "\n".join(parts).replace("</script", "<\\/script")
 
 
 def _new(bokeh: _Bokeh, title: str, x: str, y: str, **options: Any) -> Any:
@@ -126,7 +135,7 @@ def _legend(plot: Any) -> None:
 
 def _spectra(bokeh: _Bokeh, assessment: Assessment) -> list[Any]:
     """Return a picture per channel of the last log, over that of the baseline."""
-    latest, before = assessment.latest, assessment.at_baseline
+    latest, before = assessment.latest, assessment.compared
     if latest is None or latest.spectra is None:
         return []
     plots: list[Any] = []
@@ -135,7 +144,7 @@ def _spectra(bokeh: _Bokeh, assessment: Assessment) -> list[Any]:
         name = f"{channel}, 2nd derivative" if derived else channel
         linked = {"x_range": plots[0].x_range} if plots else {}
         plot = _new(bokeh, name, "frequency in Hz", "(m/s²)²/Hz", y_axis_type="log", **linked)
-        if before is not None and before.log != latest.log:
+        if before is not None:
             _curve(bokeh, plot, before, channel, MUTED, "baseline")
         _curve(bokeh, plot, latest, channel, INK, "last log")
         _lines(bokeh, plot, latest, channel)
@@ -159,10 +168,8 @@ def _curve(
     spectra = found.spectra
     if spectra is None or channel not in spectra.channels:
         return
-    k = spectra.channels.index(channel)
-    x = (spectra.edges[1:] + spectra.edges[:-1]) / 2
-    level = 10 ** (np.asarray(spectra.level[k], dtype=float) / 10)
-    fitted = 10 ** (np.asarray(spectra.fitted[k], dtype=float) / 10)
+    k, x = spectra.channels.index(channel), spectra.centres
+    level, fitted = density(spectra.level[k]), density(spectra.fitted[k])
     source = bokeh.models.ColumnDataSource({"x": x, "y": level, "log": [found.log] * len(x)})
     drawn = plot.line("x", "y", source=source, color=colour, legend_label=name)
     _hover(bokeh, plot, drawn, (name, "@log"), ("at", "@x{0.00} Hz"), ("PSD", "@y{0.00e+0}"))
@@ -181,12 +188,11 @@ def _lines(bokeh: _Bokeh, plot: Any, found: LogEstimates, channel: str) -> None:
     ]
     if not inside:
         return
-    x = (spectra.edges[1:] + spectra.edges[:-1]) / 2
-    level = np.asarray(spectra.level[spectra.channels.index(channel)], dtype=float)
+    level = spectra.level[spectra.channels.index(channel)].astype(float)
     at = [line.frequency for line in inside]
     source = {
         "x": at,
-        "y": 10 ** (np.interp(at, x, level) / 10),
+        "y": density(np.interp(at, spectra.centres, level)),
         "kind": [spell(line.kind) for line in inside],
         "amplitude": [f"{line.amplitude:.3g} {line.unit}" for line in inside],
     }
@@ -309,8 +315,7 @@ def _survival(bokeh: _Bokeh, assessment: Assessment) -> Iterator[Any]:
     ahead = np.linspace(0, end, 400)
     colours = dict.fromkeys(prognosis.parameters, MUTED) | {"any": BLUE}
     for k, name in enumerate(prognosis.parameters):
-        past = np.searchsorted(np.sort(prognosis.remaining[:, k]), ahead, side="right")
-        chance = 100 * (1 - past / len(prognosis.remaining))
+        chance = chance_left(prognosis.remaining[:, k], ahead)
         style = {"color": colours[name], "line_width": 3 if name == "any" else 1}
         drawn = plot.line(ahead / _KM, chance, legend_label=spell(name), **style)
         _hover(bokeh, plot, drawn, (f"{spell(name)} limit", "@y{0.0} % after @x{0} km"))

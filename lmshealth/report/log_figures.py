@@ -25,7 +25,7 @@ from lmshealth.modal.frf.measured import MeasuredResponse
 from lmshealth.modal.identification import AmbientReading
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
-from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, summarise
+from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
 from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures
 from lmshealth.report.rendering import render
@@ -243,22 +243,19 @@ def plot_spectra(
 
     The spectra and modes of an earlier log are drawn behind them.
     """
-    middle = (summary.edges[1:] + summary.edges[:-1]) / 2
+    middle = summary.centres
     n = len(summary.channels) + bool(len(summary.singular)) + bool(sought)
     panels = list(figure.subplots(n, sharex=True, squeeze=False)[:, 0])
-    level, fitted, singular = (
-        10 ** (np.asarray(part, dtype=float) / 10)
-        for part in (summary.level, summary.fitted, summary.singular)
-    )
+    level, fitted, singular = map(density, (summary.level, summary.fitted, summary.singular))
     refused = {one.channel: one.reason for one in modes.refused if not one.mode}
     count = summary.count.astype(float)
     range_ = gamma.ppf([[0.025], [0.975]], count) / count
-    for ax, name, derived, density, fit in zip(
+    for ax, name, derived, own, fit in zip(
         panels, summary.channels, summary.derived, level, fitted, strict=False
     ):
         if before is not None and before.spectra is not None:
             _plot_before(ax, before.spectra, before.modes, name)
-        ax.plot(middle, density, color=figures.INK, lw=0.7, label="measured")
+        ax.plot(middle, own, color=figures.INK, lw=0.7, label="measured")
         ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label="fit")
         if np.isfinite(fit).any():
             style: Any = {"color": figures.GREEN, "alpha": 0.2, "lw": 0}
@@ -268,7 +265,7 @@ def plot_spectra(
         label = figures.plain_label(name) + ("\n(2nd derivative)" if derived else "")
         label += f"\n({refused[name]})" if name in refused else ""
         _name_panel(ax, label)
-        _mark_lines(ax, modes, name, middle, density)
+        _mark_lines(ax, modes, name, middle, own)
     for k, values in enumerate(singular):
         style = {"lw": 0.9 if k == 0 else 0.6, "color": figures.MUTED if k else figures.INK}
         shown = np.where(values > _RANK * singular[0], values, np.nan)
@@ -292,11 +289,10 @@ def _plot_before(ax: Axes, summary: SpectraSummary, modes: Modes, channel: str) 
     """Fill the area below the spectrum of a channel in an earlier log, and mark its modes."""
     if channel not in summary.channels:
         return
-    level = np.asarray(summary.level[summary.channels.index(channel)], dtype=float)
-    low = 10 ** (np.nanmin(level, initial=np.inf) / 10)
+    own = density(summary.level[summary.channels.index(channel)])
+    low = np.nanmin(own, initial=np.inf)
     style: Any = {"color": figures.MUTED, "alpha": 0.3, "lw": 0}
-    middle = (summary.edges[1:] + summary.edges[:-1]) / 2
-    ax.fill_between(middle, low, 10 ** (level / 10), label="measured at the baseline", **style)
+    ax.fill_between(summary.centres, low, own, label="measured at the baseline", **style)
     for f in modes.frequency.tolist():
         if summary.low <= f <= summary.high:
             ax.axvline(f, color=figures.MUTED, lw=1, ls="-.", label="mode at the baseline")

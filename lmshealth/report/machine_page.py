@@ -30,7 +30,7 @@ from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
-from lmshealth.tracking.history import History, LogEstimates
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Effect, Track
 
 Item = TypeVar("Item")
@@ -266,15 +266,9 @@ def _track_pictures(
     return draw
 
 
-def _compared(assessment: Assessment) -> LogEstimates | None:
-    """Return the first log of the baseline; None where that is the last log."""
-    latest, before = assessment.latest, assessment.at_baseline
-    return before if latest and before and before.log != latest.log else None
-
-
 def _mac(assessment: Assessment) -> dict[str, float]:
     """Return the MAC of each mode of the last log with that of the baseline."""
-    latest, before = assessment.latest, _compared(assessment)
+    latest, before = assessment.latest, assessment.compared
     if not (latest and latest.shapes and before and before.shapes):
         return {}
     found = latest.shapes.mac_with(before.shapes)
@@ -283,7 +277,7 @@ def _mac(assessment: Assessment) -> dict[str, float]:
 
 def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, float]]]:
     """Return what draws the last log beside the one at the baseline, and the size in inches."""
-    latest, stage, before = assessment.latest, assessment.stage, _compared(assessment)
+    latest, stage, before = assessment.latest, assessment.stage, assessment.compared
     if latest is None:
         return {}
     found: dict[str, tuple[Any, tuple[float, float]]] = {}

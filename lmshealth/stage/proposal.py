@@ -164,7 +164,7 @@ def _guesses(columns: list[_Column]) -> list[Guess]:
 
 
 def _time(one: _Column) -> Guess | None:
-    """Guess a column of times: its name or unit says so, or it has none; and it ascends."""
+    """Guess a column of times: ascending, with the name or unit of times, or unnamed."""
     unit, steps = unit_key(one.unit, "time") or _time_unit(one.name), np.diff(one.values)
     if steps.size < 1 or not (steps > 0).all():
         return None

@@ -287,7 +287,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
 class TrackStart(ReadOnly):
     """State after some logs, from which a track goes on when others follow: as in `_Tracker`.
 
-    Arrays have a row for each of these logs, or for those from `kept` on where it says so.
+    Arrays have a row for each of these logs, unless stated otherwise.
     """
 
     key: str  # fingerprint of all that the state depends on

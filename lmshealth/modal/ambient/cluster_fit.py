@@ -636,16 +636,21 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         if why is not None
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
-    ordinates = masked_ordinates(data)
-    for k in np.searchsorted(spectrum.frequency, f[narrow]).tolist():
-        ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
-    lines = tuple(read_line(data, first, last) for first, last in ordinates)
+    lines = _excluded_lines(data, f[narrow])
     fitted = FittedSpectrum(channels, data.unit, spectrum, expected[data.longest])
     fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
     found = ClusterModes(modes, np.array(_losses(optimum)), lines, fitted)
     return ClusterFit(found.keep(name for name in names if name not in rejected), rejected)
+
+
+def _excluded_lines(data: ClusterData, found: FloatArray) -> tuple[LineEstimate, ...]:
+    """Read the lines that are masked, and those that were fitted as modes at these Hz."""
+    ordinates = masked_ordinates(data)
+    for k in np.searchsorted(data.spectra.spectra[data.longest].frequency, found).tolist():
+        ordinates.append((max(0, k - _LINE_BINS), k + _LINE_BINS + 1))
+    return tuple(read_line(data, first, last) for first, last in ordinates)
 
 
 def _averaged(

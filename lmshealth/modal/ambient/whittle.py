@@ -271,11 +271,10 @@ class Likelihood:
         def at(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
             p = np.frombuffer(raw)
             points = self._at(p)
-            slope, curvature = np.full(p.size, np.nan), np.eye(p.size)
             with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
                 slope, curvature = self.derivatives(p, points)
-            if np.isfinite(slope).all() and np.isfinite(curvature).all():
-                return self.value(p, points), slope, curvature
+                if np.isfinite(slope).all() and np.isfinite(curvature).all():
+                    return self.value(p, points), slope, curvature
             # Overflow far away: the optimiser takes derivatives before it sees that the value is
             # infinite and refuses the step.
             return np.inf, np.full(p.size, np.nan), np.eye(p.size)
