@@ -593,7 +593,7 @@ def test_bad_inputs_time_axes(root: Path) -> None:
     """Of some odd time axes and degenerate sets none is wrong unnamed, and unchecked ones are."""
     answer = json.loads(run_study(root, "bad_inputs", "time_axes"))
     assert all(answer["passed"].values())
-    assert answer["sets_told_right"] == answer["sets"] >= 2
+    assert answer["sets_named_right"] == answer["sets"] >= 2
 
 
 def test_bad_inputs_mutants(root: Path) -> None:

@@ -248,8 +248,8 @@ def try_set(name: str, number: int, checked: bool = True) -> Row:
             found = _found(path, truth)
     finally:
         reading.independent = independent
-    told = {one.split(": ")[1] for one in found["named"]}
-    return {"kind": name, "told_right": told == set(reasons.split()), **found}
+    named = {one.split(": ")[1] for one in found["named"]}
+    return {"kind": name, "named_right": named == set(reasons.split()), **found}
 
 
 def judge(
@@ -262,7 +262,7 @@ def judge(
     # As many as 3 standard deviations of normal errors allow in one of a thousand studies.
     allowed = int(binom.isf(1e-3, max(1, len(silent)), 2 * norm.sf(_SIGMAS)))
     seen = {f"{row['kind']} without stamps": _beyond(row["z"], _FAR) > 0 for row in controls} | {
-        "a copy that is not compared": not unnamed["told_right"]
+        "a copy that is not compared": not unnamed["named_right"]
     }
     counts = Counter(
         (row["kind"], row["refused"] or ("named" if row["named"] else "silent")) for row in rows
@@ -270,7 +270,7 @@ def judge(
     return {
         "axes": len(rows),
         "sets": len(degenerate),
-        "sets_told_right": sum(row["told_right"] for row in degenerate),
+        "sets_named_right": sum(row["named_right"] for row in degenerate),
         "frequencies_silent": len(silent),
         "silent_beyond_3": beyond,
         "silent_beyond_5": far,
@@ -281,13 +281,13 @@ def judge(
         "wrong": [
             row
             for row in [*rows, *degenerate]
-            if _beyond(row["z"], _SIGMAS) or not row.get("told_right", True)
+            if _beyond(row["z"], _SIGMAS) or not row.get("named_right", True)
         ],
         "verdicts": [{"kind": k, "verdict": v, "logs": n} for (k, v), n in counts.items()],
         "controls": seen,
         "passed": {
             "no frequency is far off without a word": not far and beyond <= allowed,
-            "every degenerate set is told right": all(row["told_right"] for row in degenerate),
+            "every degenerate set is named right": all(row["named_right"] for row in degenerate),
             "controls are found": all(seen.values()),
         },
     }
@@ -309,9 +309,9 @@ def claims(answer: Row) -> Iterator[Claim]:
     )
     yield counted(
         "degenerate sets of channels named with the right reason",
-        answer["sets_told_right"],
+        answer["sets_named_right"],
         answer["sets"],
-        met=answer["sets_told_right"] == answer["sets"],
+        met=answer["sets_named_right"] == answer["sets"],
     )
 
 

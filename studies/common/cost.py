@@ -50,7 +50,7 @@ def in_turns(
 def in_own_process(module: str, *arguments: object) -> Any:
     """Run a module in a process of its own, on one thread; return the JSON of its last line."""
     command = [sys.executable, "-m", module, *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=one_thread())
+    done = subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True, env=one_thread())
     return json.loads(done.stdout.splitlines()[-1])
 
 

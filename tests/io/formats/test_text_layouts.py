@@ -162,7 +162,7 @@ def test_klipper(tmp_path, stats):
 
 
 DIALECTS = itertools.product(
-    (",", ";", "\t", "|", " "), (".", ","), ("utf-8", "utf-8-sig", "cp1252", "utf-16"),
+    (",", ";", "\t", "|", " ", " : "), (".", ","), ("utf-8", "utf-8-sig", "cp1252", "utf-16"),
     ("", "# stage: A\n", "Export 3.1\nAxis 7\n\n"), (False, True),
 )  # fmt: skip
 
