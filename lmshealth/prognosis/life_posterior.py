@@ -408,8 +408,9 @@ def _updated(
     except NotConverged:
         return None
     probability = softmax([_log_probability(one) for one in found])
-    large = probability >= constants.MIN_CHAIN_PROBABILITY
-    if not all(one[1].reliable() for one, own in zip(found, large, strict=True) if own):
+    drawn = [one for one, own in zip(found, probability, strict=True)
+             if own >= constants.MIN_CHAIN_PROBABILITY and one[0].scenario.n_dim]  # fmt: skip
+    if not all(draws.reliable() for _, draws in drawn):
         return None
     return _sampled_scenarios(found, seeds[1], n_kept, np.inf), start
 

@@ -210,6 +210,27 @@ def test_an_update_that_fails_is_a_fit_from_nothing(
     np.testing.assert_array_equal(again.health, unchained.health)
 
 
+def test_the_update_of_a_life_without_wear_is_accepted(
+    wavering: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A scenario without coordinates has a single draw, which is exact."""
+    travel = 1e5 + np.linspace(0.0, 2e6, 12)
+    history = lived(travel, np.ones(12), np.ones(12))
+    one = fit_life(first_logs(history, 11), wavering, 11, chains=False, n_draws=400)
+    probable = {way.scenario.n_dim: way.probability for way in one.scenarios}
+    assert probable[0] > constants.MIN_CHAIN_PROBABILITY
+    starts = []
+    weighted = lifefit._weighted_scenarios
+
+    def counting(*arguments):
+        starts.append(arguments[2:])
+        return weighted(*arguments)
+
+    monkeypatch.setattr(lifefit, "_weighted_scenarios", counting)
+    fit_life(history, wavering, 11, chains=False, n_draws=400, before=one.start)
+    assert starts == [(one.start,)]
+
+
 def first_logs(history: History, n: int) -> History:
     """Return the history of the first logs."""
     names = ("logs", "recorded_at", "travel", "ln_frequency", "ln_damping", "cov", "loop_error")
