@@ -13,6 +13,10 @@ Method
     that reads HDF5 and Parquet. Controls: a reader that raises a `KeyError` and one that returns
     other samples must be detected, one that ends its process, one that loops and one that takes
     memory must be refused.
+Answer
+    No. Of 20,000 mutants of ten forms, 369 texts and 200 stores none ends in another exception than
+    a refusal, none is wrong in silence, none takes more than 10.1 s or 142 MB; all six controls are
+    caught.
 Run time
     About eight processor minutes.
 """

@@ -36,13 +36,10 @@ from lmshealth.io.reading import read_log, read_sep005
 from lmshealth.modal.frf.measured import read_responses
 from studies.foreign_files import dialects, writers
 from studies.foreign_files.writers import WRITERS, Held
-from studies.harness.claims import Claim, Older, counted
+from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study
 
 STEP = "read"
-OLDER = {
-    "result": Older("5894e7fa6fd9", "times in ticks and days were read in the unit of their column")
-}
 
 N_EACH, N_FUZZ, N_CONTROL = 12, 2000, 400
 BLOCK = 100

@@ -11,6 +11,11 @@ Method
     the log (8 bytes for each sample of each channel), and the processor time. Then every UFF58,
     TDMS, MAT and delimited file of the real samples is read
     without and with its column map.
+Answer
+    CSV and Parquet cost at most 1.3 times the library. HDF5, TDMS and MAT cost 1.4 to 2.2 times:
+    they are read in a process that may die, and its samples come through pages that both share,
+    10 ms for a minute of four signals. `read_log` takes 50 ms more to hash and judge them. Memory
+    is an eighth of the log's at most, except UFF58, whose library holds the whole file.
 Run time
     About ten minutes, and 2 GB of disk.
 Data
@@ -33,15 +38,14 @@ from lmshealth.io.formats import isolation
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
 from studies.common.cost import cpu_s, in_own_process, in_turns
-from studies.harness.claims import Claim, Older, span
+from studies.harness.claims import Claim, span
 from studies.harness.study import Row, Study, real_data
 from studies.read_throughput.files import BARE, RATE, signals, write
 from studies.read_throughput.samples import MAPS
 
 STEP = "read"
-OLDER = {
-    "result": Older("88b249d5d578", "times in ticks and days were read in the unit of their column")
-}
+_SHARED = "samples come from another process through shared pages, which takes 10 ms for a minute"
+NOT_MET = dict.fromkeys(("log.h5", "log.tdms", "plain.mat", "packed.mat"), _SHARED)
 
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
 # reader that searched for damage as slowly as it might took 3.0 times the library.
@@ -87,7 +91,7 @@ def main() -> None:
         },
         "samples": samples(data) if data else None,
     }
-    study.conclude(answer, quick_may_fail=True)
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 def timed(name: str, seconds: int, rounds: int) -> Row:

@@ -12,11 +12,11 @@ Method
     the reported errors, the second source's bias, the size of declared steps, and a relative error
     of the map's sensitivities. A twentieth of estimates and temperatures is missing. Posteriors are
     drawn by importance sampling; some of the same lives by chains too, and some by twenty updates
-    in a row, each from the draws of the one before, as after each new log of a machine. Ranks among 127 draws, ties
-    (a limit that is never reached, a parameter that keeps its health, censored lives) at random,
-    are compared with the simultaneous band of their distribution at 99.9 %, coverages with their
-    99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as exact that is wrong by
-    5 %; every parameter taken to degrade, while half of them do not.
+    in a row, each from the draws of the one before, as after each new log of a machine. Ranks among
+    127 draws, ties (a limit that is never reached, a parameter that keeps its health, censored
+    lives) at random, are compared with the simultaneous band of their distribution at 99.9 %,
+    coverages with their 99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as
+    exact that is wrong by 5 %; every parameter taken to degrade, while half of them do not.
 Answer
     Yes. All eight ranks stay inside their bands, and a parameter degrades as often as its posterior
     states. Run with the code before jumps were separated from logs at the same odometer, which
