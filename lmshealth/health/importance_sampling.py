@@ -75,20 +75,24 @@ def importance_sample(
 
 
 def importance_sample_to_ess(
-    log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
+    log_probability: LogProbability,
+    start: FloatArray,
+    rng: np.random.Generator,
+    n: int,
+    min_ess: float = constants.MIN_ESS,
 ) -> WeightedDraws:
-    """Repeat `importance_sample` with three times the draws until 400 of them are effective.
+    """Repeat `importance_sample` with three times the draws until enough of them are effective.
 
     Raises `NotConverged`, with the points, if the fourth attempt has fewer.
     """
     for _ in range(_MAX_ATTEMPTS):
         found = importance_sample(log_probability, start, rng, n)
-        if found.ess >= constants.MIN_ESS:
+        if found.ess >= min_ess:
             return found
         start, n = found.resampled(rng, 500), 3 * n
     raise NotConverged(
         f"{found.ess:.0f} effective draws of {found.weight.size} by importance sampling; needed "
-        f"are {constants.MIN_ESS}: the posterior may have several modes far apart",
+        f"are {min_ess:.0f}: the posterior may have several modes far apart",
         found.points,
     )
 

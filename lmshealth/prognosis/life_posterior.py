@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._arrays import FloatArray, ReadOnly, freeze
 from lmshealth.errors import NotConverged, NotEnoughData
+from lmshealth.health.constants import MAX_PARETO_K, MIN_ESS
 from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin
 from lmshealth.health.importance_sampling import (
     WeightedDraws,
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 _STEP = 1 << 20  # of the random stream: beyond the epochs of health
 _N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
 _N_ROUGH, _N_FINE = 600, 2000
+# Effective draws below which an evidence may miss most of its integral.
+_LEAST_ESS = 20.0
 # Draws of an update, and those of each scenario that are kept for the next one.
 _N_UPDATE, _N_START = 4000, 300
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
@@ -306,7 +309,7 @@ def fit_life(
         Seed of all random numbers.
     chains : bool
         Whether emcee samples the probable scenarios; otherwise importance sampling draws them (at
-        least 400 effective draws), in a fraction of the time.
+        least 400 effective draws of the most probable), in a fraction of the time.
     n_draws : int
         Draws of all ensembles, a multiple of 4.
     before : LifeStart, optional
@@ -410,7 +413,7 @@ def _updated(
     probability = softmax([_log_probability(one) for one in found])
     drawn = [one for one, own in zip(found, probability, strict=True)
              if own >= constants.MIN_CHAIN_PROBABILITY and one[0].scenario.n_dim]  # fmt: skip
-    if not all(draws.reliable() for _, draws in drawn):
+    if not all(draws.pareto_k < MAX_PARETO_K for _, draws in drawn):
         return None
     return _sampled_scenarios(found, seeds[1], n_kept, np.inf), start
 
@@ -428,19 +431,34 @@ def _weighted_scenarios(
     rough = [_rough(one, rng, before) for one, rng in zip(densities, generators, strict=True)]
     least = max(map(_log_probability, rough)) - constants.MAX_LOG_ODDS
     n = _N_FINE if before is None else _N_UPDATE
-    found = []
+    likely = [k for k, one in enumerate(rough) if _log_probability(one) > least]
+    drawn = [k for k in likely if densities[k].scenario.n_dim]
+    explored = list(rough)
+    for k in drawn:
+        density, draws = rough[k]
+        start = draws.resampled(generators[k], _N_ROUGH)
+        density = density.narrowed(start[: _N_ROUGH // 3])
+        draws = importance_sample(density.log_probability, start, generators[k], n)
+        explored[k] = density, draws
+    # More draws of the more probable scenarios: errors of the mixture are then at most those of a
+    # single scenario with as many effective draws as it needs.
+    largest = max(_log_probability(explored[k]) for k in likely)
+    for k in drawn:
+        density, draws = explored[k]
+        share = float(np.exp(_log_probability(explored[k]) - largest))
+        needed = max(_LEAST_ESS, MIN_ESS * np.sqrt(share))
+        # Of an update too: one that is not reliable costs a fit from nothing.
+        judged = before is not None and share >= constants.MIN_CHAIN_PROBABILITY
+        if draws.ess < needed or (judged and draws.pareto_k >= MAX_PARETO_K):
+            start = draws.resampled(generators[k], _N_ROUGH)
+            how = start, generators[k], 3 * n, needed
+            explored[k] = density, importance_sample_to_ess(density.log_probability, *how)
     widest = max(one.scenario.n_dim for one in densities)
     points = np.zeros((len(densities), _N_START, widest))
-    for k, ((density, draws), rng) in enumerate(zip(rough, generators, strict=True)):
-        likely, n_dim = _log_probability((density, draws)) > least, density.scenario.n_dim
-        if likely and n_dim:
-            start = draws.resampled(rng, _N_ROUGH)
-            density = density.narrowed(start[: _N_ROUGH // 3])
-            draws = importance_sample_to_ess(density.log_probability, start, rng, n)
-        if likely:
-            found.append((density, draws))
-        points[k, :, :n_dim] = draws.resampled(rng, _N_START)
-    return found, LifeStart(tuple(one.scenario.name for one in densities), points)
+    for k, (density, draws) in enumerate(explored):
+        points[k, :, : density.scenario.n_dim] = draws.resampled(generators[k], _N_START)
+    next_start = LifeStart(tuple(one.scenario.name for one in densities), points)
+    return [explored[k] for k in likely], next_start
 
 
 def _rough(density: LifeDensity, rng: np.random.Generator, before: LifeStart | None) -> _Explored:

@@ -204,7 +204,7 @@ def test_an_update_that_fails_is_a_fit_from_nothing(
     history: History, stage: Stage, unchained: LifePosterior, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Where the weights of an update are unreliable, its result is that without a start."""
-    monkeypatch.setattr("lmshealth.health.constants.MAX_PARETO_K", -9.0)
+    monkeypatch.setattr(lifefit, "MAX_PARETO_K", -9.0)
     start = unchained.start
     again = fit_life(history, stage, 11, chains=False, n_draws=400, before=start)
     np.testing.assert_array_equal(again.health, unchained.health)
