@@ -15,9 +15,13 @@ Method
     machines without wear, which must be calm and held; intervals a third as wide, which must not
     hold.
 Answer
-    Not recorded yet.
+    Mostly. Of 60 lives of drawn machines no verdict is surely wrong, 90 % intervals hold 106 of 120
+    health parameters and 141 of 180 drifts. False alarms: none of 16 unchanged machines in four
+    worlds, 4 of 5 where a payload is never logged. Where the amplitude dependence grows, intervals
+    of the drifts hold 19 of 36. Recorded before lives drew fewer samples of
+    improbable scenarios, on which health and drifts do not depend.
 Run time
-    Half an hour on one processor.
+    An hour on one processor; a life with a step takes minutes.
 """
 
 from __future__ import annotations
@@ -50,7 +54,22 @@ NOMINAL = "nominal machines"
 UNCHANGED, SURE = 0.99, 0.95
 # Asked for: false alarms and wrong sure verdicts, intervals of 90 % that hold.
 MOST_ALARMS, MOST_WRONG, LEAST_HELD = 0.02, 0.02, 0.85
-NOT_MET: dict[str, str] = {}
+_PAYLOAD = (
+    "a payload that is carried for many logs and stated in none moves all modes as a step does, and "
+    "16 logs do not show that it returns; state it in the logs"
+)
+_GROWTH = "an amplitude dependence that grows lowers ln f as wear does, at every amplitude"
+NOT_MET = {
+    "drifts held: healthy": "7 of 36 are outside, all of three machines: self-heating and amplitude "
+    "dependence are learned from 16 logs only",
+    **dict.fromkeys(
+        (f"{what}: payload-not-logged" for what in ("false alarms", "health held", "drifts held")),
+        _PAYLOAD,
+    ),
+    **dict.fromkeys(
+        (f"{what}: amplitude-growth" for what in ("health held", "drifts held")), _GROWTH
+    ),
+}
 _LEVELS, _REACH, _NARROWER = (0.05, 0.5, 0.95), 1.6448536, 3.0
 
 
