@@ -478,6 +478,13 @@ def test_sbc_life(root: Path) -> None:
     assert low["every part taken to lose"] > 0.25 * 2 * lives["every part taken to lose"]
 
 
+def test_sbc_life_updated(root: Path) -> None:
+    """A life updated twice is that from nothing; without the last logs it differs."""
+    answer = json.loads(run_study(root, "sbc_life", "updated"))
+    assert answer["passed"]["updates are fits from nothing"]
+    assert answer["passed"]["twenty logs make a difference (control)"]
+
+
 def test_lifetimes_raw(root: Path) -> None:
     """From raw logs to the remaining life: a life of four logs is told, and not refused."""
     answer = json.loads(run_study(root, "lifetimes_raw"))

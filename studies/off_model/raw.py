@@ -55,13 +55,13 @@ UNCHANGED, SURE = 0.99, 0.95
 # Asked for: false alarms and wrong sure verdicts, intervals of 90 % that hold.
 MOST_ALARMS, MOST_WRONG, LEAST_HELD = 0.02, 0.02, 0.85
 _PAYLOAD = (
-    "a payload that is carried for many logs and stated in none moves all modes as a step does, and "
-    "16 logs do not show that it returns; state it in the logs"
+    "a payload that is carried for many logs and stated in none moves all modes as a step does; "
+    "16 logs do not show that it returns"
 )
 _GROWTH = "an amplitude dependence that grows lowers ln f as wear does, at every amplitude"
 NOT_MET = {
-    "drifts held: healthy": "7 of 36 are outside, all of three machines: self-heating and amplitude "
-    "dependence are learned from 16 logs only",
+    "drifts held: healthy": "7 of 36 are outside, all of three machines: self-heating and "
+    "amplitude dependence are learned from 16 logs only",
     **dict.fromkeys(
         (f"{what}: payload-not-logged" for what in ("false alarms", "health held", "drifts held")),
         _PAYLOAD,
