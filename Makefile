@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo notebooks picture check test slow coverage statistics bench fuzz compat lock locked sbom clean
+.PHONY: demo notebooks picture check test slow studies coverage statistics bench fuzz compat lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -36,12 +36,16 @@ check: .venv/installed
 	$(BIN)/lint-imports
 
 # Tests run in parallel processes: one thread each for linear algebra.
-test slow coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
-test slow coverage statistics bench: export OMP_NUM_THREADS = 1
+test slow studies coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
+test slow studies coverage statistics bench: export OMP_NUM_THREADS = 1
 # Tests start many programs: let them share compiled byte code.
 unexport PYTHONDONTWRITEBYTECODE
 test: .venv/installed
-	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not statistical"
+	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not study and not statistical"
+
+# Quick forms of all studies: the questions of studies/README.md on few data.
+studies: .venv/installed
+	$(BIN)/pytest -n 2 --dist worksteal -m study
 
 # Tests of seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed
@@ -49,7 +53,7 @@ slow: .venv/installed
 
 # Lines of the package that no fast test runs; fails below 95 %. Studies do not count.
 coverage: .venv/installed
-	$(BIN)/pytest -n 2 -m "not slow and not statistical" --ignore=tests/test_studies.py \
+	$(BIN)/pytest -n 2 -m "not slow and not study and not statistical" \
 		--cov=lmshealth --cov-fail-under=95
 
 # Calibration of errors and intervals; LMSHEALTH_SEED=7 draws other data.

@@ -20,6 +20,7 @@ import lmshealth
 from studies.new_machine.run import Step, follow, steps
 from studies.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
+pytestmark = pytest.mark.study
 PARTS = ("preload", "mount")
 
 
@@ -154,7 +155,6 @@ def test_three_methods(root: Path) -> None:
     assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]
 
 
-@pytest.mark.slow
 def test_three_methods_with_friction(root: Path) -> None:
     """A sweep that turns the stage back has pitch too high; moving, or without friction, not."""
     assert all(json.loads(run_study(root, "three_methods", "friction"))["passed"].values())
@@ -240,7 +240,6 @@ def test_off_model(root: Path) -> None:
     assert checks["without wander healthy lives alarm (control)"]
 
 
-@pytest.mark.slow
 def test_raw_logs_of_drawn_machines(root: Path) -> None:
     """Raw logs of a nominal and of a drawn machine raise no false alarm and hold their drifts."""
     answer = json.loads(run_study(root, "off_model", "raw"))

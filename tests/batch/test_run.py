@@ -193,6 +193,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
     assert pages(done.out) == done.pages
 
 
+@pytest.mark.slow
 def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:

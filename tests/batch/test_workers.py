@@ -128,6 +128,7 @@ def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
     servers.wait_until(lambda: not any(_is_there(child) for child in children), "ending")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "begun", ["pool.map_unordered(dawdle, items, lost)", "map_in_order(pool.executor, len, items)"]
 )

@@ -137,6 +137,7 @@ def test_worn_modes_keep_their_identity(shift: float) -> None:
         assert np.abs(deviations(found, name, f * shift, zeta)).max() < 4
 
 
+@pytest.mark.slow
 def test_an_undescribed_mode_takes_no_name() -> None:
     """Yaw is not described and stronger: roll and pitch stay, yaw is reported without a name."""
     modes = lms_y_modes()

@@ -14,6 +14,7 @@ MODES = (Mode(60.0, 0.015, 1.0, (1.0, 0.7, 0.3)), Mode(66.0, 0.015, 1.0, (0.5, -
 PHASES = np.radians([(0.0, 20.0, -10.0), (0.0, 0.0, 15.0)])
 
 
+@pytest.mark.slow
 def test_shapes_of_neighbours_have_their_amplitudes_and_phases() -> None:
     """Two modes two bandwidths apart, of which one moves one channel 20° late."""
     rng = np.random.default_rng(2)

@@ -609,6 +609,7 @@ def test_browser_shows_every_picture_and_prints(
         assert seen == []
 
 
+@pytest.mark.slow
 def test_the_spectrum_of_the_last_log_is_explained_and_names_what_is_missing(
     make: Maker, tmp_path: Path
 ) -> None:

@@ -124,6 +124,7 @@ def test_line_and_band_are_those_of_the_effects(straight: Stage, bent: Stage) ->
     assert one.explained_std(values) is None
 
 
+@pytest.mark.slow
 def test_shifts_are_the_sum_of_what_covariates_explain(bent: Stage) -> None:
     """The sum of all known covariates is the change of ln f."""
     history = awkward_history(np.random.default_rng(4))

@@ -151,6 +151,7 @@ def test_a_step_that_was_found_stays_sharp(stage: Stage) -> None:
     assert np.abs(smeared.drift[20] - smeared.drift[19] + 0.03).max() > 1e-3
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("declared", [True, False])
 def test_only_what_nobody_declared_opens_rates_anew(stage: Stage, declared: bool) -> None:
     """The last epoch equals the track's, for declared and detected steps, of four lives."""

@@ -136,11 +136,17 @@ def test_samples_arrive_unchanged(tmp_path, dtype, size):
 
 def test_interrupt(file):
     """An interrupt ends the process, so that its answer is none to the next request."""
-    timer = threading.Timer(0.2, signal.pthread_kill, [threading.get_ident(), signal.SIGINT])
     attempt(print_much, file)
-    timer.start()
+    # An interrupt just before the reader waits is noticed with the next one.
+    timers = [
+        threading.Timer(after, signal.pthread_kill, [threading.get_ident(), signal.SIGINT])
+        for after in (0.2, 5.0)
+    ]
+    for timer in timers:
+        timer.start()
     with pytest.raises(KeyboardInterrupt):
         attempt(hang, file)
+    timers[1].cancel()
     assert isolation._reader.process is None
     assert attempt(print_much, file).columns == {}
 

@@ -341,6 +341,7 @@ def test_small_types_that_swell(tmp_path):
     assert caught.value.reason == "too-large"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("n", "item"),
     [

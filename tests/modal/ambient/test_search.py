@@ -32,6 +32,7 @@ def test_every_mode_is_found_and_none_that_is_not_there(family: str, seed: int) 
     assert (found, false) == (there, 0)
 
 
+@pytest.mark.slow
 def test_a_harmonic_that_wanders_is_a_line_and_hides_no_mode() -> None:
     """Eight modes, two steady harmonics and one that wanders by 1 %."""
     world = FAMILIES["eight modes"](np.random.default_rng([231, 2, 4]))

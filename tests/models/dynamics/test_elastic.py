@@ -201,6 +201,7 @@ def test_energy_of_a_decay_is_what_the_dampers_take(name):
     assert taken > 0.01 * energy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FULL)
 def test_modes_keep_their_names_along_the_travel(name):
     """From end to end every mode is found, no frequency jumps, and those on the guide move."""

@@ -46,6 +46,7 @@ def test_no_wander_is_none():
     assert not common.any() and not own.any()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["lms-x", "lms-y", "lms-y-full"])
 def test_wander_moves_frequencies_by_itself(name):
     """Frequencies of the wandering stage are those of the other, times what was drawn."""

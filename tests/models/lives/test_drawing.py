@@ -39,6 +39,7 @@ def test_without_a_seed_the_machine_is_the_nominal_one():
     assert machine.numbers == {}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", STAGES)
 def test_a_seed_makes_one_machine(name):
     """The same seed gives the same machine, another seed another one, in every drawn number."""

@@ -142,6 +142,7 @@ def test_refuses_what_no_stage_has(wrong):
         wrong()
 
 
+@pytest.mark.slow
 def test_effects_leave_the_rest_of_a_seed_alone():
     """The noise of a seed is the same with effects: gusts and hits have a stream of their own."""
     seconds = {"seconds": 0.5, "rng": None}
