@@ -26,6 +26,7 @@ from lmshealth.tracking.history import History
 # Lives of the prior per scenario that the nodes are chosen by, and the drift in ln f that the QR
 # decomposition may leave: other lives are met within some 1e-6, those of a posterior within 1e-8.
 _N_EXAMPLES, _RESIDUAL = 300, 1e-8
+_AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed at a time
 _CACHED = 2_000_000  # whitened drifts that are computed at a time
 
 
@@ -105,16 +106,17 @@ class NodeBasis(ReadOnly):
     @classmethod
     def of(cls, data: LifeData) -> Self:
         """Choose the nodes by a pivoted QR decomposition of the drifts of lives of the prior."""
-        rng, examples, n_logs = np.random.default_rng(0), [], data.clock.size
+        rng, n_logs = np.random.default_rng(0), data.clock.size
+        joined = np.empty((0, n_logs))
         for scenario in data.scenarios:
             y = scenario.draw(rng, _N_EXAMPLES if scenario.n_dim else 1)
             x, inside = ln_health(data.stage, scenario, y, data.clock)
-            if inside.any():
-                examples.append(drifts(data, x[inside]).reshape(-1, n_logs))
-        if not examples:
+            # A few lives at a time, for the memory: R has the columns' geometry of all before.
+            for some in np.array_split(x[inside], inside.sum() * n_logs // _AT_A_TIME + 1):
+                part = drifts(data, some).reshape(-1, n_logs)
+                joined = qr(np.concatenate([joined, part]), mode="r")[0][:n_logs]
+        if not joined.size:
             raise NotEnoughData(f"{data.stage.name}: no life of the prior stays inside the map")
-        # The R of each part has the columns' geometry of the part.
-        joined = np.concatenate([qr(one, mode="r")[0][:n_logs] for one in examples])
         _, r, order = qr(joined, mode="economic", pivoting=True)
         n = max(int(np.sum(np.abs(np.diag(r)) > _RESIDUAL)), 1)
         nodes, weights = order[:n], np.zeros((n_logs, n))

@@ -1,8 +1,12 @@
-"""Run a machine after one new log, and from nothing, in a process of its own."""
+"""Run a machine after one new log, and from nothing, in a process of its own.
+
+The argument is a file with its estimates: what draws them does not count.
+"""
 
 from __future__ import annotations
 
 import json
+import pickle
 import sys
 import tempfile
 from contextlib import closing
@@ -17,37 +21,15 @@ from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
-from lmshealth.io.log import Metadata
-from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from studies.common.cost import cpu_s, memory_bytes
-from studies.common.lives import drawn, history_of, life_of, plan_of, recorded, rng_of
 from studies.harness.study import Row
 
 NAME, EPOCHS, SEED = "AX-1", 40, 0
-
-
-def readings(n: int) -> list[LogEstimates]:
-    """Draw the estimates of the logs of a life."""
-    life = life_of(plan_of("lms-y", "both", SEED, n))
-    history = history_of(life, drawn(life, *recorded("lms-y"), rng_of(41, 0, SEED)))
-    m, found = len(history.modes), []
-    for k in range(n):
-        modes = Modes(
-            names=history.modes, sources=("joint",) * m, channels=("acc_pitch",) * m,
-            ln_frequency=history.ln_frequency[k], ln_damping=history.ln_damping[k],
-            cov=history.cov[k], snr=np.full(m, 50.0), dispersion=np.ones(m), flags=("",) * m,
-            shape_channels=(), shapes=np.zeros((m, 0)), lines=(), refused=(),
-        )  # fmt: skip
-        covariates = {name: float(values[k]) for name, values in history.covariates.items()}
-        metadata = Metadata(NAME, history.recorded_at[k], float(history.travel[k]), covariates)
-        digest, error = fingerprint("log", n, k), float(history.loop_error[k])
-        found.append(LogEstimates(history.logs[k], digest, metadata, modes, error))
-    return found
 
 
 def run_with(
@@ -74,8 +56,8 @@ def run_with(
 
 def main() -> None:
     """Print costs, and what differs from a run from nothing, as JSON."""
-    n, stage = int(sys.argv[1]), load_stage("lms-y")
-    logs = readings(n)
+    logs, stage = pickle.loads(Path(sys.argv[1]).read_bytes()), load_stage("lms-y")
+    n = len(logs)
     kept: list[Assessment] = []
     with tempfile.TemporaryDirectory() as folder:
         out = Path(folder)

@@ -16,9 +16,20 @@ Run time
 
 from __future__ import annotations
 
+import pickle
+import tempfile
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
+import numpy as np
+
+from lmshealth._serialize import fingerprint
+from lmshealth.io.log import Metadata
+from lmshealth.modal.modes import Modes
+from lmshealth.tracking.history import LogEstimates
 from studies.common.cost import in_own_process
+from studies.common.lives import drawn, history_of, life_of, plan_of, recorded, rng_of
+from studies.cost_of_a_log.life import NAME, SEED
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
@@ -54,10 +65,32 @@ def main() -> None:
 
 def measured(n: int) -> Row:
     """Measure a history of so many logs."""
-    found: Row = in_own_process("studies.cost_of_a_log.life", n)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "estimates.pickle"
+        path.write_bytes(pickle.dumps(readings(n)))
+        found: Row = in_own_process("studies.cost_of_a_log.life", path)
     cost = found["cpu_s"]
     shares = {"new_over_first": cost["new"] / cost["first"]}
     return {"logs": n, **found, **shares, "unchanged_over_new": cost["unchanged"] / cost["new"]}
+
+
+def readings(n: int) -> list[LogEstimates]:
+    """Draw the estimates of the logs of a life."""
+    life = life_of(plan_of("lms-y", "both", SEED, n))
+    history = history_of(life, drawn(life, *recorded("lms-y"), rng_of(41, 0, SEED)))
+    m, found = len(history.modes), []
+    for k in range(n):
+        modes = Modes(
+            names=history.modes, sources=("joint",) * m, channels=("acc_pitch",) * m,
+            ln_frequency=history.ln_frequency[k], ln_damping=history.ln_damping[k],
+            cov=history.cov[k], snr=np.full(m, 50.0), dispersion=np.ones(m), flags=("",) * m,
+            shape_channels=(), shapes=np.zeros((m, 0)), lines=(), refused=(),
+        )  # fmt: skip
+        covariates = {name: float(values[k]) for name, values in history.covariates.items()}
+        metadata = Metadata(NAME, history.recorded_at[k], float(history.travel[k]), covariates)
+        digest, error = fingerprint("log", n, k), float(history.loop_error[k])
+        found.append(LogEstimates(history.logs[k], digest, metadata, modes, error))
+    return found
 
 
 def verdicts(rows: Sequence[Row]) -> dict[str, bool]:
