@@ -12,9 +12,11 @@ Method
     compared with their band as in `run`. Control, which must fail: the posterior before the twenty
     logs, in the place of the updated one.
 Answer
-    Not recorded yet.
+    No. After twenty updates mean squares of the differences are 0.02 to 0.5: posteriors have more
+    effective draws than 400. Without the twenty logs they are 5 to 3,700. All ranks are inside
+    their bands; 18 of 800 updates failed and were fitted from nothing.
 Run time
-    Half an hour on one processor.
+    45 minutes on one processor: half a minute a life, minutes after a jump.
 """
 
 from __future__ import annotations
