@@ -429,19 +429,20 @@ def _weighted_scenarios(
     densities = [LifeDensity(likelihood, one, grid) for one in likelihood.data.scenarios]
     generators = [np.random.default_rng(own) for own in seed.spawn(len(densities))]
     rough = [_rough(one, rng, before) for one, rng in zip(densities, generators, strict=True)]
-    least = max(map(_log_probability, rough)) - constants.MAX_LOG_ODDS
     n = _N_FINE if before is None else _N_UPDATE
-    likely = [k for k, one in enumerate(rough) if _log_probability(one) > least]
+    log_share = np.array([_log_probability(one) for one in rough])
+    log_share -= log_share.max()
+    likely = np.flatnonzero(log_share > -constants.MAX_LOG_ODDS).tolist()
+    # Errors of a mixture are those of a single scenario if draws follow the root of the share.
+    sizes = np.maximum(_N_ROUGH, n * np.exp(log_share / 2)).astype(int).tolist()
     drawn = [k for k in likely if densities[k].scenario.n_dim]
     explored = list(rough)
     for k in drawn:
         density, draws = rough[k]
         start = draws.resampled(generators[k], _N_ROUGH)
         density = density.narrowed(start[: _N_ROUGH // 3])
-        draws = importance_sample(density.log_probability, start, generators[k], n)
+        draws = importance_sample(density.log_probability, start, generators[k], sizes[k])
         explored[k] = density, draws
-    # More draws of the more probable scenarios: errors of the mixture are then at most those of a
-    # single scenario with as many effective draws as it needs.
     largest = max(_log_probability(explored[k]) for k in likely)
     for k in drawn:
         density, draws = explored[k]
@@ -451,7 +452,7 @@ def _weighted_scenarios(
         judged = before is not None and share >= constants.MIN_CHAIN_PROBABILITY
         if draws.ess < needed or (judged and draws.pareto_k >= MAX_PARETO_K):
             start = draws.resampled(generators[k], _N_ROUGH)
-            how = start, generators[k], 3 * n, needed
+            how = start, generators[k], 3 * sizes[k], needed
             explored[k] = density, importance_sample_to_ess(density.log_probability, *how)
     widest = max(one.scenario.n_dim for one in densities)
     points = np.zeros((len(densities), _N_START, widest))
