@@ -397,7 +397,9 @@ def test_a_scenario_of_little_probability_has_no_chains(
     assert {way.probability >= 0.5 for way in with_law} == {True, False}
     for way in with_law:
         assert np.isfinite(way.r_hat).all() == (way.probability >= 0.5)
-        assert 0 < way.evidence_std <= 1 / np.sqrt(400)
+        # As many effective draws as its share needs; the share itself is an estimate.
+        share = way.probability / max(one.probability for one in fit.scenarios)
+        assert 0 < way.evidence_std**2 * 400 * np.sqrt(share) < 1.25
 
 
 @pytest.mark.slow
