@@ -43,7 +43,7 @@ MOST_NEW, MOST_FIRST, MOST_GROWTH, MOST_MB = 5.0, 45.0, 1.5, 350.0
 MOST_APART = 4.0
 FLEET = 1000
 OLDER = {
-    "result": Older("c94f75414009", "improbable scenarios of a life had fewer draws"),
+    "result": Older("f32ac03b638b", "improbable scenarios of a life had fewer draws"),
 }
 NOT_MET = {
     "a new log takes at most 5 s": (
@@ -52,7 +52,7 @@ NOT_MET = {
     ),
     "a first run of 60 logs takes at most 45 s": "40 epochs are drawn, four of which emcee judges",
     "growth with the history": (
-        "outcomes of all logs are read and associated again, and rows of all logs are written to the "
+        "outcomes of all logs are read and associated again, and their rows are written to the "
         "tables; the likelihood of a life grows with its logs until they are condensed"
     ),
     "memory": "210 MB are imported libraries; the tracker's settings take 60 MB",
