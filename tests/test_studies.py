@@ -484,6 +484,15 @@ def test_sbc_life_updated(root: Path) -> None:
     assert answer["passed"]["twenty logs make a difference (control)"]
 
 
+def test_cost_of_a_log(root: Path) -> None:
+    """After a new log answers are those from nothing, and a machine without one costs nothing."""
+    passed = json.loads(run_study(root, "cost_of_a_log"))["passed"]
+    assert passed["epochs are those of a run from nothing"]
+    assert passed["lives are those of a run from nothing"]
+    assert passed["another life differs"]
+    assert passed["an unchanged machine costs nothing"]
+
+
 def test_lifetimes_raw(root: Path) -> None:
     """From raw logs to the remaining life: a life of four logs is told, and not refused."""
     answer = json.loads(run_study(root, "lifetimes_raw"))
