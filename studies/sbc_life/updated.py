@@ -6,7 +6,7 @@ Method
     the draws of one posterior start the importance sampling of the next. It is compared with the
     posterior of all logs from nothing, by importance sampling too: means of whether a part loses
     health, of health now and of exp(-remaining travel / travel until now), in standard errors of
-    400 effective draws each, fewer than which no posterior of a scenario has. Mean squares of these
+    400 effective draws each: fewer no mixture of scenarios has. Mean squares of these
     differences above 1 show an error beyond that of sampling; far below 1 they show that the
     standard error is too large. Ranks of the truth among draws of the updated posterior are
     compared with their band as in `run`. Control, which must fail: the posterior before the twenty
@@ -32,7 +32,7 @@ from lmshealth.health.constants import MIN_ESS
 from lmshealth.prognosis import life_posterior
 from lmshealth.prognosis.life_posterior import LifePosterior, LifeStart, fit_life
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
-from studies.harness.claims import Claim, number, ranked
+from studies.harness.claims import Claim, Older, number, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_life.lives import Life, draw
 from studies.sbc_life.run import (
@@ -47,6 +47,7 @@ from studies.sbc_life.run import (
 )
 
 STEP = "prognose"
+OLDER = {"updated": Older("aa8065327160", "improbable scenarios of a life had fewer draws")}
 sample_updated = life_posterior._updated
 LIVES, UPDATES, QUICK_UPDATES = 40, 20, 2
 # Probability of a larger mean square where updates are exact.

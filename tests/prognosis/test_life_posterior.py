@@ -186,9 +186,9 @@ def test_importance_sampling_alone_has_the_same_posterior(
 @pytest.mark.slow
 def test_a_life_updated_log_by_log_is_that_from_nothing(history: History, stage: Stage) -> None:
     """After five updates in a row quantiles are those of a fit from nothing, within its error."""
-    one = fit_life(first_logs(history, 7), stage, 11, chains=False, n_draws=400)
+    one = fit_life(history.first_logs(7), stage, 11, chains=False, n_draws=400)
     for n in range(8, 13):
-        one = fit_life(first_logs(history, n), stage, 11, n_draws=2000, before=one.start)
+        one = fit_life(history.first_logs(n), stage, 11, n_draws=2000, before=one.start)
         assert np.isnan(one.scenarios[0].r_hat).all()  # no chains
     whole = fit_life(history, stage, 12, chains=False, n_draws=2000)
     draws = [
@@ -216,7 +216,7 @@ def test_the_update_of_a_life_without_wear_is_accepted(
     """A scenario without coordinates has a single draw, which is exact."""
     travel = 1e5 + np.linspace(0.0, 2e6, 12)
     history = lived(travel, np.ones(12), np.ones(12))
-    one = fit_life(first_logs(history, 11), wavering, 11, chains=False, n_draws=400)
+    one = fit_life(history.first_logs(11), wavering, 11, chains=False, n_draws=400)
     probable = {way.scenario.n_dim: way.probability for way in one.scenarios}
     assert probable[0] > constants.MIN_CHAIN_PROBABILITY
     starts = []
@@ -229,15 +229,6 @@ def test_the_update_of_a_life_without_wear_is_accepted(
     monkeypatch.setattr(lifefit, "_weighted_scenarios", counting)
     fit_life(history, wavering, 11, chains=False, n_draws=400, before=one.start)
     assert starts == [(one.start,)]
-
-
-def first_logs(history: History, n: int) -> History:
-    """Return the history of the first logs."""
-    names = ("logs", "recorded_at", "travel", "ln_frequency", "ln_damping", "cov", "loop_error")
-    covariates = {name: values[:n] for name, values in history.covariates.items()}
-    return replace(
-        history, covariates=covariates, **{name: getattr(history, name)[:n] for name in names}
-    )
 
 
 def test_linear_algebra_keeps_to_one_thread(
