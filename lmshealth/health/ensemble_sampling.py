@@ -24,7 +24,7 @@ Start = Callable[[np.random.Generator], FloatArray]
 
 _FIRST_STEPS, _START_ATTEMPTS = 250, 100
 # Vectorised, many walkers cost little more than few.
-_MIN_WALKERS, _WALKERS_PER_DIMENSION = 32, 16
+_MIN_WALKERS, _WALKERS_PER_DIMENSION = 64, 16
 # Draws of the prior, and of the importance sampler, that starts are chosen from.
 _N_PRIOR, _N_START = 1000, 1000
 _N_WEIGHTED = 2000  # weighted draws of each importance sampler

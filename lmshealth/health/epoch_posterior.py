@@ -41,10 +41,7 @@ class MachineDrifts:
 
         Both ``(n_map_errors, n_points)``, for the possible errors of the map.
         """
-        own = x[:, self.columns]
-        n, n_parameters = own.shape
-        drift = self.stage.drift(with_single_changes(self.stage, own), self.modes)
-        drift = drift.reshape(n_parameters + 1, n, -1)
+        drift = self.stage.drifts(x[:, self.columns], self.modes)
         variance = np.array([std for std, _ in self.stage.map_errors])[:, None, None] ** 2
         error = variance * np.sum(drift[1:] ** 2, axis=0)
         cov = self.cov + error[..., None] * np.eye(len(self.modes))
@@ -91,17 +88,3 @@ class EpochPosterior:
         low, high = np.quantile(x, (0.05, 0.95), axis=0)
         margin = constants.EDGE_SHARE * (self.prior.high - self.prior.low)
         return np.asarray((low < self.prior.low + margin) | (high > self.prior.high - margin))
-
-
-def with_single_changes(stage: Stage, x: FloatArray) -> FloatArray:
-    """Stack points with copies in which all parameters but one are at baseline.
-
-    Ln parameters ``(n_points, n_parameters)`` become ``((1 + n_parameters) n_points,
-    n_parameters)``: the points, then for each parameter those with all others at baseline.
-    """
-    stacked = np.empty((x.shape[1] + 1, *x.shape))
-    stacked[0] = x
-    stacked[1:] = stage.baseline_point
-    for j in range(x.shape[1]):
-        stacked[1 + j, :, j] = x[:, j]
-    return stacked.reshape(-1, x.shape[1])

@@ -16,6 +16,8 @@ _FREEDOM = 5
 _N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
 # Effective share of the draws at which the proposal is good enough for the last round.
 _GOOD_SHARE = 0.3
+# Effective draws per dimension from which a proposal is made.
+_LEAST_PER_DIMENSION = 20.0
 # Share of a wide component about all draws, which covers tails between and beyond the kernels, and
 # its width in standard deviations [Hesterberg1995].
 _WHOLE_SHARE, _WHOLE_WIDTH = 0.2, 1.5
@@ -70,7 +72,26 @@ def importance_sample(
         if _weighted(points, log_weight).ess >= _GOOD_SHARE * few and points is not start:
             break
         points, proposal = _propose(_adapted(points, log_weight), rng, few)
-    points, proposal = _propose(_adapted(points, log_weight), rng, n)
+    return _drawn_near(log_probability, _adapted(points, log_weight), rng, n)
+
+
+def importance_sample_again(
+    log_probability: LogProbability, before: WeightedDraws, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    """Draw n times from a density, given draws of nearly the same: without rounds if they suffice.
+
+    `NotConverged` is raised as by `importance_sample`.
+    """
+    if before.ess >= _LEAST_PER_DIMENSION * before.points.shape[1]:
+        return _drawn_near(log_probability, before, rng, n)
+    start = before.resampled(rng, before.points.shape[0])
+    return importance_sample(log_probability, start, rng, n)
+
+
+def _drawn_near(
+    log_probability: LogProbability, draws: WeightedDraws, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    points, proposal = _propose(draws, rng, n)
     return _weighted(points, log_probability(points) - proposal)
 
 
@@ -113,7 +134,8 @@ def tempered(points: FloatArray, log_weight: FloatArray, min_ess: float) -> Weig
 
 def _adapted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
     n_inside = np.isfinite(log_weight).sum()
-    return tempered(points, log_weight, min(20.0 * points.shape[1], 0.3 * n_inside))
+    wanted = _LEAST_PER_DIMENSION * points.shape[1]
+    return tempered(points, log_weight, min(wanted, 0.3 * n_inside))
 
 
 def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:

@@ -14,7 +14,6 @@ from scipy.linalg import qr, solve_triangular
 
 from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
-from lmshealth.health.epoch_posterior import with_single_changes
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_data import LifeData
 from lmshealth.prognosis.scenarios import Scenario
@@ -291,9 +290,8 @@ def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     Shape ``(n_modes, 1 + n_parameters, n, n_moments)``.
     """
     n, n_moments, n_parameters = x.shape
-    flat = with_single_changes(data.stage, x.reshape(-1, n_parameters))
-    drift = data.stage.drift(flat, data.modes).reshape(-1, n, n_moments, len(data.modes))
-    return np.moveaxis(drift, 3, 0)
+    drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
+    return np.moveaxis(drift.reshape(-1, n, n_moments, len(data.modes)), 3, 0)
 
 
 def _reduced(

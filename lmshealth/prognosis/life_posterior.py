@@ -18,6 +18,7 @@ from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stre
 from lmshealth.health.importance_sampling import (
     WeightedDraws,
     importance_sample,
+    importance_sample_again,
     importance_sample_to_ess,
 )
 from lmshealth.health.results import QUANTILES
@@ -439,9 +440,8 @@ def _weighted_scenarios(
     explored = list(rough)
     for k in drawn:
         density, draws = rough[k]
-        start = draws.resampled(generators[k], _N_ROUGH)
-        density = density.narrowed(start[: _N_ROUGH // 3])
-        draws = importance_sample(density.log_probability, start, generators[k], sizes[k])
+        density = density.narrowed(draws.resampled(generators[k], _N_ROUGH // 3))
+        draws = importance_sample_again(density.log_probability, draws, generators[k], sizes[k])
         explored[k] = density, draws
     largest = max(_log_probability(explored[k]) for k in likely)
     for k in drawn:

@@ -322,6 +322,21 @@ class Stage:
         columns = [self.modal_map.modes.index(name) for name in modes]
         return (self.modal_map.ln_frequency(x) - self._ln_frequency_at_baseline)[:, columns]
 
+    def drifts(self, x: FloatArray, modes: tuple[str, ...]) -> FloatArray:
+        """Predict `drift`, then that of each parameter alone, all others at baseline.
+
+        Shape ``(1 + n_parameters, n_points, n_modes)``.
+        """
+        assert self.modal_map is not None
+        columns = [self.modal_map.modes.index(name) for name in modes]
+        found = self.modal_map.ln_frequency_alone(x, self._alone)
+        return (found - self._ln_frequency_at_baseline)[..., columns]
+
+    @cached_property
+    def _alone(self) -> tuple[FloatArray, ...]:
+        assert self.modal_map is not None  # drifts() is of stages with one
+        return self.modal_map.alone(self.baseline_point)
+
     @cached_property
     def _ln_frequency_at_baseline(self) -> FloatArray:
         assert self.modal_map is not None  # drift() has checked

@@ -1,5 +1,6 @@
 """Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import reduce
 from io import BytesIO
@@ -8,7 +9,6 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 from numpy.polynomial.chebyshev import chebder, chebvander
-from scipy.linalg import khatri_rao
 
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth._files import read_table
@@ -42,6 +42,29 @@ class ModalMap:
         the grid: there is no extrapolation.
         """
         return _evaluate(self.coefficients, self._unit(x))
+
+    def alone(self, point: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the series over each parameter with all others at a point ``(n_parameters,)``.
+
+        Chebyshev coefficients of shape ``(d + 1, n_modes)`` each.
+        """
+        found, ends = [], _bases(self._unit(point[None]), self.coefficients.shape[:-1])
+        for j in range(len(self.parameters)):
+            series = np.moveaxis(self.coefficients, j, -2)
+            for k, basis in enumerate(ends):
+                if k != j:
+                    series = np.tensordot(basis[0], series, 1)
+            found.append(series)
+        return tuple(found)
+
+    def ln_frequency_alone(self, x: FloatArray, alone: tuple[FloatArray, ...]) -> FloatArray:
+        """Evaluate `ln_frequency`, then the series of each parameter by `alone`, at points.
+
+        Shape ``(1 + n_parameters, n_points, n_modes)``; the basis of each parameter is shared.
+        """
+        bases = _bases(self._unit(x), self.coefficients.shape[:-1])
+        whole = _product(bases) @ self.coefficients.reshape(-1, len(self.modes))
+        return np.stack([whole, *(b @ own for b, own in zip(bases, alone, strict=True))])
 
     def gradient(self, x: FloatArray) -> FloatArray:
         """Differentiate ln frequency by the ln parameters, ``(n_points, n_modes, n_parameters)``.
@@ -128,48 +151,52 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
             f"with modes {list(modes)} needs {n_grid * len(modes)}"
         )
     if min(axis.size for axis in axes) < 3:
-        sizes = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
-        raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {sizes}")
+        found = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+        raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {found}")
     points = np.log(wide.index.to_frame().to_numpy(dtype=float))
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
-    degrees, miss = _choose_degrees(unit, np.log(values), [axis.size for axis in axes])
-    solution = np.linalg.lstsq(_basis(unit, degrees), np.log(values), rcond=None)[0]
-    coefficients = solution.reshape(*[d + 1 for d in degrees], len(modes))
+    sizes, miss = _choose_sizes(unit, np.log(values), [axis.size for axis in axes])
+    basis = _product(_bases(unit, sizes))
+    coefficients = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
+    coefficients = coefficients.reshape(*sizes, len(modes))
     return ModalMap(parameters, modes, low, high, coefficients, miss)
 
 
 def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
     """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
     *sizes, n_modes = coefficients.shape
-    degrees = [size - 1 for size in sizes]
-    return np.asarray(_basis(unit, degrees) @ coefficients.reshape(-1, n_modes))
+    return np.asarray(_product(_bases(unit, sizes)) @ coefficients.reshape(-1, n_modes))
 
 
-def _basis(unit: FloatArray, degrees: list[int]) -> FloatArray:
-    rows = (chebvander(x, degree).T for x, degree in zip(unit.T, degrees, strict=True))
-    return np.asarray(reduce(khatri_rao, rows).T)
+def _bases(unit: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
+    """Return the polynomials of each parameter at points, ``(n_points, size)`` each."""
+    return [chebvander(x, size - 1) for x, size in zip(unit.T, sizes, strict=True)]
 
 
-def _choose_degrees(
-    unit: FloatArray, values: FloatArray, sizes: list[int]
+def _product(bases: list[FloatArray]) -> FloatArray:
+    return reduce(lambda a, b: (a[:, :, None] * b[:, None]).reshape(len(a), -1), bases)
+
+
+def _choose_sizes(
+    unit: FloatArray, values: FloatArray, grid: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Choose the degree of each axis with the least error at inner grid points, each left out.
+    """Choose the coefficients of each axis with the least error at inner grid points left out.
 
     The error of a fit without a point is r / (1 - h) there, r the residual and h the leverage of
     the fit with it. The largest of each mode is returned, too, ``(n_modes,)``.
     """
     interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None
-    for degree in range(1, min(max(sizes) - 1, _MAX_DEGREE) + 1):
-        # One degree less than the axis permits keeps fits without a point well posed.
-        degrees = [min(degree, size - 2) for size in sizes]
-        span = np.linalg.qr(_basis(unit, degrees))[0]
+    for degree in range(1, min(max(grid) - 1, _MAX_DEGREE) + 1):
+        # One less than the axis permits keeps fits without a point well posed.
+        sizes = [min(degree + 1, n - 1) for n in grid]
+        span = np.linalg.qr(_product(_bases(unit, sizes)))[0]
         residual = values - span @ (span.T @ values)
         rest = 1 - np.sum(span**2, axis=1)
         error = np.abs(residual / rest[:, None])[interior].max(axis=0)
         if best is None or error.max() < best[1].max():
-            best = degrees, error
+            best = sizes, error
         if error.max() < _NEGLIGIBLE:
             break
     assert best is not None  # at least 3 grid values: degree 1 is always tried

@@ -9,7 +9,6 @@ from functools import cache
 import numpy as np
 from scipy.special import erf
 
-from lmshealth.health.epoch_posterior import with_single_changes
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from models.lives.degradation import (
@@ -144,8 +143,6 @@ def _covariance(history: History) -> Array:
 
 def _map_error(stage: Stage, x: Array, modes: tuple[str, ...]) -> Array:
     """Covariance of relative errors of 1 of every sensitivity, one per parameter and mode."""
-    alone = stage.drift(with_single_changes(stage, x), modes).reshape(-1, x.shape[0], len(modes))[
-        1:
-    ]
+    alone = stage.drifts(x, modes)[1:]
     total = np.einsum("jkm,jlm,mi->kmli", alone, alone, np.eye(len(modes)))
     return np.asarray(total.reshape(alone[0].size, -1))

@@ -12,7 +12,6 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from lmshealth.health.ensemble_sampling import start_from_prior
-from lmshealth.health.epoch_posterior import with_single_changes
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, ln_health
 from lmshealth.prognosis.life_posterior import LifeDensity
 from lmshealth.prognosis.remaining_life import prognose
@@ -106,9 +105,7 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
 
     def loop() -> Array:
         x, _ = ln_health(stage, scenario, y[:looped], history.clock())
-        flats = [
-            stage.drift(with_single_changes(stage, path), MODES).reshape(3, -1, 2) for path in x
-        ]
+        flats = [stage.drifts(path, MODES) for path in x]
         setting = {"walk": walk, "scale": scale, "model_std": model_std}
         return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])
 

@@ -23,7 +23,7 @@ from lmshealth.health.ensemble_sampling import (
 )
 
 MEAN = np.array([0.3, -1.2])
-WALKERS = 32
+WALKERS = 64
 COV = np.array([[0.04, 0.018], [0.018, 0.01]])
 
 
@@ -259,13 +259,13 @@ def test_starts_are_inside_the_support_and_distinct(width: float) -> None:
     for start in starts:
         rng = np.random.default_rng(1)
         points = start(rng)
-        assert points.shape == (32, 2)
+        assert points.shape == (64, 2)
         assert np.isfinite(box(points)).all()
-        assert np.unique(points, axis=0).shape[0] == 32
+        assert np.unique(points, axis=0).shape[0] == 64
         assert not np.array_equal(points, start(rng))
 
 
-@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 32), (2, 32), (4, 64)])
+@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 64), (2, 64), (5, 80)])
 def test_starts_among_draws_are_some_of_them(n_dim: int, walkers: int) -> None:
     """So many walkers as the dimensions ask for begin at draws, no two at the same."""
     rng = np.random.default_rng(5)
@@ -301,14 +301,14 @@ def test_starts_among_few_draws_of_weight_spread_out() -> None:
     weight /= weight.sum()
     assert 1 / np.sum(weight**2) < 20
     found = start_among(points, weight)(np.random.default_rng(7))
-    assert np.unique(found).size == 32
+    assert np.unique(found).size == 64
     assert np.median(np.abs(found - 0.5)) < 0.1
 
 
 def test_a_centre_outside_the_support_is_refused() -> None:
     """Where next to no point about a centre is possible, the error carries what was found."""
     start = start_near(MEAN, COV, lambda x: np.full(x.shape[0], -np.inf))
-    with pytest.raises(NotConverged, match=r"of 3200 points about .* 0 lie inside") as caught:
+    with pytest.raises(NotConverged, match=r"of 6400 points about .* 0 lie inside") as caught:
         start(np.random.default_rng(1))
     assert np.shape(caught.value.chains) == (0, 2)
 
@@ -354,5 +354,5 @@ def test_a_prior_with_too_few_possible_draws_is_refused() -> None:
         possible = np.arange(x.shape[0]) < 7
         return np.where(possible, 0.0, -np.inf)
 
-    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed"):
+    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 64 are needed"):
         start_from_prior(seldom, wide)(np.random.default_rng(3))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth._arrays import FloatArray
-from lmshealth.health.epoch_posterior import EpochPosterior, with_single_changes
+from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage
 from tests.lives import AXES, make_stage, true_drift
@@ -72,8 +72,9 @@ def test_outside_the_map_is_impossible_and_raises_nothing(stage: Stage) -> None:
     assert np.isneginf(posterior.log_probability(x[1:3])).all()
 
 
-def test_one_at_a_time_moves_one_parameter(stage: Stage) -> None:
-    """The stack is the points, then each parameter alone with the other at baseline."""
+def test_drifts_of_one_parameter_alone(stage: Stage) -> None:
+    """Drifts along points come first, then of each parameter with the other at baseline."""
     x = np.array([[-0.1, -0.2], [-0.3, -0.4]])
-    known = [[-0.1, -0.2], [-0.3, -0.4], [-0.1, 0], [-0.3, 0], [0, -0.2], [0, -0.4]]
-    np.testing.assert_array_equal(with_single_changes(stage, x), known)
+    stacked = [x, x * [1, 0], x * [0, 1]]
+    known = [stage.drift(points, ("roll", "pitch")) for points in stacked]
+    np.testing.assert_allclose(stage.drifts(x, ("roll", "pitch")), known, rtol=0, atol=1e-13)
