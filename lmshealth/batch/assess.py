@@ -34,8 +34,15 @@ from lmshealth.prognosis.life_posterior import LifeStart
 from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise
+from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import History, LogEstimates, build_history, missing_mode_notices
+from lmshealth.tracking.history import (
+    History,
+    LogEstimates,
+    build_history,
+    missing_mode_notices,
+    sort_by_time,
+)
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import (
     TrackStart,
@@ -43,6 +50,9 @@ from lmshealth.tracking.track import (
     continue_track,
     outlier_refusals,
 )
+
+ROWS = fingerprint(VERSION, "rows")
+"""Key of the part of an assessment that has the rows of its logs (`LogRows`)."""
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -317,11 +327,32 @@ def _assess_packed(
     mapper = map if executor is None else partial(map_in_order, executor)
 
     def work() -> PackedAssessment:
-        parts = Parts(known, mapper)
-        made = pack_assessment(_assess(unpack_logs(logs), machine, parts))
+        parts, readings = Parts(known, mapper), unpack_logs(logs)
+        made = pack_assessment(_assess(readings, machine, parts))
+        parts.used[ROWS] = _pack_rows(readings, machine, known.get(ROWS))
         return replace(made, parts=parts.used)
 
     return reason_if_failed(work, machine.name, (CancelledError, *crashes))
+
+
+@dataclass(frozen=True, slots=True)
+class LogRows:
+    """Tables of one log as CSV by name; they depend on its name and its key."""
+
+    log: str
+    key: str
+    tables: dict[str, str]
+
+
+def _pack_rows(readings: Sequence[LogEstimates], machine: Machine, before: bytes | None) -> bytes:
+    """Encode the rows of all logs in the order of time; those that are known are not made again."""
+    found: list[LogRows] = unpack_or_none(before, list[LogRows]) or []
+    known = {(own.log, own.key): own for own in found}
+    keys, rows = dict(machine.logs), []
+    for reading in sort_by_time(readings):
+        own = reading.log, keys[reading.log]
+        rows.append(known.get(own) or LogRows(*own, log_tables(reading)))
+    return pack(rows)
 
 
 def apply_fleet_priors(

@@ -14,7 +14,7 @@ from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
-from lmshealth.batch.assess import Machine, PackedLogs, apply_fleet_priors, assess_all, packed_logs
+from lmshealth.batch.assess import ROWS, Machine, apply_fleet_priors, assess_all
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Fleet, Status
@@ -28,7 +28,7 @@ from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.interactive import interactive_page
-from lmshealth.report.tables import refused_rows
+from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
 
@@ -293,7 +293,7 @@ def _report(
     rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    packed = dict[str, bytes]()
+    tables = dict[str, dict[str, bytes]]()
     left = list(machines)
     for attempt in range(constants.ASSESSMENT_ATTEMPTS):
         if attempt:
@@ -306,7 +306,7 @@ def _report(
                 failed[name] = output
                 continue
             store.publish(name, (keys[name], own_keys[name]), refused_key)
-            packed[name] = output.tables
+            tables[name] = output.tables
             excluded.update(output.excluded)
             made[name] = output.status
             rows[name] = output.summary
@@ -318,8 +318,9 @@ def _report(
     fleet, changes = update_fleet(read_fleet(out), made, moment, alerts)
     store.put_status(fleet.machines, changes, moment)
     changed = [msgspec.to_builtins(change) for change in changes]
-    packed[""] = pack({"refused": refused_rows(refused), "changes": changed})
-    write_tables(out, names, packed)
+    of_run = {"refused": refused_rows(refused), "changes": changed}
+    tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
+    write_tables(out, names, tables)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     result = RunResult(
         index=out / "index.html",
@@ -338,32 +339,32 @@ def _outputs(
     resources: Resources,
     out: Path,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write pages as `write_pages` does; those of unchanged results are taken from the store."""
-    store, missing = resources.store, dict[str, tuple[Machine, str]]()
+    """Write pages as `write_pages` does; those of unchanged results are taken from the store.
+
+    Machines without the rows of their logs are skipped.
+    """
+    store, missing = resources.store, dict[str, str]()
     for machine in machines:
         name = machine.name
         record = _record(name, keys[name], files[name], store)
+        if record.rows is None:
+            continue
         key = fingerprint(VERSION, record, machine.logs)
         kept: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
         if kept is None:
-            missing[name] = machine, key
+            missing[name] = key
         else:
             write_text(out / files[name], kept.page)
             yield name, kept
-    records = (
-        _record(name, keys[name], files[name], store, packed_logs(machine, store))
-        for name, (machine, _) in missing.items()
-    )
+    records = (_record(name, keys[name], files[name], store) for name in missing)
     for name, output in write_pages(records, resources.pool, out):
         if isinstance(output, MachineOutput):
             store.put_points(name, output.points)
-            store.put_part(name, missing[name][1], pack(output))
+            store.put_part(name, missing[name], pack(output))
         yield name, output
 
 
-def _record(
-    machine: str, key: str, file: str, store: Store, logs: PackedLogs = ()
-) -> MachineRecord:
+def _record(machine: str, key: str, file: str, store: Store) -> MachineRecord:
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, logs, before)
+    return MachineRecord(machine, file, assessment, store.part(machine, ROWS), before)

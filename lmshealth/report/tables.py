@@ -1,6 +1,8 @@
 """Tables of a run and of single logs, with the columns of the public contract (units in names)."""
 
-from collections.abc import Iterable, Sequence
+import csv
+import io
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, astuple
 from datetime import date, datetime
 from itertools import combinations
@@ -97,14 +99,59 @@ def frame(columns: str, rows: Sequence[Row]) -> pd.DataFrame:
     return pd.DataFrame(list(rows), columns=list(order))
 
 
-def machine_tables(
-    readings: Sequence[LogEstimates], assessment: Assessment
-) -> dict[str, list[Row]]:
-    """Return the rows of all tables of one machine and its logs, by table (key of `COLUMNS`)."""
-    rows: dict[str, list[Row]] = {name: [] for name in COLUMNS}
-    for reading in readings:
-        rows["modes"] += modes_rows(reading)
-        rows["modes_cov"] += _modes_cov_rows(reading)
+def csv_text(table: str, rows: Iterable[Row]) -> str:
+    """Write rows of a table (key of `COLUMNS`) as CSV, NaN as a missing value."""
+    rows = list(rows)
+    columns = dict.fromkeys(COLUMNS[table].split())
+    for row in rows:
+        columns |= dict.fromkeys(row)
+    target = io.StringIO()
+    writer = csv.DictWriter(target, columns, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows({key: cell for key, cell in row.items() if cell == cell} for row in rows)
+    return target.getvalue()
+
+
+def join_csv(parts: Sequence[Any], read: Callable[[Any], str] = str) -> Iterator[str]:
+    """Join tables of `csv_text` to one, in pieces; columns of later ones follow as they appear.
+
+    Each part is read twice, so that only one of them needs to be in memory as text.
+    """
+    columns: dict[str, None] = {}
+    for part in parts:
+        columns |= dict.fromkeys(_header(read(part)))
+    header = _line(columns)
+    yield header
+    for part in parts:
+        text = read(part)
+        if text.startswith(header):
+            yield text[len(header) :]
+        else:
+            target = io.StringIO()
+            writer = csv.DictWriter(target, columns, lineterminator="\n")
+            writer.writerows(csv.DictReader(io.StringIO(text, newline="")))
+            yield target.getvalue()
+
+
+def _header(text: str) -> list[str]:
+    return next(csv.reader(io.StringIO(text, newline="")))
+
+
+def _line(cells: Iterable[str]) -> str:
+    target = io.StringIO()
+    csv.writer(target, lineterminator="\n").writerow(cells)
+    return target.getvalue()
+
+
+def log_tables(reading: LogEstimates) -> dict[str, str]:
+    """Return the tables of one log as CSV, by name."""
+    rows = {"modes": modes_rows(reading), "modes_cov": _modes_cov_rows(reading)}
+    return {name: csv_text(name, own) for name, own in rows.items()}
+
+
+def machine_tables(assessment: Assessment) -> dict[str, list[Row]]:
+    """Return the rows of the tables of one machine without those of its logs, by table."""
+    rows: dict[str, list[Row]] = {}
     if assessment.track is not None:
         rows["track"] = track_rows(assessment.track)
         rows["track_cov"] = track_cov_rows(assessment.track)

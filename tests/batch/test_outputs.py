@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 
-from lmshealth._serialize import pack, unpack
+from lmshealth._serialize import pack
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.outputs import MachineRecord, machine_output, write_tables
 from lmshealth.io.log import Refusal
-from lmshealth.report.tables import COLUMNS, Row, refused_rows
+from lmshealth.report.tables import COLUMNS, csv_text, refused_rows
 from tests.assessments import worn
 
 
@@ -22,10 +22,10 @@ def read(path: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(stream))
 
 
-def effect(mode: str, **more: Any) -> bytes:
-    """Give a row of effects.csv."""
+def effect(mode: str, **more: Any) -> dict[str, bytes]:
+    """Give effects.csv with one row."""
     row = {"stage": "A", "mode": mode, "coefficient": 0.1 + 0.2, "std": float("nan"), **more}
-    return pack({"effects": [row]})
+    return {"effects": pack(csv_text("effects", [row]))}
 
 
 def test_rows_stand_in_the_order_of_the_machines(tmp_path: Path) -> None:
@@ -44,8 +44,8 @@ def test_a_machine_that_never_comes_keeps_no_other_from_its_place(tmp_path: Path
 
 def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
     """A column that only some rows have is empty in the others, and comes last."""
-    one, two = effect("roll", note='two\nlines, "quoted"'), effect("pitch", other=1)
-    write_tables(tmp_path, ["A", "B"], {"A": one, "B": two})
+    tables = {"A": effect("roll", note='two\nlines, "quoted"'), "B": effect("pitch", other=1)}
+    write_tables(tmp_path, ["A", "B"], tables)
     one, two = read(tmp_path / "effects.csv")
     assert list(one) == [*COLUMNS["effects"].split(), "note", "other"]
     assert (one["note"], one["other"]) == ('two\nlines, "quoted"', "")
@@ -62,8 +62,8 @@ def test_a_cell_may_hold_any_sign(tmp_path: Path) -> None:
 
 def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
     """Refused logs are listed, and tables without rows have their headers."""
-    refused = pack({"refused": refused_rows([Refusal("a.h5", "empty", "0 bytes")])})
-    write_tables(tmp_path, [], {"": refused})
+    rows = refused_rows([Refusal("a.h5", "empty", "0 bytes")])
+    write_tables(tmp_path, [], {"": {"refused": pack(csv_text("refused", rows))}})
     assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
     for name, columns in COLUMNS.items():
         head = (tmp_path / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
@@ -74,7 +74,7 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
     """An error leaves the last complete tables, and no other file in the folder."""
     (tmp_path / "effects.csv").write_text("as it was")
     with pytest.raises(ValueError):
-        write_tables(tmp_path, ["A", "B"], {"A": effect("roll"), "B": b"damaged"})
+        write_tables(tmp_path, ["A", "B"], {"A": effect("roll"), "B": {"effects": b"damaged"}})
     assert [path.name for path in tmp_path.iterdir()] == ["effects.csv"]
     assert (tmp_path / "effects.csv").read_text() == "as it was"
 
@@ -83,10 +83,10 @@ def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> N
 def test_a_page_needs_no_logs(tmp_path: Path) -> None:
     """The assessment is enough for the page; one that cannot be decoded has no output."""
     made = pack_assessment(worn(tmp_path))
-    output = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, (), None))
+    output = machine_output(MachineRecord("M7-Y", "M7-Y.html", made.content, None, None))
     assert output is not None
     summary = output.summary
     assert (summary.file, summary.identity) == ("M7-Y.html", "M7-Y")
-    assert unpack(output.tables, dict[str, list[Row]]) == {}
-    assert machine_output(MachineRecord("M7-Y", "M7-Y.html", b"nonsense", (), None)) is None
-    assert machine_output(MachineRecord("M7-Y", "M7-Y.html", None, (), None)) is None
+    assert output.tables == {}
+    for assessment, rows in ((b"nonsense", None), (None, None), (made.content, b"nonsense")):
+        assert machine_output(MachineRecord("M7-Y", "M7-Y.html", assessment, rows, None)) is None

@@ -235,6 +235,31 @@ def test_known_parts_are_not_computed_again() -> None:
 
 
 @pytest.mark.slow
+def test_rows_of_known_logs_are_not_made_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A new log adds its own rows; the tables are those of a run from nothing."""
+    logs, out = write_archive(tmp_path / "logs", 3), tmp_path / "out"
+    later = (logs / "log-02.h5").rename(tmp_path / "log-02.h5")
+    run(logs, [modes_only], out)
+    made: list[str] = []
+    whole = assessing.log_tables
+
+    def counted(reading: LogEstimates) -> dict[str, str]:
+        made.append(reading.log)
+        return whole(reading)
+
+    monkeypatch.setattr(assessing, "log_tables", counted)
+    later.rename(logs / "log-02.h5")
+    run(logs, [modes_only], out)
+    assert made == ["log-02.h5"]
+    run(logs, [modes_only], tmp_path / "anew")
+    assert made == ["log-02.h5", "log-00.h5", "log-01.h5", "log-02.h5"]
+    changed = {"changes.csv": b""}  # since the last run, of which the new store knows none
+    assert tables(out) | changed == tables(tmp_path / "anew") | changed
+
+
+@pytest.mark.slow
 def test_pages_come_from_the_store_alone(
     done: Done, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -690,13 +715,13 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     made = assessing._update(("M7-Y", "key", pack(own), None, lives))
     assert isinstance(made, assessing.PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
-    tables = machine_tables([], found)
+    tables = machine_tables(found)
     row = tables["prognosis"][-1]
     travel = np.quantile(own.prognosis.remaining[:, -1], 0.01, method="inverted_cdf")
     assert row["rul_km_calibrated"] == pytest.approx(travel / 1000)
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
     assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
-    assert machine_tables([], own)["prognosis"][-1]["calibrated_lives"] is None
+    assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
     few = assessing._update(("M7-Y", "key", pack(own), None, lives[:8]))
     assert isinstance(few, assessing.PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

@@ -237,7 +237,7 @@ def test_points_of_a_dashboard_are_those_of_the_tables(make: Maker) -> None:
     """Health and frequencies per log with 90 % intervals, and the remaining life now."""
     assessment = make()
     summary = summarise(assessment, assessment.service())
-    found = points(machine_tables((), assessment))
+    found = points(machine_tables(assessment))
     health = [one for one in found if one["quantity"] == "health"]
     assert assessment.health is not None and assessment.track is not None
     expected = assessment.health.quantile(np.array([0.05, 0.5, 0.95]))
@@ -251,4 +251,4 @@ def test_points_of_a_dashboard_are_those_of_the_tables(make: Maker) -> None:
     km = {one["subject"]: one["median"] for one in found if one["quantity"] == "remaining_km"}
     assert summary.life is not None
     assert km["any"] == summary.life.any.travel[3] / 1000
-    assert points(machine_tables((), nothing(make()))) == points({}) == []
+    assert points(machine_tables(nothing(make()))) == points({}) == []

@@ -537,7 +537,7 @@ def show(url: str, assessment: Assessment, changes: tuple[Change, ...] = ()) -> 
     moment = summary.recorded_at + timedelta(hours=12)
     status, _ = compare(None, make_status(assessment, summary), moment, None)
     store = Store(url)
-    store.put_points(summary.identity, points(machine_tables((), assessment)))
+    store.put_points(summary.identity, points(machine_tables(assessment)))
     store.put_status([status], changes, moment)
     store.close()
     return status
@@ -574,7 +574,7 @@ def test_views_show_status_points_and_changes_once(url: str, tmp_path: Path) -> 
 def test_points_are_replaced_but_remaining_lives_stay(file_url: str, tmp_path: Path) -> None:
     """A new assessment replaces what the old one had; what it predicted then is history."""
     assessment = worn(tmp_path)
-    found = points(machine_tables((), assessment))
+    found = points(machine_tables(assessment))
     later = [own | {"recorded_at": "2027-01-01T00:00:00+01:00"} for own in found]
     store = Store(file_url)
     store.put_points("M7-Y", found)
@@ -595,7 +595,7 @@ def test_what_no_run_computes_again_comes_from_the_schema_before(
     """Earlier remaining lives, changes and summaries are copied once; results are not."""
     assessment = worn(tmp_path)
     with closing(Store(url)) as store:
-        store.put_points("M7-Y", points(machine_tables((), assessment)))
+        store.put_points("M7-Y", points(machine_tables(assessment)))
         store.put_assessment("M7-Y", "k1", pack_assessment(assessment))
         store.publish("M7-Y", ["k1"], store.put_refused(()))
         summary = store.previous_summary("M7-Y", "k2")

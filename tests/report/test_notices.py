@@ -54,7 +54,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     }
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
-    (row, *_) = [row for row in machine_tables([], bad)["warnings"] if row["code"] == code]
+    (row, *_) = [row for row in machine_tables(bad)["warnings"] if row["code"] == code]
     assert list(row) == COLUMNS["warnings"].split()
     assert row["what"].endswith(".")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, date, datetime
@@ -19,7 +20,9 @@ from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.tables import (
     COLUMNS,
     frame,
+    join_csv,
     lines_rows,
+    log_tables,
     machine_tables,
     modes_rows,
     prognosis_rows,
@@ -127,8 +130,12 @@ def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
 
 def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
-    rows = machine_tables(readings, made)
-    return {name: frame(COLUMNS[name], own) for name, own in rows.items()}
+    found = {name: frame(COLUMNS[name], own) for name, own in machine_tables(made).items()}
+    of_logs = [log_tables(reading) for reading in readings]
+    for name in of_logs[0] if of_logs else ():
+        text = "".join(join_csv([own[name] for own in of_logs]))
+        found[name] = pd.read_csv(io.StringIO(text))
+    return found
 
 
 def test_empty_tables_have_their_columns() -> None:
