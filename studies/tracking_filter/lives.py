@@ -18,6 +18,7 @@ from lmshealth.tracking.constants import (
     DAMPING_WALK,
     LOGS_PER_LIFE,
     RATE_COMMON,
+    SETTLING_LOGS,
     WANDER_COMMON,
 )
 from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, hyperparameter_grid
@@ -113,11 +114,13 @@ def _walk(rng: np.random.Generator, chosen: Hyperparameters, ticks: Array) -> tu
     rate = chosen.rate_std * _together(rng, RATE_COMMON)
     decay = float(chosen.rate_decay[0])
     level, damping = [LEVEL], [DAMPING]
-    for tick in ticks:
+    settled = np.exp(-np.cumsum(np.r_[0.0, ticks]) * LOGS_PER_LIFE / SETTLING_LOGS)
+    for tick, settling in zip(ticks, -np.diff(settled), strict=True):
         # The integral of a walk, and the walk itself, over one tick.
         bend = chosen.rate_walk * np.sqrt(tick) * _together(rng, RATE_COMMON)
         rest = chosen.rate_walk * np.sqrt(tick**3 / 12) * _together(rng, RATE_COMMON)
         own = chosen.level_walk * np.sqrt(tick) * rng.standard_normal(m)
+        own += chosen.settling * np.sqrt(settling) * _together(rng, RATE_COMMON)
         far = -np.expm1(-decay * tick) / decay if decay else tick
         level.append(level[-1] + rate * far + bend * tick / 2 + rest + own)
         rate = rate * np.exp(-decay * tick) + bend

@@ -19,6 +19,7 @@ from lmshealth.tracking.constants import (
     LN_F_STD,
     LN_ZETA_STD,
     LOGS_PER_LIFE,
+    SETTLING_LOGS,
     WANDER_COMMON,
 )
 from lmshealth.tracking.covariates import Regressor
@@ -65,6 +66,8 @@ def filterpy_loop(
     wander = np.outer(std, std) * (WANDER_COMMON + (1 - WANDER_COMMON) * eye)
     kalman.P[rate, rate], kalman.P[own, own] = setting.rate_std[0] ** 2 * alike, wander
     decay, there = float(setting.rate_decay[0]), np.isfinite(history.ln_frequency).any(axis=1)
+    left = np.exp(-np.cumsum(ticks) * LOGS_PER_LIFE / SETTLING_LOGS)
+    settling = setting.settling[0] ** 2 * -np.diff(left, prepend=1.0)
     states, covs = np.empty((n, size)), np.empty((n, size, size))
     for k, tick in enumerate(ticks):
         f, q = np.eye(size), np.zeros((size, size))
@@ -72,6 +75,7 @@ def filterpy_loop(
         f[level, rate] = (-np.expm1(-decay * tick) / decay if decay else tick) * eye
         f[rate, rate] = np.exp(-decay * tick) * eye
         q[level, level] = setting.level_walk[0] ** 2 * tick * eye + bend * tick**3 / 3
+        q[level, level] += settling[k] * alike
         q[level, rate] = q[rate, level] = bend * tick**2 / 2
         q[rate, rate] = bend * tick
         keep = setting.wander_keep[0] if k and there[k] else 1.0
