@@ -71,7 +71,7 @@ fuzz: .venv/installed
 
 # Fast tests on other Pythons, lowest dependencies, kernels and threads, as far as they are here.
 compat: .venv/installed
-	$(BIN)/python tests/compat.py
+	$(BIN)/python -m studies.compat.run
 
 # Versions and hashes of all that development needs; `make locked` installs just these.
 lock: .venv/installed
