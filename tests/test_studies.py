@@ -679,3 +679,11 @@ def test_mutants(root: Path) -> None:
     assert answer["mutants"]["n"] == 1
     assert answer["controls"] == {"as it is": {"survived": 1}, "planted": {"killed": 1}}
     assert answer["that no test runs"] == 0
+
+
+def test_compat(root: Path) -> None:
+    """A few tests pass with another kernel, and fail where transforms are 1 % too large."""
+    answer = json.loads(run_study(root, "compat"))
+    assert all(answer["passed"].values())
+    (case,) = answer["cases"]
+    assert case["kernel"] == "Haswell" and case["passed"] > 0

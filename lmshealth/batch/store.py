@@ -114,6 +114,8 @@ class Identified:
         """Replace the name of the log, which may have been moved since."""
         if not isinstance(self.outcome, LogEstimates):
             return replace(self, outcome=_renamed(self.outcome, log))
+        if self.outcome.log == log:
+            return self
         modes = replace(self.outcome.modes, refused=_renamed(self.outcome.modes.refused, log))
         return replace(self, outcome=replace(self.outcome, log=log, modes=modes))
 

@@ -106,9 +106,10 @@ def csv_text(table: str, rows: Iterable[Row]) -> str:
     for row in rows:
         columns |= dict.fromkeys(row)
     target = io.StringIO()
-    writer = csv.DictWriter(target, columns, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows({key: cell for key, cell in row.items() if cell == cell} for row in rows)
+    writer = csv.writer(target, lineterminator="\n")
+    writer.writerow(columns)
+    cells = ([row.get(name) for name in columns] for row in rows)
+    writer.writerows([cell if cell == cell else None for cell in own] for own in cells)
     return target.getvalue()
 
 

@@ -67,7 +67,7 @@ TESTS = {
     "test_losses_by_laws_are_calibrated": Part(250, ("loss by the law", "health now")),
     "test_health_off_its_law_is_calibrated": Part(250, ("health now, off its law",)),
     "test_ranks_of_whole_lives_are_uniform": Part(
-        80,
+        40,
         (
             "preload is lost",
             "mount is lost",
@@ -80,7 +80,7 @@ TESTS = {
         ),
     ),
     "test_usage_covers_what_comes": Part(400, ("twenty weeks", "three weeks")),
-    "test_young_machines_are_told_right_by_their_fleet": Part(36, ("remaining life",)),
+    "test_young_machines_are_told_right_by_their_fleet": Part(24, ("remaining life",)),
     # Planning.
     "test_a_test_has_the_power_that_was_planned": Part(
         20_000,
