@@ -79,17 +79,19 @@ def environment(version: str, resolution: str) -> tuple[str, str]:
     """Make an environment; return its interpreter, or nothing and why that is not possible."""
     own = Path(sys.executable).parent
     pyenv = Path(os.environ.get("PYENV_ROOT", Path.home() / ".pyenv")) / "versions"
-    places = [os.environ["PATH"], *map(str, sorted(pyenv.glob(f"{version}.*/bin")))]
+    # Before the path, which may lead to a shim for another version.
+    places = [*map(str, sorted(pyenv.glob(f"{version}.*/bin"))), os.environ["PATH"]]
     python = shutil.which(f"python{version}", path=os.pathsep.join(places))
     uv = shutil.which("uv", path=os.pathsep.join([str(own), *places]))
     if python is None or uv is None:
         return "", f"no Python {version} here" if uv else "no uv here"
     folder = Path(tempfile.gettempdir()) / f"lmshealth-compat-{version}-{resolution}"
     made = folder / "bin" / "python"
-    install = (uv, "pip", "install", "--quiet", "--python", str(made), "--resolution", resolution)
+    install = (uv, "pip", "install", "--quiet", "--python", str(made), *_WHEELS)
     commands = (
         (uv, "venv", "--quiet", "--clear", "--python", python, str(folder)),
-        (*install, *_WHEELS, "-e", f"{ROOT}[models,formats]", *_TOOLS),
+        (*install, "--resolution", resolution, "-e", f"{ROOT}[models,formats]"),
+        (*install, *_TOOLS),
     )
     for command in commands:
         done = subprocess.run(command, capture_output=True, text=True, check=False)

@@ -137,6 +137,8 @@ def test_samples_arrive_unchanged(tmp_path, dtype, size):
 def test_interrupt(file):
     """An interrupt ends the process, so that its answer is none to the next request."""
     attempt(print_much, file)
+    # A shell's job in the background ignores interrupts.
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     # An interrupt just before the reader waits is noticed with the next one.
     timers = [
         threading.Timer(after, signal.pthread_kill, [threading.get_ident(), signal.SIGINT])
@@ -147,6 +149,7 @@ def test_interrupt(file):
     with pytest.raises(KeyboardInterrupt):
         attempt(hang, file)
     timers[1].cancel()
+    signal.signal(signal.SIGINT, before)
     assert isolation._reader.process is None
     assert attempt(print_much, file).columns == {}
 
