@@ -611,6 +611,12 @@ def test_bad_inputs_time_axes(root: Path) -> None:
     assert answer["sets_named_right"] == answer["sets"] >= 2
 
 
+def test_bad_inputs_channels(root: Path) -> None:
+    """A log of many channels stays within bounds, and a wrong rate is seen."""
+    answer = json.loads(run_study(root, "bad_inputs", "channels"))
+    assert all(answer["passed"].values())
+
+
 def test_bad_inputs_mutants(root: Path) -> None:
     """A few damaged files of all forms, texts and stores are refused or read right."""
     answer = json.loads(run_study(root, "bad_inputs", "mutants"))
