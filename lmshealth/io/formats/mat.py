@@ -9,6 +9,7 @@ memory.
 
 import re
 from collections.abc import Iterator
+from contextlib import suppress
 from importlib import import_module
 from math import prod
 from pathlib import Path
@@ -83,10 +84,13 @@ def _variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
     matlab: Any = import_module("scipy.io.matlab")
     try:
         found: list[tuple[str, tuple[int, ...], str]] = matlab.whosmat(path, appendmat=False)
-    except TypeError:  # of an object of a newer class, which has no name
+    except TypeError:  # of an object of a newer class, which has no shape
+        found = []
         with path.open("rb") as stream:
             parts = matlab.varmats_from_mat(stream)
-        return [one for name, part in parts if name != "None" for one in matlab.whosmat(part)]
+        for _, part in parts:
+            with suppress(TypeError):
+                found += matlab.whosmat(part)
     return found
 
 
