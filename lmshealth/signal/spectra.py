@@ -259,7 +259,9 @@ def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
         total, count = total + spectrum.matrix, count + 1
         every += [] if spectrum.transforms is None else [spectrum.transforms]
         free, lines = free & spectrum.free, (*lines, *spectrum.lines)
-    transforms = every[0] if len(every) == 1 else np.concatenate(every)
+    if count == 1:
+        return first
+    transforms = np.concatenate(every) if every else None
     return replace(
         first, matrix=total / count, free=free, lines=lines, count=count, transforms=transforms
     )

@@ -63,6 +63,11 @@ OPTIONS = {
     "whole band": ("--band", "5", "9900"),
 }
 SEED = 20261126
+NOT_MET = dict.fromkeys(
+    ("memory", "time"),
+    "eight channels over a minute at 20 kHz, searched without a description up to 10 kHz: matrices "
+    "of 600,000 ordinates take 0.6 GB each; a band that is searched keeps within both",
+)
 
 
 def main() -> None:
@@ -77,7 +82,7 @@ def main() -> None:
         "frequencies are those of the modes": all(row["sigmas"] <= MOST_SIGMA for row in rows),
         "a wrong rate is seen": control["sigmas"] > MOST_SIGMA,
     }
-    study.conclude({"cases": rows, "control": control, "passed": passed})
+    study.conclude({"cases": rows, "control": control, "passed": passed}, not_met=NOT_MET)
 
 
 def measured(

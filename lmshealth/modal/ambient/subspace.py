@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -64,7 +65,7 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[
     candidates, poles = _cluster(poles)
     stable = [one for one in _merge(candidates) if low <= one.frequency <= high]
     place = np.searchsorted(longest.frequency[:-1], [one.frequency for one in stable])
-    levels = _level(longest.matrix)[place]
+    levels = _smooth_level(np.diagonal(longest.matrix, axis1=1, axis2=2).real)[place]
     # From whitened to physical channels.
     rows = zip(stable, levels, strict=True)
     return [replace(one, shape=one.shape * level) for one, level in rows], poles
@@ -80,31 +81,45 @@ def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
         cut = spectrum.band(low, high)
         if cut.frequency.size < _NEAR_LINE:
             continue
-        tapered = _whitened(cut) * tukey(cut.frequency.size, 2 * _MARGIN)[:, None, None]
+        taper = tukey(cut.frequency.size, 2 * _MARGIN)[:, None]
         turn = np.exp(2j * np.pi / (cut.duration * width))
         first = np.exp(2j * np.pi * (cut.frequency[0] - low) / width * lags)
-        total += spectrum.count * czt(tapered, lags.size, turn, axis=0) * first[:, None, None]
+        # Row by row: transforms of all at once would take several times the memory of the spectra.
+        for i, row in enumerate(_whitened(cut)):
+            part = czt(row * taper, lags.size, turn, axis=0)
+            total[:, i] += spectrum.count * part * first[:, None]
     return total
 
 
-def _whitened(spectrum: CrossSpectrum) -> ComplexArray:
-    """Scale channels by a smooth level, and replace masked ordinates by their surroundings."""
+def _whitened(spectrum: CrossSpectrum) -> Iterator[ComplexArray]:
+    """Yield rows of the matrices, ``(n_ordinates, n_channels)``, of channels of one smooth level.
+
+    Masked ordinates are replaced by their surroundings.
+    """
     matrix = _project(spectrum)
     masked, free = np.flatnonzero(~spectrum.free), np.flatnonzero(spectrum.free)
+    near: np.ndarray | None = None
     if masked.size and free.size > 2 * _NEAR_LINE:
         place = np.searchsorted(free, masked)
         reach = range(-_NEAR_LINE, _NEAR_LINE)
         near = np.stack([free[np.clip(place + k, 0, free.size - 1)] for k in reach])
-        matrix[masked] = matrix[near].mean(axis=0)
-    level = _level(matrix)
-    return np.asarray(matrix / level[:, :, None] / level[:, None, :])
+
+    def repaired(part: ComplexArray) -> ComplexArray:
+        part = part.copy()
+        if near is not None:
+            part[masked] = part[near].mean(axis=0)
+        return part
+
+    level = _smooth_level(repaired(np.diagonal(matrix, axis1=1, axis2=2)).real)
+    for i in range(level.shape[1]):
+        yield repaired(matrix[:, i]) / (level[:, [i]] * level)
 
 
 def _project(spectrum: CrossSpectrum) -> ComplexArray:
     """Return the matrices without the directions of what no mode causes."""
-    matrix = spectrum.matrix.copy()
     if spectrum.foreign is None:
-        return matrix
+        return spectrum.matrix
+    matrix = spectrum.matrix.copy()
     within = np.flatnonzero(np.trace(spectrum.foreign, axis1=1, axis2=2).real)
     level = np.diagonal(matrix[within], axis1=1, axis2=2).real.mean(axis=0)
     root = np.sqrt(level.clip(1e-300))
@@ -119,11 +134,10 @@ def _project(spectrum: CrossSpectrum) -> ComplexArray:
     return matrix
 
 
-def _level(matrix: ComplexArray) -> FloatArray:
-    """Smooth root of the density of each channel, shape ``(n_ordinates, n_channels)``."""
-    power = np.diagonal(matrix, axis1=1, axis2=2).real.clip(1e-300)
+def _smooth_level(power: FloatArray) -> FloatArray:
+    """Smooth root of the densities of channels, shape ``(n_ordinates, n_channels)``."""
     u = np.linspace(-1, 1, len(power))
-    fit = np.polynomial.polynomial.polyfit(u, np.log(power), 2)
+    fit = np.polynomial.polynomial.polyfit(u, np.log(power.clip(1e-300)), 2)
     return np.asarray(np.exp(np.polynomial.polynomial.polyval(u, fit) / 2).T)
 
 
