@@ -8,9 +8,9 @@ Method
     numbers to tolerances are the same in all cases. Control, which must fail: a scipy whose
     Fourier transforms are 1 % too large.
 Answer
-    Yes: ten cases of 1,492 tests, three kernels, two threads, Python 3.11 to 3.13 with the newest and
-    the lowest dependencies. The first run found a MAT reader that fails with the newest scipy, and
-    three lower bounds that do not work. Python 3.14 is tested by the workflow `compat`.
+    Yes: ten cases of 1,492 tests: three kernels, two threads, Python 3.11 to 3.13 with the newest
+    and the lowest dependencies. The first run found a MAT reader that fails with the newest scipy,
+    and three lower bounds that do not work. Python 3.14 is tested by the workflow `compat`.
 Run time
     Half an hour on one processor.
 """
