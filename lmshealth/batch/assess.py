@@ -51,8 +51,8 @@ from lmshealth.tracking.track import (
     outlier_refusals,
 )
 
-ROWS = fingerprint(VERSION, "rows")
-"""Key of the part of an assessment that has the rows of its logs (`LogRows`)."""
+# Keys of the parts of an assessment with the rows of its logs, and a fingerprint of these logs.
+_ROWS, _ROWS_OF = fingerprint(VERSION, "rows"), fingerprint(VERSION, "rows of")
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -329,7 +329,7 @@ def _assess_packed(
     def work() -> PackedAssessment:
         parts, readings = Parts(known, mapper), unpack_logs(logs)
         made = pack_assessment(_assess(readings, machine, parts))
-        parts.used[ROWS] = _pack_rows(readings, machine, known.get(ROWS))
+        parts.used.update(_pack_rows(readings, machine, known.get(_ROWS)))
         return replace(made, parts=parts.used)
 
     return reason_if_failed(work, machine.name, (CancelledError, *crashes))
@@ -344,15 +344,35 @@ class LogRows:
     tables: dict[str, str]
 
 
-def _pack_rows(readings: Sequence[LogEstimates], machine: Machine, before: bytes | None) -> bytes:
-    """Encode the rows of all logs in the order of time; those that are known are not made again."""
+def packed_rows(machine: Machine, store: Store) -> bytes:
+    """Fetch the rows of the logs of a machine, a packed list of `LogRows` in the order of time.
+
+    They are made from its logs where the store has those of other ones, or none.
+    """
+    found = store.part(machine.name, _ROWS)
+    if found is None or store.part(machine.name, _ROWS_OF) != _digest(machine):
+        parts = _pack_rows(unpack_logs(packed_logs(machine, store)), machine, found)
+        for key, content in parts.items():
+            store.put_part(machine.name, key, content)
+        found = parts[_ROWS]
+    return found
+
+
+def _digest(machine: Machine) -> bytes:
+    return fingerprint(machine.logs).encode()
+
+
+def _pack_rows(
+    readings: Sequence[LogEstimates], machine: Machine, before: bytes | None
+) -> dict[str, bytes]:
+    """Make the parts that have the rows of all logs; those known before are not made again."""
     found: list[LogRows] = unpack_or_none(before, list[LogRows]) or []
     known = {(own.log, own.key): own for own in found}
     keys, rows = dict(machine.logs), []
     for reading in sort_by_time(readings):
         own = reading.log, keys[reading.log]
         rows.append(known.get(own) or LogRows(*own, log_tables(reading)))
-    return pack(rows)
+    return {_ROWS: pack(rows), _ROWS_OF: _digest(machine)}
 
 
 def apply_fleet_priors(

@@ -14,7 +14,7 @@ from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
-from lmshealth.batch.assess import ROWS, Machine, apply_fleet_priors, assess_all
+from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
 from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Fleet, Status
@@ -339,32 +339,32 @@ def _outputs(
     resources: Resources,
     out: Path,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write pages as `write_pages` does; those of unchanged results are taken from the store.
-
-    Machines without the rows of their logs are skipped.
-    """
-    store, missing = resources.store, dict[str, str]()
+    """Write pages as `write_pages` does; those of unchanged results are taken from the store."""
+    store, missing = resources.store, dict[str, tuple[Machine, str]]()
     for machine in machines:
         name = machine.name
-        record = _record(name, keys[name], files[name], store)
-        if record.rows is None:
-            continue
+        record = _record(name, keys[name], files[name], store, packed_rows(machine, store))
         key = fingerprint(VERSION, record, machine.logs)
         kept: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
         if kept is None:
-            missing[name] = key
+            missing[name] = machine, key
         else:
             write_text(out / files[name], kept.page)
             yield name, kept
-    records = (_record(name, keys[name], files[name], store) for name in missing)
+    records = (
+        _record(name, keys[name], files[name], store, packed_rows(machine, store))
+        for name, (machine, _) in missing.items()
+    )
     for name, output in write_pages(records, resources.pool, out):
         if isinstance(output, MachineOutput):
             store.put_points(name, output.points)
-            store.put_part(name, missing[name], pack(output))
+            store.put_part(name, missing[name][1], pack(output))
         yield name, output
 
 
-def _record(machine: str, key: str, file: str, store: Store) -> MachineRecord:
+def _record(
+    machine: str, key: str, file: str, store: Store, rows: bytes | None = None
+) -> MachineRecord:
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, store.part(machine, ROWS), before)
+    return MachineRecord(machine, file, assessment, rows, before)

@@ -13,7 +13,7 @@ USABLE = 0.45
 WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 # Most channels that are fitted together, those that add most to each other: cross spectra of 64
 # channels over a minute at 1 kHz take 2 GB each. Of 64 accelerometers, 16 take twelve times as long
-# as 10, for standard deviations 1 % smaller; 8 take half, for 5 % larger ones.
+# as 10, for standard deviations 2 % smaller; 8 take half, for 5 % larger ones.
 MOST_CHANNELS = 10
 # Most modes that are fitted together.
 MOST_TOGETHER = 4

@@ -175,7 +175,10 @@ def _bases(unit: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
 
 
 def _product(bases: list[FloatArray]) -> FloatArray:
-    return reduce(lambda a, b: (a[:, :, None] * b[:, None]).reshape(len(a), -1), bases)
+    def product(a: FloatArray, b: FloatArray) -> FloatArray:
+        return (a[:, :, None] * b[:, None]).reshape(len(a), a.shape[1] * b.shape[1])
+
+    return reduce(product, bases)
 
 
 def _choose_sizes(

@@ -9,8 +9,8 @@ Method
     Frequencies must be within 4 of their standard deviations. Control: the same recording with its
     rate stated 1 % too large must be beyond.
 Answer
-    They do: at most 0.5 GB and 16 s. Of more than ten channels those that add most to each other
-    are fitted; the standard deviations of ten are 2 % above those of sixteen.
+    With a description they do; of more than ten channels those that add most to each other are
+    fitted. A search without one does in a band, but not over 10 kHz of a minute of 8 channels.
 Run time
     Five minutes on one processor.
 """

@@ -12,7 +12,7 @@ Answer
     and the lowest dependencies. The first run found a MAT reader that fails with the newest scipy,
     and three lower bounds that do not work. Python 3.14 is tested by the workflow `compat`.
 Run time
-    Half an hour on one processor.
+    A quarter of an hour on one processor, or half an hour with the installations.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def main() -> None:
         control = tested(sys.executable, one | {"PYTHONPATH": path}, ("tests/signal",))
     passed = {
         "no case fails": all(row["result"] != "failed" for row in rows),
-        "transforms that are 1 % too large fail": control["result"] == "failed",
+        "transforms that are 1 % too large fail": control.get("failed", 0) > 0,
     }
     study.conclude({"tests": tests, "cases": rows, "control": control, "passed": passed})
 

@@ -257,6 +257,17 @@ def test_rows_of_known_logs_are_not_made_again(
     assert made == ["log-02.h5", "log-00.h5", "log-01.h5", "log-02.h5"]
     changed = {"changes.csv": b""}  # since the last run, of which the new store knows none
     assert tables(out) | changed == tables(tmp_path / "anew") | changed
+    # The store has the rows of three logs beside an assessment of two.
+    three = Store(default_url(out))
+    machine = three.published()[0].machine
+    kept = three.parts(machine)
+    (logs / "log-02.h5").rename(tmp_path / "log-02.h5")
+    run(logs, [modes_only], out)
+    for key, content in kept.items():
+        three.put_part(machine, key, content)
+    three.close()
+    run(logs, [modes_only], out)
+    assert {row["log"] for row in rows(out / "modes.csv")} == {"log-00.h5", "log-01.h5"}
 
 
 @pytest.mark.slow

@@ -78,3 +78,4 @@ def test_drifts_of_one_parameter_alone(stage: Stage) -> None:
     stacked = [x, x * [1, 0], x * [0, 1]]
     known = [stage.drift(points, ("roll", "pitch")) for points in stacked]
     np.testing.assert_allclose(stage.drifts(x, ("roll", "pitch")), known, rtol=0, atol=1e-13)
+    assert stage.drifts(x[:0], ("roll", "pitch")).shape == (3, 0, 2)
