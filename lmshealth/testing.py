@@ -4,7 +4,6 @@ import random
 from collections.abc import Mapping
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -57,7 +56,7 @@ def check_format(
     assert content.present, "present is empty, needed the names of all columns"
     for name, values in expected.items():
         read = np.asarray(content.columns[name][:])
-        assert _same(read, np.asarray(values)), f"column {name!r} differs from the samples written"
+        np.testing.assert_array_equal(read, np.asarray(values), f"column {name!r} differs")
     for key, text in (metadata or {}).items():
         got = content.metadata.get(key)
         assert got == text, f"metadata {key!r} is {got!r}, needed {text!r}"
@@ -100,8 +99,7 @@ def _check_damaged(
             for name, samples in content.columns.items():
                 # The last number of a text that is cut off may be a part of one.
                 read = np.asarray(samples[:])[:-1]
-                known = np.asarray(expected[name])[: read.size]
-                fine = _same(read, known)
+                fine = np.array_equal(read, np.asarray(expected[name])[: read.size], equal_nan=True)
                 assert fine, f"cut off after {size} bytes, {name!r} has other values"
         cut.write_bytes(b"")
         empty = False
@@ -113,11 +111,3 @@ def _check_damaged(
         assert empty, "load returns samples of an empty file"
     finally:
         cut.unlink(missing_ok=True)
-
-
-def _same(read: Any, known: Any) -> bool:
-    """Return whether samples are equal, but for what readers of text round."""
-    if read.shape != known.shape:
-        return False
-    largest = float(np.max(np.abs(known[np.isfinite(known)]), initial=0.0))
-    return bool(np.allclose(read, known, rtol=0.0, atol=1e-15 * largest, equal_nan=True))

@@ -119,8 +119,12 @@ def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
     """
     for name in [name for name in names if name in table.columns]:
         given = table[name].str.strip() != ""
-        table[name] = pd.to_numeric(table[name], errors="coerce")
-        wrong = given & ~np.isfinite(table[name])
+        numbers = pd.to_numeric(table[name], errors="coerce")
+        if numbers.dtype == float:  # before 3.1 pandas rounds their last digits
+            known = np.isfinite(numbers)
+            numbers[known] = table[name][known].astype(float)
+        table[name] = numbers
+        wrong = given & ~np.isfinite(numbers)
         if wrong.any():
             raise BadTable(f"{path}, {lines(table, wrong)}: {name} is no finite number")
 

@@ -11,7 +11,8 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from datetime import UTC, datetime, timedelta
-from functools import partial
+from functools import cache, partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import IO, Any
 
@@ -253,6 +254,13 @@ def _head(text: Text, encoding: str) -> list[tuple[int, str]]:
     return head
 
 
+@cache
+def _exact_numbers() -> dict[str, Any]:
+    """Return options of pandas for numbers to the last digit, which its default is from 3.1 on."""
+    major, minor = version("pandas").split(".")[:2]
+    return {} if (int(major), int(minor)) >= (3, 1) else {"float_precision": "round_trip"}
+
+
 def _numbers(
     text: Text, places: dict[str, int], dialect: Dialect, times: Mapping[str, float]
 ) -> dict[str, Samples]:
@@ -277,6 +285,7 @@ def _numbers(
         encoding_errors="replace",
         header=None,
         names=list(range(text.n_fields + n_spare)),
+        **_exact_numbers(),
         index_col=False,
         # A block is small enough as a whole.
         low_memory=False,
