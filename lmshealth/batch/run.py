@@ -343,7 +343,8 @@ def _outputs(
     store, missing = resources.store, dict[str, tuple[Machine, str]]()
     for machine in machines:
         name = machine.name
-        record = _record(name, keys[name], files[name], store, packed_rows(machine, store))
+        # The rows of its logs, which are large, follow from their names and keys.
+        record = _record(name, keys[name], files[name], store)
         key = fingerprint(VERSION, record, machine.logs)
         kept: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
         if kept is None:
