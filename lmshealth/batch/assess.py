@@ -7,7 +7,7 @@ from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Se
 from concurrent.futures import CancelledError, Executor
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 from numpy.linalg import LinAlgError
 
@@ -31,7 +31,7 @@ from lmshealth.prognosis.fleet_prior import (
     machine_evidence,
 )
 from lmshealth.prognosis.life_posterior import LifeStart
-from lmshealth.prognosis.remaining_life import prognose, prognose_with_posterior
+from lmshealth.prognosis.remaining_life import prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import log_tables
@@ -166,7 +166,7 @@ def _with_results(
         history = accepted_estimates(history, tracked)
         # The prognosis takes longest: it is begun before the epochs and fetched after them.
         has_limit = any(parameter.limit for parameter in stage.parameters)
-        life_key = fingerprint(VERSION, "life", stage.digest, seed)
+        life_key = _life_key(stage, made.seed)
         before = unpack_or_none(parts.known.get(life_key), LifeStart)
         life = parts.mapper(_prognose, [history], [stage], [seed], [before]) if has_limit else None
         if has_limit:
@@ -223,6 +223,11 @@ def map_in_order(
     # down afterwards would log as an error of its own.
     futures = [executor.submit(function, *row) for row in zip(*columns, strict=True)]
     return (future.result() for future in futures)
+
+
+def _life_key(stage: Stage, seed: int) -> str:
+    """Return the key of the part from which the next posterior of a life is sampled."""
+    return fingerprint(VERSION, "life", stage.digest, seed)
 
 
 def _prognose(
@@ -396,16 +401,23 @@ def apply_fleet_priors(
     if left:
         resources.progress("fleet priors", 0, len(left))
     updates = (
-        (m.name, key, store.assessment(m.name, m.key), prior, ended)
+        _Update(
+            machine=m.name,
+            key=key,
+            content=store.assessment(m.name, m.key),
+            life=store.part(m.name, _life_key(m.stage, m.seed)),
+            prior=prior,
+            ended=ended,
+        )
         for m, key, prior, ended in left
     )
     done = resources.pool.map_unordered(_update, updates, lambda _, why: why)
-    for k, ((name, key, _, _, _), made) in enumerate(done, start=1):
+    for k, (one, made) in enumerate(done, start=1):
         if isinstance(made, PackedAssessment):
-            store.put_assessment(name, key, made)
-            keys[name] = key
+            store.put_assessment(one.machine, one.key, made)
+            keys[one.machine] = one.key
         elif made is not None:
-            failed[name] = made
+            failed[one.machine] = made
         resources.progress("fleet priors", k, len(left))
     return keys, failed
 
@@ -434,25 +446,43 @@ def _machines_to_update(
             yield from ((fleet[m], None, tuple(ended)) for m in evidence if m not in priors)
 
 
-def _update(
-    job: tuple[str, str, bytes | None, FleetPrior | None, tuple[EndedLife, ...]],
-) -> PackedAssessment | str | None:
-    """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
-    machine, _, content, prior, ended = job
+class _Update(NamedTuple):
+    """What is needed to recompute the prognosis of a machine, and the key of the result."""
+
+    machine: str
+    key: str
+    content: bytes | None  # packed assessment by the description
+    life: bytes | None  # packed start of its posterior, as in `Parts`
+    prior: FleetPrior | None  # None where the prognosis is calibrated instead
+    ended: tuple[EndedLife, ...]
+
+
+def _update(job: _Update) -> PackedAssessment | str | None:
+    """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails.
+
+    Coordinates of scenarios do not depend on what a fleet changes of a description: draws of the
+    posterior by the description are the start of that with the prior of the fleet.
+    """
 
     def work() -> PackedAssessment | None:
-        found: Assessment | None = unpack_or_none(content, Assessment)
+        found: Assessment | None = unpack_or_none(job.content, Assessment)
         if found is None or found.track is None:
             return None
-        if prior is None:
+        if job.prior is None:
             if found.prognosis is None:
                 return None
-            return pack_assessment(replace(found, calibration=calibrate(found.prognosis, ended)))
-        history, stage = accepted_estimates(found.history, found.track), prior.apply_to(found.stage)
-        prognosis = prognose(history, stage, seed_of(found.seed, history.stage, stage.digest))
-        return pack_assessment(replace(found, prognosis=prognosis, fleet=prior))
+            calibration = calibrate(found.prognosis, job.ended)
+            return pack_assessment(replace(found, calibration=calibration))
+        history, stage = (
+            accepted_estimates(found.history, found.track),
+            job.prior.apply_to(found.stage),
+        )
+        seed = seed_of(found.seed, history.stage, stage.digest)
+        before = unpack_or_none(job.life, LifeStart)
+        prognosis, _ = prognose_with_posterior(history, stage, seed, before=before)
+        return pack_assessment(replace(found, prognosis=prognosis, fleet=job.prior))
 
-    return reason_if_failed(work, machine)
+    return reason_if_failed(work, job.machine)
 
 
 def reason_if_failed(

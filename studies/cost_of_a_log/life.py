@@ -9,6 +9,7 @@ import json
 import pickle
 import sys
 import tempfile
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 
@@ -18,7 +19,7 @@ from lmshealth._serialize import fingerprint
 from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.assess import Machine, assess, assess_all
-from lmshealth.batch.ingest import Resources
+from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
 from lmshealth.prognosis.results import Prognosis
@@ -32,23 +33,44 @@ from studies.harness.study import Row
 NAME, EPOCHS, SEED = "AX-1", 40, 0
 
 
+def machine_of(
+    name: str,
+    logs: Sequence[LogEstimates],
+    stored: int,
+    stage: Stage,
+    store: Store,
+    epochs: int = EPOCHS,
+) -> Machine:
+    """Return a machine with these logs, of which so many are in the store already; add the rest."""
+    keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
+    store.put_identified(
+        OutcomeRow.of(key, log.digest, Identified(log, stage.digest, name))
+        for (_, key), log in zip(keys[stored:], logs[stored:], strict=True)
+    )
+    return Machine(name, tuple(keys), stage, NO_MAINTENANCE, epochs, SEED)
+
+
+def assess_and_report(
+    machines: Sequence[Machine],
+    store: Store,
+    out: Path,
+    workers: int = 1,
+    progress: Progress = lambda step, done, total: None,
+) -> None:
+    """Assess machines and write their pages, as a run does; all must succeed."""
+    with processes(workers) as pool:
+        resources = Resources(store, pool, progress)
+        assert not assess_all(machines, resources)
+        result, *_ = running._report(machines, (), resources, out, Alerts())
+    assert not result.failed
+
+
 def run_with(
     logs: list[LogEstimates], stored: int, stage: Stage, store: Store, out: Path
 ) -> Assessment:
-    """Assess the machine with some of its logs, and write its page, as a run does.
-
-    As many of the logs are stored already.
-    """
-    keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
-    store.put_identified(
-        OutcomeRow.of(key, log.digest, Identified(log, stage.digest, NAME))
-        for (_, key), log in zip(keys[stored:], logs[stored:], strict=True)
-    )
-    machine = Machine(NAME, tuple(keys), stage, NO_MAINTENANCE, EPOCHS, SEED)
-    with processes(1) as pool:
-        resources = Resources(store, pool)
-        assert not assess_all([machine], resources)
-        running._report([machine], (), resources, out, Alerts())
+    """Assess the machine with some of its logs, and write its page."""
+    machine = machine_of(NAME, logs, stored, stage, store)
+    assess_and_report([machine], store, out)
     found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
     assert found is not None and found.prognosis is not None
     return found
@@ -79,24 +101,20 @@ def compared(updated: Assessment, fresh: Assessment, short: Assessment) -> Row:
     assert own is not None and other is not None
     return {
         "epochs_equal": bool(np.array_equal(own.samples, other.samples)),
-        "apart": _apart(updated.prognosis, fresh.prognosis),
-        "control_apart": _apart(updated.prognosis, short.prognosis),
+        "apart": apart(updated.prognosis, fresh.prognosis),
+        "control_apart": apart(updated.prognosis, short.prognosis),
     }
 
 
-def _apart(one: Prognosis | None, other: Prognosis | None) -> float:
-    """Return how far medians of the remaining travel to any limit are apart, in standard errors."""
+def apart(one: Prognosis | None, other: Prognosis | None) -> float:
+    """Return how far means of the remaining travel, up to the horizon, are apart in std errors."""
     assert one is not None and other is not None
-    medians, errors = [], []
+    means, errors = [], []
     for found in (one, other):
-        travel = np.where(
-            np.isfinite(found.remaining[:, -1]), found.remaining[:, -1], found.horizon
-        )
-        medians.append(np.log(np.median(travel) + 1.0))
-        # Of a median: 1.25 standard deviations of the mean, by the interquartile range.
-        low, high = np.log(np.quantile(travel, (0.25, 0.75)) + 1.0)
-        errors.append(1.25 * (high - low) / 1.349 / np.sqrt(found.ess))
-    return float(abs(medians[0] - medians[1]) / np.hypot(*errors))
+        travel = np.minimum(found.remaining[:, -1], found.horizon)
+        means.append(travel.mean())
+        errors.append(travel.std() / np.sqrt(found.ess))
+    return float(abs(means[0] - means[1]) / max(np.hypot(*errors), 1e-9 * one.horizon))
 
 
 if __name__ == "__main__":

@@ -7,15 +7,17 @@ import shutil
 import sqlite3
 from collections.abc import Sequence
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from lmshealth import examples
 from lmshealth._serialize import pack, unpack
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
@@ -23,17 +25,23 @@ from lmshealth.batch import ingest as ingesting
 from lmshealth.batch.run import RunResult, Settings, report, run
 from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
-from lmshealth.errors import LmshealthError, NothingUsable
+from lmshealth.errors import LmshealthError, NotConverged, NothingUsable
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Log
 from lmshealth.modal.identification import AmbientReading
-from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior
+from lmshealth.prognosis import life_posterior
+from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import scatter_prior
+from lmshealth.prognosis.life_posterior import fit_life
+from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.tables import COLUMNS, machine_tables
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import LogEstimates
+from lmshealth.stage.priors import Lognormal
+from lmshealth.tracking.history import LogEstimates, build_history
+from lmshealth.tracking.track import accepted_estimates, track
+from studies.cost_of_a_log.life import apart
 from studies.harness import servers
 from tests.assessments import Maker, make
 from tests.signals import sine, write_archive, write_archive_stage, write_log
@@ -440,7 +448,7 @@ def test_a_fleet_update_that_cannot_be_read_is_repeated(
         lambda machines, store: ((machine, learned, ()) for machine in machines),
     )
     # Without parameters there is nothing to forecast.
-    monkeypatch.setattr(assessing, "prognose", lambda history, stage, seed: None)
+    monkeypatch.setattr(assessing, "prognose_with_posterior", lambda *_, before: (None, None))
     run(logs, [modes_only], tmp_path / "out")
     before = pages(tmp_path / "out")
     with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
@@ -718,12 +726,44 @@ def test_assess_without_parameters_tracks_and_claims_nothing(
     assert assessment.judgement.verdict == "not-enough-data"
 
 
+@pytest.mark.slow
+def test_a_fleet_prior_continues_from_the_draws_by_the_description(
+    make: Maker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: the life fitted from nothing under the prior; no chains are run for the update."""
+    stage = load_stage("lms-y")
+    young, _ = build_history(examples.readings()[:15], stage)
+    own = replace(make(), stage=stage, history=young, track=track(young, stage))
+    assert own.track is not None
+    history = accepted_estimates(own.history, own.track)
+    laws = []
+    for parameter in own.stage.parameters:
+        for law in parameter.laws:
+            before = getattr(law, "life_km", None)
+            pace = (before, before.placed(-0.5, 0.6)) if isinstance(before, Lognormal) else None
+            laws.append(LawPrior(parameter.name, law.kind, (1.0, 1.0), "life_km", pace))
+    prior = FleetPrior(9, tuple(laws), scatter_prior(own.stage))
+    start = fit_life(history, own.stage, seed=1, chains=False).start
+    alone = prognose(history, own.stage, seed=1, chains=False)
+    fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
+    chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
+    monkeypatch.setattr(life_posterior, "sample", chains)
+    job = assessing._Update("M7-Y", "key", pack(own), pack(start), prior, ())
+    made = assessing._update(job)
+    assert isinstance(made, assessing.PackedAssessment)
+    found = unpack(made.content, Assessment).prognosis
+    assert apart(found, fresh) < 4 < apart(found, alone)
+    assert not chains.called
+    assessing._update(job._replace(life=None))
+    assert chains.called
+
+
 def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) -> None:
     """With enough ended lives page and table state the calibrated travel, and early ends."""
     own = make()
     assert own.prognosis is not None
     lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
-    made = assessing._update(("M7-Y", "key", pack(own), None, lives))
+    made = assessing._update(assessing._Update("M7-Y", "key", pack(own), None, None, lives))
     assert isinstance(made, assessing.PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
     tables = machine_tables(found)
@@ -733,6 +773,6 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
     assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
     assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
-    few = assessing._update(("M7-Y", "key", pack(own), None, lives[:8]))
+    few = assessing._update(assessing._Update("M7-Y", "key", pack(own), None, None, lives[:8]))
     assert isinstance(few, assessing.PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None
