@@ -37,6 +37,17 @@ end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 SCHEMA = 7
 """Version of the tables of a store, part of their names: older tables are not read."""
 
+SETTLED_S = 10
+"""Seconds (s) after its last change from which the digest of a file may be kept: clocks of file
+systems have steps of up to 2 s, in which a file may change again unnoticed."""
+
+OTHERS_POLL_S = 1.0
+"""Seconds (s) between two looks at work that other runs on the store have begun."""
+
+KEEPALIVE = {"idle": 30, "interval": 10, "count": 3}
+"""When PostgreSQL probes the connection of a run that is silent (s), again (s), and how often in
+vain: after a minute work of a computer that was cut off is left to other runs."""
+
 RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow")
 """Reasons of refusal that depend on more than the log: on the moment, ``--max-memory`` or
 the speed of the computer. They
