@@ -14,7 +14,7 @@ START_ATTEMPTS = 3
 SCHEDULER_TIMEOUT_S = 20
 """Seconds (s) within which a Dask scheduler has to answer, and to have a first worker."""
 
-LOGS_PER_TASK = 8
+LOGS_PER_TASK = 16
 """Most logs that one task identifies: the main process works once a task. As many are identified
 again per worker after an interruption."""
 
