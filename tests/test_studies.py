@@ -19,6 +19,7 @@ import pytest
 import lmshealth
 from studies.new_machine.run import Step, follow, steps
 from studies.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
+from studies.scale import speedup
 
 pytestmark = pytest.mark.study
 PARTS = ("preload", "mount")
@@ -659,9 +660,26 @@ def test_scale_speedup(root: Path) -> None:
     """One and two workers of this machine are timed beside bare processes."""
     answer = json.loads(run_study(root, "scale", "speedup"))
     # A log takes the main process some milliseconds, and workers find many in a second.
-    assert 0 < answer["local_serial_ms"][1] < 1e3
-    assert answer["local_rate"][1] > 0
+    assert 0 < answer["serial_ms"]["local"][1] < 1e3
+    assert answer["rate"]["local"] > 0
     assert answer["workers kept busy"]["local"] >= 1
+    assert answer["passed"]["no log is identified twice"]
+
+
+def test_the_model_of_scale_speedup(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rates of the model are met; of workers that wait for each other the model is missed."""
+    monkeypatch.setattr("os.cpu_count", lambda: 2)
+    bound, log_ms, serial_ms = {"1": 10.0, "2": 19.0, "4": 20.0}, 100.0, 2.0
+    rates = {n: own / (1 + serial_ms / log_ms) for n, own in bound.items()} | {"1": 10.0}
+    turn: dict[str, Any] = {"bound": bound, "local": rates, "scheduler_ms": {}}
+    turn["serial_ms"] = {"local": {"2": serial_ms, "4": serial_ms}}
+    found = speedup.judged([turn], ("local",))
+    assert found["model"]["local"] == {"2": 1.863, "4": 1.961}
+    assert found["passed"]["local: model of 2"]
+    assert found["passed"]["local: model of 4"]
+    assert not found["passed"]["local: at most 1 ms per log"]
+    slow = turn | {"local": rates | {"4": 14.0}}
+    assert not speedup.judged([slow], ("local",))["passed"]["local: model of 4"]
 
 
 def test_scale_plan(root: Path) -> None:

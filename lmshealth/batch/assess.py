@@ -12,7 +12,7 @@ from typing import Any, NamedTuple, TypeVar
 from numpy.linalg import LinAlgError
 
 from lmshealth._serialize import VERSION, fingerprint, pack
-from lmshealth.batch.ingest import LogKey, Resources, unexpected
+from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
@@ -58,9 +58,9 @@ PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
 
 _Job = tuple["Machine", PackedLogs, dict[str, bytes]]
+_Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]  # with its key
 
 Part = TypeVar("Part")
-Work = TypeVar("Work")
 
 _logger = logging.getLogger(__name__)
 
@@ -269,39 +269,55 @@ def assess_all(
 
     Return the machines that could not be assessed, and why: one must not end the batch.
     """
-    store, failed = resources.store, dict[str, str]()
-    left = [m for m in machines if force or not store.has_assessment(m.name, m.key)]
-    n_cached = len(machines) - len(left)
-    resources.progress("assessing", n_cached, len(machines))
-    for k, (machine, made) in enumerate(_assessed(left, resources, force), start=1):
+    store, failed, known = resources.store, dict[str, str](), set[str]()
+
+    def fetch(part: Sequence[Machine]) -> list[Machine]:
+        found = [m for m in part if not force and store.has_assessment(m.name, m.key)]
+        known.update(machine.name for machine in found)
+        return found
+
+    fetch(machines)
+    left = [machine for machine in machines if machine.name not in known]
+    resources.progress("assessing", len(known), len(machines))
+    for k, (machine, made) in enumerate(_assessed(left, resources, fetch, force=force), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         else:
             failed[machine.name] = made
-        resources.progress("assessing", n_cached + k, len(machines))
+        resources.progress("assessing", len(known) + k, len(machines))
     return failed
 
 
 def _assessed(
-    machines: Sequence[Machine], resources: Resources, force: bool
+    machines: Sequence[Machine],
+    resources: Resources,
+    fetch: Callable[[Sequence[Machine]], list[Machine]],
+    *,
+    force: bool,
 ) -> Iterator[tuple[Machine, PackedAssessment | str]]:
     """Assess machines in parallel; where they are fewer than workers, the parts of each.
 
     With ``force`` no part of an earlier assessment is used.
     """
     pool, store = resources.pool, resources.store
-    jobs: Iterator[_Job] = (
-        (one, packed_logs(one, store), {} if force else store.parts(one.name)) for one in machines
-    )
-    if pool.executor is None or len(machines) >= pool.size:
-        for (machine, *_), made in pool.map_unordered(_assess_packed, jobs, lambda _, why: why):
-            yield machine, made
-        return
-    for job in jobs:
-        try:
-            yield job[0], _assess_packed(job, pool.executor, pool.crashes)
-        except pool.crashes:  # a worker was killed: without workers it only takes longer
-            yield job[0], _assess_packed(job)
+
+    def job(part: Sequence[Machine]) -> _Job:
+        [one] = part
+        return one, packed_logs(one, store), {} if force else store.parts(one.name)
+
+    def mapper(jobs: Iterator[_Job]) -> Iterator[tuple[_Job, PackedAssessment | str]]:
+        if pool.executor is None or len(machines) >= pool.size:
+            yield from pool.map_unordered(_assess_packed, jobs, lambda _, why: why)
+            return
+        for job in jobs:
+            try:
+                yield job, _assess_packed(job, pool.executor, pool.crashes)
+            except pool.crashes:  # a worker was killed: without workers it only takes longer
+                yield job, _assess_packed(job)
+
+    work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
+    for (machine, *_), made in work.divided(machines, store, mapper):
+        yield machine, made
 
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
@@ -391,28 +407,35 @@ def apply_fleet_priors(
     """
     store, failed = resources.store, dict[str, str]()
     keys = {machine.name: machine.key for machine in machines}
-    left = []
-    for machine, prior, ended in _machines_to_update(machines, store):
-        key = fingerprint(machine.key, prior, ended)
-        if machine.name not in force and store.has_assessment(machine.name, key):
-            keys[machine.name] = key
-        else:
-            left.append((machine, key, prior, ended))
-    if left:
-        resources.progress("fleet priors", 0, len(left))
-    updates = (
-        _Update(
-            machine=m.name,
+    updates = [
+        (machine, fingerprint(machine.key, prior, ended), prior, ended)
+        for machine, prior, ended in _machines_to_update(machines, store)
+    ]
+
+    def fetch(part: Sequence[_Update]) -> list[_Update]:
+        of_part = [one for one in part if one[0].name not in force]
+        found = [one for one in of_part if store.has_assessment(one[0].name, one[1])]
+        keys.update((machine.name, key) for machine, key, *_ in found)
+        return found
+
+    def job(part: Sequence[_Update]) -> _UpdateJob:
+        [(machine, key, prior, ended)] = part
+        return _UpdateJob(
+            machine=machine.name,
             key=key,
-            content=store.assessment(m.name, m.key),
-            life=store.part(m.name, _life_key(m.stage, m.seed)),
+            content=store.assessment(machine.name, machine.key),
+            life=store.part(machine.name, _life_key(machine.stage, machine.seed)),
             prior=prior,
             ended=ended,
         )
-        for m, key, prior, ended in left
-    )
-    done = resources.pool.map_unordered(_update, updates, lambda _, why: why)
-    for k, (one, made) in enumerate(done, start=1):
+
+    known = {key for _, key, *_ in fetch(updates)}
+    left = [one for one in updates if one[1] not in known]
+    if left:
+        resources.progress("fleet priors", 0, len(left))
+    work: Work[_Update, _UpdateJob] = Work(lambda one: one[1], job, fetch)
+    mapper = lambda jobs: resources.pool.map_unordered(_update, jobs, lambda _, why: why)  # noqa: E731
+    for k, (one, made) in enumerate(work.divided(left, store, mapper), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(one.machine, one.key, made)
             keys[one.machine] = one.key
@@ -446,7 +469,7 @@ def _machines_to_update(
             yield from ((fleet[m], None, tuple(ended)) for m in evidence if m not in priors)
 
 
-class _Update(NamedTuple):
+class _UpdateJob(NamedTuple):
     """What is needed to recompute the prognosis of a machine, and the key of the result."""
 
     machine: str
@@ -457,7 +480,7 @@ class _Update(NamedTuple):
     ended: tuple[EndedLife, ...]
 
 
-def _update(job: _Update) -> PackedAssessment | str | None:
+def _update(job: _UpdateJob) -> PackedAssessment | str | None:
     """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails.
 
     Coordinates of scenarios do not depend on what a fleet changes of a description: draws of the
@@ -486,8 +509,8 @@ def _update(job: _Update) -> PackedAssessment | str | None:
 
 
 def reason_if_failed(
-    work: Callable[[], Work], machine: str, raised: tuple[type[BaseException], ...] = ()
-) -> Work | str:
+    work: Callable[[], Part], machine: str, raised: tuple[type[BaseException], ...] = ()
+) -> Part | str:
     """Return the result of work for a machine, or why it fails; raise only certain exceptions."""
     try:
         return work()

@@ -14,7 +14,7 @@ START_ATTEMPTS = 3
 SCHEDULER_TIMEOUT_S = 20
 """Seconds (s) within which a Dask scheduler has to answer, and to have a first worker."""
 
-LOGS_PER_TASK = 8
+LOGS_PER_TASK = 16
 """Most logs that one task identifies: the main process works once a task. As many are identified
 again per worker after an interruption."""
 
@@ -36,6 +36,17 @@ end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
 SCHEMA = 7
 """Version of the tables of a store, part of their names: older tables are not read."""
+
+SETTLED_S = 10
+"""Seconds (s) after its last change from which the digest of a file may be kept: clocks of file
+systems have steps of up to 2 s, in which a file may change again unnoticed."""
+
+OTHERS_POLL_S = 1.0
+"""Seconds (s) between two looks at work that other runs on the store have begun."""
+
+KEEPALIVE = {"idle": 30, "interval": 10, "count": 3}
+"""When PostgreSQL probes the connection of a run that is silent (s), again (s), and how often in
+vain: after a minute work of a computer that was cut off is left to other runs."""
 
 RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow")
 """Reasons of refusal that depend on more than the log: on the moment, ``--max-memory`` or

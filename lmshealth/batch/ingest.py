@@ -1,11 +1,12 @@
 """Ingest of an archive: every log is hashed, and identified once in the life of a store."""
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+import time
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import Generic, NamedTuple, Self, TypeVar
 
 from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.batch import constants
@@ -32,6 +33,10 @@ Progress = Callable[[str, int, int], None]
 LogKey = tuple[str, str]
 """Name of a log, and the key of its estimates in the store."""
 
+Piece = TypeVar("Piece")
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+
 _logger = logging.getLogger(__name__)
 
 
@@ -42,6 +47,67 @@ class Resources:
     store: Store
     pool: Pool
     progress: Progress = lambda step, done, total: None
+
+
+@dataclass(frozen=True, slots=True)
+class Work(Generic[Piece, Job]):
+    """Work that the runs on a store divide among them: pieces by their keys.
+
+    A run claims pieces, ``size`` at a time, and makes a ``job`` of those that it gets. ``fetch``
+    takes results of pieces from the store, and yields those pieces whose result was there.
+    """
+
+    key: Callable[[Piece], str]
+    job: Callable[[Sequence[Piece]], Job]
+    fetch: Callable[[Sequence[Piece]], Iterable[Piece]]
+    size: int = 1
+
+    def divided(
+        self,
+        pieces: Sequence[Piece],
+        store: Store,
+        mapper: Callable[[Iterator[Job]], Iterator[tuple[Job, Result]]],
+    ) -> Iterator[tuple[Job, Result]]:
+        """Map over jobs of all pieces that no other run does; yield each job with its result.
+
+        What other runs have claimed is looked at again in the end: they store its result, or end
+        without. The caller stores a result before it asks for the next.
+        """
+        left = pieces
+        while left:
+            others = yield from self._unclaimed(left, store, mapper)
+            if len(others) == len(left):
+                time.sleep(constants.OTHERS_POLL_S)
+            left = others
+
+    def _unclaimed(
+        self,
+        pieces: Sequence[Piece],
+        store: Store,
+        mapper: Callable[[Iterator[Job]], Iterator[tuple[Job, Result]]],
+    ) -> Generator[tuple[Job, Result], None, list[Piece]]:
+        """Map over jobs of unclaimed pieces; return the pieces that others have claimed."""
+        others, claimed = list[Piece](), dict[int, list[str]]()
+
+        def jobs() -> Iterator[Job]:
+            for first in range(0, len(pieces), self.size):
+                part = [(self.key(piece), piece) for piece in pieces[first : first + self.size]]
+                own = store.claim([key for key, _ in part])
+                others.extend(piece for key, piece in part if key not in own)
+                mine = [piece for key, piece in part if key in own]
+                if store.is_divided:  # another run may have done it since this one began
+                    done = {self.key(piece) for piece in self.fetch(mine)}
+                    store.release(list(done))
+                    mine = [piece for piece in mine if self.key(piece) not in done]
+                if mine:
+                    job = self.job(mine)
+                    claimed[id(job)] = [self.key(piece) for piece in mine]
+                    yield job
+
+        for job, result in mapper(jobs()):
+            yield job, result
+            store.release(claimed.pop(id(job)))
+        return others
 
 
 class Reading(NamedTuple):
@@ -112,7 +178,7 @@ def ingest(
     Each log is read with the first description that matches it. No file inside the folder of the
     output is a log.
     """
-    store, pool, progress = resources.store, resources.pool, resources.progress
+    store, progress = resources.store, resources.progress
     folder = folder.absolute()  # workers may have another working directory
     archive = find_logs(folder, follow_links=reading.follow_links)
     inside = out.resolve()
@@ -130,19 +196,24 @@ def ingest(
             own.append(found.key)
 
     cached = set()
-    for task, outcome in _cached(tasks, stages, store):
-        add(_Outcome.of(task, outcome, is_new=False))
-        cached.add(task.name)
+
+    def fetch(part: Sequence[_Task]) -> Iterator[_Task]:
+        for task, outcome in _cached(part, stages, store):
+            add(_Outcome.of(task, outcome, is_new=False))
+            cached.add(task.name)
+            yield task
+
+    known = {task.name for task in fetch(tasks)}
     progress("identifying", len(cached), len(tasks))
-    left = [task for task in tasks if task.name not in cached]
-    work = partial(_identify_logs, stages=tuple(stages), max_memory=reading.max_memory)
-    done = len(cached)
-    for part in _identified(left, work, pool):
+    left = [task for task in tasks if task.name not in known]
+    identify = partial(_identify_logs, stages=tuple(stages), max_memory=reading.max_memory)
+    done = 0
+    for part in _identified(left, identify, resources, fetch):
         store.put_identified(one.row for one in part if one.row is not None)
         for one in part:
             add(one)
         done += len(part)
-        progress("identifying", done, len(tasks))
+        progress("identifying", len(cached) + done, len(tasks))
     names = {name_of(path, folder) for path in found}
     machines, descriptions, others = _grouped(groups, [stage.digest for stage in stages])
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
@@ -177,16 +248,11 @@ def _tasks(
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
     manifest = read_manifest(folder, follow_links=reading.follow_links)
-    digests: dict[Path, str | BadLog] = {}
-    resources.progress("reading", 0, len(found))
-    size = constants.FILES_PER_HASH_TASK
-    batches = (tuple(found[first : first + size]) for first in range(0, len(found), size))
-    for _, part in resources.pool.map_unordered(_digests, batches, _no_digests):
-        digests |= part
-        resources.progress("reading", len(digests), len(found))
+    digests = _all_digests({path: _file_key(path, folder) for path in found}, resources)
     tasks: list[_Task] = []
     refused: list[Refusal] = list(manifest.refused)
-    for path, digest in digests.items():
+    for path in found:
+        digest = digests[path]
         if isinstance(digest, BadLog):
             refused.append(Refusal(name_of(path, folder), digest.reason, digest.detail))
     seen: dict[tuple[str, str], str] = {}
@@ -208,6 +274,45 @@ def _tasks(
         seen[content] = name
         tasks.append(_Task(path, name, overrides, digest, reading.columns))
     return tasks, refused
+
+
+def _file_key(path: Path, folder: Path) -> tuple[str, bool]:
+    """Return a key of a file by its name, size and times, and whether these are old enough."""
+    name = name_of(path, folder)
+    try:
+        found = path.stat()
+    except OSError:
+        return fingerprint(name), False
+    age = time.time() - max(found.st_mtime, found.st_ctime)
+    key = fingerprint(name, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
+    return key, age > constants.SETTLED_S
+
+
+def _all_digests(
+    files: Mapping[Path, tuple[str, bool]], resources: Resources
+) -> dict[Path, str | BadLog]:
+    """Hash the files that have changed since they were hashed last, by this run or another one."""
+    store, pool, digests = resources.store, resources.pool, dict[Path, str | BadLog]()
+
+    def fetch(paths: Sequence[Path]) -> Iterator[Path]:
+        known = store.digests(files[path][0] for path in paths)
+        for path in paths:
+            if (digest := known.get(files[path][0])) is not None:
+                digests[path] = digest
+                yield path
+
+    known = set(fetch([*files]))
+    resources.progress("reading", len(digests), len(files))
+    size = constants.FILES_PER_HASH_TASK
+    work: Work[Path, tuple[Path, ...]] = Work(lambda path: files[path][0], tuple, fetch, size)
+    left = [path for path in files if path not in known]
+    mapper = lambda jobs: pool.map_unordered(_digests, jobs, _no_digests)  # noqa: E731
+    for _, part in work.divided(left, store, mapper):
+        digests |= part
+        new = {files[path]: digest for path, digest in part.items() if isinstance(digest, str)}
+        store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
+        resources.progress("reading", len(digests), len(files))
+    return digests
 
 
 def _digests(paths: Iterable[Path]) -> dict[Path, str | BadLog]:
@@ -253,16 +358,20 @@ def _none_of(stages: Sequence[Stage]) -> str:
 
 
 def _identified(
-    left: Sequence[_Task], work: Callable[[Sequence[_Task]], list[_Outcome]], pool: Pool
+    left: Sequence[_Task],
+    identify: Callable[[Sequence[_Task]], list[_Outcome]],
+    resources: Resources,
+    fetch: Callable[[Sequence[_Task]], Iterable[_Task]],
 ) -> Iterator[list[_Outcome]]:
     """Identify logs, several in one task; those of a task that ended its worker one by one."""
+    pool, lost = resources.pool, list[tuple[_Task, ...]]()
     size = min(constants.LOGS_PER_TASK, max(1, len(left) // (4 * pool.size)))
-    parts = [tuple(left[first : first + size]) for first in range(0, len(left), size)]
-    lost: list[tuple[_Task, ...]] = []
-    for part, outcomes in pool.map_unordered(work, parts, lambda part, why: []):
+    work: Work[_Task, tuple[_Task, ...]] = Work(lambda task: task.key(""), tuple, fetch, size)
+    mapper = lambda jobs: pool.map_unordered(identify, jobs, lambda part, why: [])  # noqa: E731
+    for part, outcomes in work.divided(left, resources.store, mapper):
         lost += [] if outcomes else [(task,) for task in part]
         yield outcomes
-    for _, outcomes in pool.map_unordered(work, lost, _crashed):
+    for _, outcomes in pool.map_unordered(identify, lost, _crashed):
         yield outcomes
 
 

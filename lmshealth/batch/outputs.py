@@ -77,16 +77,15 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
 
 def write_pages(
     records: Iterable[MachineRecord], pool: Pool, out: Path
-) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write the pages of machines; yield each machine with its output, or why there is none.
+) -> Iterator[tuple[MachineRecord, MachineOutput | str | None]]:
+    """Write the pages of machines; yield each record with its output, or why there is none.
 
-    Machines whose assessment is missing or cannot be decoded are skipped.
+    The output is None where the assessment is missing or cannot be decoded.
     """
     for record, output in pool.map_unordered(_output_or_reason, records, lambda _, why: why):
         if isinstance(output, MachineOutput):
             write_text(out / record.file, output.page)
-        if output is not None:
-            yield record.machine, output
+        yield record, output
 
 
 def _output_or_reason(record: MachineRecord) -> MachineOutput | str | None:

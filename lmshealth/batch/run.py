@@ -4,6 +4,7 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
+from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -15,7 +16,7 @@ from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import Progress, Reading, Resources, ingest
+from lmshealth.batch.ingest import Progress, Reading, Resources, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Fleet, Status
 from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
@@ -215,11 +216,11 @@ def report(
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
         records = (_record(one.machine, one.key, files[one.machine], store) for one in present)
-        for name, output in write_pages(records, pool, out):
+        for record, output in write_pages(records, pool, out):
             if isinstance(output, str):
-                failed[name] = output
-            else:
-                rows[name] = output.summary
+                failed[record.machine] = output
+            elif output is not None:
+                rows[record.machine] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         found = "the store holds only results of another version of lmshealth"
@@ -346,21 +347,41 @@ def _outputs(
         # The rows of its logs, which are large, follow from their names and keys.
         record = _record(name, keys[name], files[name], store)
         key = fingerprint(VERSION, record, machine.logs)
-        kept: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
-        if kept is None:
-            missing[name] = machine, key
+        if output := _kept_output(name, key, store, out / files[name]):
+            yield name, output
         else:
-            write_text(out / files[name], kept.page)
-            yield name, kept
-    records = (
-        _record(name, keys[name], files[name], store, packed_rows(machine, store))
-        for name, (machine, _) in missing.items()
-    )
-    for name, output in write_pages(records, resources.pool, out):
-        if isinstance(output, MachineOutput):
-            store.put_points(name, output.points)
-            store.put_part(name, missing[name][1], pack(output))
-        yield name, output
+            missing[name] = machine, key
+
+    def fetch(names: Sequence[str]) -> list[str]:
+        return [name for name in names if store.part(name, missing[name][1]) is not None]
+
+    def job(names: Sequence[str]) -> MachineRecord:
+        [name] = names
+        rows = packed_rows(missing[name][0], store)
+        return _record(name, keys[name], files[name], store, rows)
+
+    work: Work[str, MachineRecord] = Work(lambda name: missing[name][1], job, fetch)
+    left = set(missing)
+    mapper = partial(write_pages, pool=resources.pool, out=out)
+    for record, drawn in work.divided(list(missing), store, mapper):
+        name = record.machine
+        left.remove(name)
+        if isinstance(drawn, MachineOutput):
+            store.put_points(name, drawn.points)
+            store.put_part(name, missing[name][1], pack(drawn))
+        if drawn is not None:
+            yield name, drawn
+    for name in left:  # drawn by other runs
+        if output := _kept_output(name, missing[name][1], store, out / files[name]):
+            yield name, output
+
+
+def _kept_output(name: str, key: str, store: Store, page: Path) -> MachineOutput | None:
+    """Fetch the output of a machine from the store, and write its page; None if it is not there."""
+    found: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
+    if found is not None:
+        write_text(page, found.page)
+    return found
 
 
 def _record(

@@ -10,7 +10,7 @@ import hashlib
 import logging
 import re
 import socket
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -22,7 +22,7 @@ from urllib.parse import quote
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.engine import URL, Connection, Engine, make_url
-from sqlalchemy.exc import SQLAlchemyError
+from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.schema import CreateTable
 
 from lmshealth._serialize import VERSION, fingerprint, pack, unpack
@@ -71,6 +71,8 @@ def _table(table: str, keys: str, columns: str) -> sql.Table:
     return sql.Table(f"{table}_{constants.SCHEMA}", _METADATA, *primary, *others)
 
 
+# Digest of the content of each file, by its name, size and times.
+_HASHED = _table("hashed", "key", "digest")
 # Outcome of each log; the columns between key and content are for people.
 _IDENTIFIED = _table("identified", "key", "digest description version machine content")
 # The present assessment of each machine, and the one before the fleet prior was applied.
@@ -192,8 +194,9 @@ class Store:
         self._engine, self._address = _connect(url, create=create)
         self._shown = shown_address(self._address)
         tables = sql.inspect(self._engine).get_table_names()
-        shown = {table.name for table in _VIEWS.values()}
-        if missing := _METADATA.tables.keys() - shown - set(tables):
+        self._claims: Connection | None = None
+        optional = {table.name for table in (_HASHED, *_VIEWS.values())}
+        if missing := _METADATA.tables.keys() - optional - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
@@ -206,9 +209,72 @@ class Store:
 
     def close(self) -> None:
         """Close all connections."""
+        self._drop_claims()
         self._engine.dispose()
 
+    # Division of work among runs
+
+    @property
+    def is_divided(self) -> bool:
+        """Whether runs divide their work: on PostgreSQL; those on one SQLite file do not."""
+        return bool(self._engine.dialect.name == "postgresql")
+
+    def claim(self, keys: Sequence[str]) -> set[str]:
+        """Claim pieces of work; return the keys of those that no other run has claimed.
+
+        A claim ends by `release`, or with the connection of this run, for instance by a crash.
+        """
+        return set(keys) if not self.is_divided else self._lock(sql.func.pg_try_advisory_lock, keys)
+
+    def release(self, keys: Sequence[str]) -> None:
+        """End claims, once for each time that a piece of work was claimed."""
+        if self.is_divided and keys:
+            self._lock(sql.func.pg_advisory_unlock, keys)
+
+    def _lock(self, function: Any, keys: Sequence[str]) -> set[str]:
+        """Apply a function of the server to the locks of its session that stand for keys."""
+        numbers = {key: _lock_number(key) for key in keys}
+        given = sql.cast([*numbers.values()], postgresql.ARRAY(sql.BigInteger))
+        number = sql.func.unnest(given).column_valued("number")
+        query = sql.select(number, function(number))
+        with self._faults():
+            try:
+                rows = self._claiming().execute(query).all()
+            except DBAPIError as error:
+                if not error.connection_invalidated:
+                    raise
+                # A server that was started again has lost the claims: work may be done twice.
+                self._drop_claims()
+                rows = self._claiming().execute(query).all()
+        done = {number for number, is_done in rows if is_done}
+        return {key for key, number in numbers.items() if number in done}
+
+    def _claiming(self) -> Connection:
+        """Return the connection whose session holds the claims."""
+        if self._claims is None:
+            connection = self._engine.connect().execution_options(isolation_level="AUTOCOMMIT")
+            for name, value in constants.KEEPALIVE.items():
+                connection.execute(sql.text(f"SET tcp_keepalives_{name} = {value}"))
+            self._claims = connection
+        return self._claims
+
+    def _drop_claims(self) -> None:
+        if self._claims is not None:
+            self._claims.invalidate()
+            self._claims.close()
+            self._claims = None
+
     # Logs
+
+    def digests(self, keys: Iterable[str]) -> dict[str, str]:
+        """Fetch the digests of the content of those files that are known by their keys."""
+        return {row.key: row.digest for row in self._of_keys(_HASHED, _HASHED.c.digest, keys)}
+
+    def put_digests(self, digests: Mapping[str, str]) -> None:
+        """Store digests of the content of files."""
+        with self._begin() as connection:
+            rows = [{"key": key, "digest": digest} for key, digest in digests.items()]
+            self._put_rows(connection, _HASHED, rows)
 
     def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
         """Fetch the outcomes of those logs that are stored, under their names of that time."""
@@ -218,22 +284,18 @@ class Store:
 
     def packed_identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Fetch the same as bytes, for `unpack_or_none` in a worker."""
-        asked = list(dict.fromkeys(keys))
-        for first in range(0, len(asked), constants.ROWS_PER_QUERY):
-            part = asked[first : first + constants.ROWS_PER_QUERY]
-            query = sql.select(_IDENTIFIED.c.key, _IDENTIFIED.c.content)
-            with self._begin() as connection:
-                rows = connection.execute(query.where(_IDENTIFIED.c.key.in_(part))).all()
-            for row in rows:
-                if (content := _unsealed(row.content, row.key)) is not None:
-                    yield row.key, content
+        for row in self._of_keys(_IDENTIFIED, _IDENTIFIED.c.content, keys):
+            if (content := _unsealed(row.content, row.key)) is not None:
+                yield row.key, content
 
     def put_identified(self, rows: Iterable[OutcomeRow]) -> None:
         """Store outcomes of logs in one transaction."""
+        whole = [
+            row._asdict() | {"content": _sealed(row.content, row.key), "version": VERSION}
+            for row in rows
+        ]
         with self._begin() as connection:
-            for row in rows:
-                sealed = {"content": _sealed(row.content, row.key), "version": VERSION}
-                connection.execute(self._upsert(_IDENTIFIED, row._asdict() | sealed))
+            self._put_rows(connection, _IDENTIFIED, whole)
 
     # Machines
 
@@ -262,8 +324,7 @@ class Store:
                 return
             of_this = _PARTS.c.machine == own
             connection.execute(sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(parts))))
-            for part, content in parts.items():
-                connection.execute(self._upsert(_PARTS, _part(machine, part, content)))
+            self._put_rows(connection, _PARTS, [_part(machine, *part) for part in parts.items()])
 
     def put_part(self, machine: str, key: str, content: bytes) -> None:
         """Store one more part of the last assessment of a machine."""
@@ -292,7 +353,7 @@ class Store:
         earlier = _POINTS.c.machine == _id(machine), _POINTS.c.quantity != "remaining_km"
         with self._begin() as connection:
             connection.execute(sql.delete(_POINTS).where(*earlier))
-            self._put_rows(connection, _POINTS, rows)
+            self._put_rows(connection, _POINTS, _named(rows))
 
     def put_status(
         self, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
@@ -310,8 +371,8 @@ class Store:
             for one in changes
         ]
         with self._begin() as connection:
-            self._put_rows(connection, _STATUS, present)
-            self._put_rows(connection, _CHANGES, changed)
+            self._put_rows(connection, _STATUS, _named(present))
+            self._put_rows(connection, _CHANGES, _named(changed))
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
@@ -372,6 +433,16 @@ class Store:
 
     # Statements
 
+    def _of_keys(self, table: sql.Table, column: Any, keys: Iterable[str]) -> Iterator[Any]:
+        """Fetch a column of the rows that are there under keys, some rows in each query."""
+        asked = list(dict.fromkeys(keys))
+        for first in range(0, len(asked), constants.ROWS_PER_QUERY):
+            part = asked[first : first + constants.ROWS_PER_QUERY]
+            query = sql.select(table.c.key, column).where(table.c.key.in_(part))
+            with self._begin() as connection:
+                rows = connection.execute(query).all()
+            yield from rows
+
     def _of_assessment(self, column: Any, machine: str, key: str) -> Any:
         where = _ASSESSED.c.machine == _id(machine), _ASSESSED.c.key == key
         return self._first(sql.select(column).where(*where))
@@ -386,16 +457,11 @@ class Store:
             connection.execute(self._upsert(table, row))
 
     def _put_rows(
-        self, connection: Connection, table: sql.Table, rows: Iterable[dict[str, Any]]
+        self, connection: Connection, table: sql.Table, rows: Sequence[dict[str, Any]]
     ) -> None:
-        """Write rows of machines by their names; SQLite knows no zones: moments are in UTC."""
-        whole = [
-            {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
-            | {"machine": _id(row["name"])}
-            for row in rows
-        ]
-        if whole:
-            connection.execute(self._upsert(table, whole[0]), whole)
+        """Write rows in one statement."""
+        if rows:
+            connection.execute(self._upsert(table, rows[0]), rows)
 
     def _upsert(self, table: sql.Table, row: dict[str, Any], *, where: Any = None) -> Any:
         """Insert or update a row, of another table with ``where``: a later write replaces it."""
@@ -411,17 +477,36 @@ class Store:
     @contextmanager
     def _begin(self) -> Iterator[Connection]:
         """Open a transaction."""
+        with self._faults(), self._engine.begin() as connection:
+            yield connection
+
+    @contextmanager
+    def _faults(self) -> Iterator[None]:
+        """Replace the errors of the database by a `StoreError`."""
         try:
-            with self._engine.begin() as connection:
-                yield connection
+            yield
         except SQLAlchemyError as error:
             why = f"{_reason(error, self._address)}; its results are kept, run again to continue"
             # The cause would quote the row.
             raise StoreError(f"the store {self._shown} failed: {why}") from None
 
 
+def _lock_number(key: str) -> int:
+    digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).digest()
+    return int.from_bytes(digest[:8], signed=True)
+
+
 def _id(machine: str) -> str:
     return hashlib.sha256(machine.encode("utf-8", "surrogatepass")).hexdigest()
+
+
+def _named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add the keys of machines to rows with their names; moments in UTC: SQLite has no zones."""
+    return [
+        {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+        | {"machine": _id(row["name"])}
+        for row in rows
+    ]
 
 
 def _sealed(content: bytes, *keys: str) -> bytes:

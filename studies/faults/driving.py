@@ -163,12 +163,15 @@ def _lines(path: Path) -> list[str]:
 
 
 def rows(store: str) -> dict[str, int]:
-    """Count the rows of every table of a store, their version left out of their names."""
+    """Count the rows of every table of a store, their version left out of their names.
+
+    Digests of files are left out: those of files that were written just now are not kept.
+    """
     if store.startswith("sqlite") and not Path(make_url(store).database or "").exists():
         return {}  # to connect would make it
     engine = create_engine(store)
     try:
-        names = inspect(engine).get_table_names()
+        names = [n for n in inspect(engine).get_table_names() if not n.startswith("hashed_")]
         with engine.connect() as connection:
             counts = {n: connection.execute(text(f'SELECT count(*) FROM "{n}"')) for n in names}
             return {re.sub(r"_\d+$", "", n): int(count.scalar_one()) for n, count in counts.items()}

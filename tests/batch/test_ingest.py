@@ -1,10 +1,12 @@
 """Ingest: several logs in one task, and those of a task whose worker ends."""
 
 from collections.abc import Iterable, Iterator
+from contextlib import closing
 from pathlib import Path
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _identified, _Outcome, _Task
+from lmshealth.batch.ingest import Resources, _identified, _Outcome, _Task
+from lmshealth.batch.store import Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal
 
@@ -39,7 +41,9 @@ def test_a_log_that_ends_its_worker_costs_no_other_log() -> None:
     """The logs of its task are identified one by one, and it alone is refused for that."""
     tasks = [_Task(Path(f"log-{k:04d}"), f"log-{k:04d}", {}, "0" * 64, None) for k in range(150)]
     pool = Fragile()
-    refused = [one.refused[0] for part in _identified(tasks, work, pool) for one in part]
+    with closing(Store("sqlite://")) as store:
+        parts = list(_identified(tasks, work, Resources(store, pool), lambda part: ()))
+    refused = [one.refused[0] for part in parts for one in part]
     assert sorted(one.log for one in refused) == [task.name for task in tasks]
     assert [one.log for one in refused if one.reason == "crashed"] == [BAD]
     assert max(pool.sizes) == constants.LOGS_PER_TASK
@@ -50,5 +54,7 @@ def test_few_logs_are_spread_over_the_workers() -> None:
     """A handful of logs is not one task."""
     tasks = [_Task(Path(str(k)), str(k), {}, "0" * 64, None) for k in range(6)]
     pool = Fragile()
-    assert len([one for part in _identified(tasks, work, pool) for one in part]) == len(tasks)
+    with closing(Store("sqlite://")) as store:
+        parts = list(_identified(tasks, work, Resources(store, pool), lambda part: ()))
+    assert len([one for part in parts for one in part]) == len(tasks)
     assert pool.sizes == [1] * len(tasks)

@@ -3,9 +3,16 @@
 from __future__ import annotations
 
 import csv
+import json
+import os
 import shutil
 import sqlite3
-from collections.abc import Sequence
+import subprocess
+import sys
+import threading
+from collections import Counter
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,6 +23,7 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from sqlalchemy import text
 
 from lmshealth import examples
 from lmshealth._serialize import pack, unpack
@@ -309,6 +317,172 @@ def test_results_on_a_cluster_are_those_of_this_machine(
 
 
 @pytest.mark.slow
+@dataclass
+class Shared:
+    """Two runs at the same time: results, and how often each piece of work was done."""
+
+    results: list[RunResult]
+    done: dict[str, Counter[str]]
+
+
+def run_twice(
+    logs: Path, stage: Stage, outs: Sequence[Path], store: str | None, patch: pytest.MonkeyPatch
+) -> Shared:
+    """Start two runs at the same time, in threads; count files hashed and read, and machines."""
+    done = {name: Counter[str]() for name in ("hashed", "read", "assessed", "drawn")}
+
+    def count(module: Any, function: str, what: str, name: Callable[..., str]) -> None:
+        original = getattr(module, function)
+
+        def counted(*given: Any, **more: Any) -> Any:
+            done[what][name(*given)] += 1
+            return original(*given, **more)
+
+        patch.setattr(module, function, counted)
+
+    count(ingesting, "content_digest", "hashed", lambda path: path.name)
+    count(ingesting, "read_log", "read", lambda path: path.name)
+    count(assessing, "_assess", "assessed", lambda _, machine, __: machine.name)
+    count(outputs, "make_page", "drawn", lambda found, *_: found.history.stage)
+    patch.setattr(constants, "OTHERS_POLL_S", 0.05)
+    patch.setattr(constants, "SETTLED_S", -1)
+    patch.setattr(constants, "FILES_PER_HASH_TASK", 2)
+    both = threading.Barrier(2)
+
+    def one(out: Path) -> RunResult:
+        both.wait()
+        return run(logs, [stage], out, Settings(store=store))
+
+    with ThreadPoolExecutor(2) as threads:
+        return Shared(list(threads.map(one, outs)), done)
+
+
+def write_three_machines(logs: Path) -> None:
+    """Write five logs of each of three machines."""
+    for k in range(15):
+        write_log(logs / f"{k}.h5", 1.0, k, stage=f"test-{k % 3}-A")
+
+
+def test_two_runs_on_a_server_divide_logs_and_machines(
+    tmp_path: Path, modes_only: Stage, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each log is hashed and read once, each machine assessed and drawn once; both have all."""
+    logs, outs = tmp_path / "logs", [tmp_path / "one", tmp_path / "two"]
+    write_three_machines(logs)
+    alone = run(logs, [modes_only], tmp_path / "alone", Settings())
+    shared = run_twice(logs, modes_only, outs, database, monkeypatch)
+    for what, n in {"hashed": 15, "read": 15, "assessed": 3, "drawn": 3}.items():
+        assert len(shared.done[what]) == n
+        assert set(shared.done[what].values()) == {1}, what
+    assert sum(result.n_logs - result.n_remembered for result in shared.results) == 15
+    for out, result in zip(outs, shared.results, strict=True):
+        assert [row.identity for row in result.rows] == [row.identity for row in alone.rows]
+        assert tables(out) == tables(tmp_path / "alone")
+        assert pages(out) == pages(tmp_path / "alone")
+
+
+def test_two_runs_on_a_file_both_do_everything(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Control of the test before: without claims work is done twice."""
+    logs, outs = tmp_path / "logs", [tmp_path / "one", tmp_path / "two"]
+    write_three_machines(logs)
+    shared = run_twice(logs, modes_only, outs, None, monkeypatch)
+    assert set(shared.done["read"].values()) == {2}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("killed", [False, True])
+def test_two_processes_on_a_server_divide_an_archive(
+    killed: bool, tmp_path: Path, database: str, root: Path
+) -> None:
+    """As two computers do; what a run that is killed has begun is left to the other."""
+    logs, stage = tmp_path / "logs", write_archive_stage(tmp_path / "stage", health=False)
+    for k in range(60):
+        write_log(logs / f"{k:02d}.h5", 1.0, k, stage=f"test-{k % 4}-A")
+    command = [sys.executable, "-m", "lmshealth", "run", str(logs), "--stage", str(stage)]
+    command += ["--store", database, "--workers", "1", "--format", "json", "--out"]
+    outs = [tmp_path / "one", tmp_path / "two"]
+    started = [
+        subprocess.Popen([*command, str(out)], stdout=subprocess.PIPE, cwd=root) for out in outs
+    ]
+    if killed:
+        with closing(Store(database)) as store:
+            servers.wait_until(lambda: bool(_ask_count(store)), "the first log")
+        started[0].kill()
+    found = [json.loads(one.communicate()[0] or "{}") for one in started]
+    run(logs, [load_stage(str(stage))], tmp_path / "alone", Settings())
+    assert tables(outs[1]) == tables(tmp_path / "alone")
+    assert pages(outs[1]) == pages(tmp_path / "alone")
+    new = [one["n_logs"] - one["n_remembered"] for one in found if one]
+    if not killed:
+        assert sum(new) == 60
+        assert tables(outs[0]) == tables(outs[1])
+    assert len(new) == (1 if killed else 2)
+
+
+def _ask_count(store: Store) -> Any:
+    with store._begin() as connection:
+        return connection.scalar(text(f"SELECT count(*) FROM identified_{constants.SCHEMA}"))
+
+
+def test_work_that_another_run_leaves_is_done(
+    tmp_path: Path, modes_only: Stage, database: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A run waits for logs that another one has claimed, and does them when that has ended."""
+    write_archive(tmp_path / "logs", 3)
+    monkeypatch.setattr(constants, "OTHERS_POLL_S", 0.05)
+    claims, waiting = list[str](), threading.Event()
+    original = Store.claim
+
+    def claim(store: Store, keys: Sequence[str]) -> set[str]:
+        if not claims:
+            claims.extend(keys)
+            original(other, keys)
+        elif not waiting.is_set():
+            waiting.set()
+            assert not original(store, keys)
+            other.close()
+            return set()
+        return original(store, keys)
+
+    with closing(Store(database)) as other:
+        monkeypatch.setattr(Store, "claim", claim)
+        settings = Settings(store=database)
+        assert run(tmp_path / "logs", [modes_only], tmp_path / "out", settings).n_logs == 3
+    assert waiting.is_set()
+
+
+def test_unchanged_files_are_not_hashed_again(
+    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A file is hashed after a change, also one that keeps size and time, or came just now."""
+    logs = write_archive(tmp_path / "logs", 3)
+    hashed = list[str]()
+    original = ingesting.content_digest
+
+    def digest(path: Path) -> str:
+        hashed.append(path.name)
+        return original(path)
+
+    monkeypatch.setattr(ingesting, "content_digest", digest)
+
+    def again() -> list[str]:
+        hashed.clear()
+        run(logs, [modes_only], tmp_path / "out", Settings())
+        return sorted(hashed)
+
+    assert again() == again() == ["log-00.h5", "log-01.h5", "log-02.h5"]  # written just now
+    monkeypatch.setattr(constants, "SETTLED_S", -1)
+    again()
+    assert not again()
+    changed, before = logs / "log-01.h5", (logs / "log-01.h5").stat()
+    changed.write_bytes(changed.read_bytes()[:-1] + b"x")
+    os.utime(changed, ns=(before.st_atime_ns, before.st_mtime_ns))
+    assert changed.stat().st_size == before.st_size
+    assert again() == ["log-01.h5"]
+
+
 def test_another_seed_gives_other_draws(done: Done) -> None:
     """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
     (assessment,) = assessments(done.out)
@@ -748,7 +922,7 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
-    job = assessing._Update("M7-Y", "key", pack(own), pack(start), prior, ())
+    job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(start), prior, ())
     made = assessing._update(job)
     assert isinstance(made, assessing.PackedAssessment)
     found = unpack(made.content, Assessment).prognosis
@@ -763,7 +937,7 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     own = make()
     assert own.prognosis is not None
     lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
-    made = assessing._update(assessing._Update("M7-Y", "key", pack(own), None, None, lives))
+    made = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives))
     assert isinstance(made, assessing.PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
     tables = machine_tables(found)
@@ -773,6 +947,6 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
     assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
     assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
-    few = assessing._update(assessing._Update("M7-Y", "key", pack(own), None, None, lives[:8]))
+    few = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives[:8]))
     assert isinstance(few, assessing.PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

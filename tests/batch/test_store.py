@@ -41,7 +41,7 @@ from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.tracking.history import LogEstimates
-from studies.harness.servers import Postgres
+from studies.harness.servers import Postgres, wait_until
 from tests.assessments import leaves, worn
 
 SCHEMA = constants.SCHEMA
@@ -248,6 +248,44 @@ def test_a_frozen_server_is_not_waited_for(
         assert [key for key, _ in store.identified(["before"])] == ["before"]
 
 
+def test_runs_on_a_server_divide_their_work(database: str) -> None:
+    """A piece of work is claimed by one run, until that releases it or ends."""
+    with closing(Store(database)) as second:
+        with closing(Store(database)) as first:
+            assert first.claim(["a", "b"]) == {"a", "b"}
+            assert second.claim(["b", "c"]) == {"c"}
+            first.release(["b"])
+            assert second.claim(["a", "b"]) == {"b"}
+        wait_until(lambda: second.claim(["a"]) == {"a"}, "the end of a session")
+
+
+def test_runs_on_a_file_do_not_divide_their_work(file_url: str) -> None:
+    """Each may do everything."""
+    with closing(Store(file_url)) as first, closing(Store(file_url)) as second:
+        assert first.claim(["a"]) == second.claim(["a"]) == {"a"}
+        first.release(["a"])
+
+
+def test_a_run_whose_claims_are_lost_goes_on(database: str) -> None:
+    """A server that ends the session of the claims leaves them to others, and makes new ones."""
+    with closing(Store(database)) as first, closing(Store(database)) as second:
+        assert first.claim(["a"]) == {"a"}
+        others = "pg_stat_activity WHERE pid != pg_backend_pid() AND datname = current_database()"
+        _ask(second, f"SELECT pg_terminate_backend(pid, 10000) FROM {others}")
+        assert second.claim(["a"]) == {"a"}
+        assert first.claim(["a", "b"]) == {"b"}
+        first.release(["a", "b"])
+
+
+def test_digests_come_back_by_key(url: str) -> None:
+    """Those that are there, and the last one of a key."""
+    with closing(Store(url)) as store:
+        store.put_digests({"k": "0" * 64, "m": "1" * 64})
+        store.put_digests({"k": "2" * 64})
+        assert store.digests(["k", "none"]) == {"k": "2" * 64}
+        store.put_digests({})
+
+
 def _ask(store: Store, statement: str) -> list[tuple[object, ...]]:
     with store._begin() as connection:
         return [tuple(row) for row in connection.execute(text(statement))]
@@ -451,7 +489,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
         Store(f"sqlite:///{path}").close()
     finally:
         event.remove(Engine, "before_cursor_execute", be_quicker)
-    assert len(made) == 9 + 3
+    assert len(made) == 10 + 3
 
 
 @pytest.mark.slow

@@ -271,7 +271,7 @@ def test_two_workers(race: Race) -> None:
 
         def turn() -> float:
             one, two = (bare(folder, n, N_SHORT) for n in (1, 2))
-            rates = [identified(folder, Settings(workers=n)).rate for n in (1, 2)]
+            rates = [identified(folder, Settings(workers=n)).rate() for n in (1, 2)]
             return min(two / one, 2.0) / (rates[1] / rates[0])
 
         race.told(
