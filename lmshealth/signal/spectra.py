@@ -280,6 +280,7 @@ def transform_detrended(x: FloatArray, n_ordinates: int) -> ComplexArray:
     turn = np.exp(-2j * np.pi / n * np.arange(1, n_ordinates + 1))
     most = max(1, n // max(_LONG, 2 * n_ordinates))
     m = max(m for m in range(1, most + 1) if n % m == 0)
+    x = x - x[0]  # a channel without a signal has a transform of exactly zero
     parts = fft.rfft(x.reshape(-1, m), axis=0)[1 : n_ordinates + 1]
     transform: ComplexArray = parts[:, -1]
     for k in range(m - 2, -1, -1):

@@ -170,27 +170,25 @@ def _fit(
 
     real = np.ascontiguousarray(rest).view(np.float64)
 
-    def fit(terms: int) -> tuple[ComplexArray, ComplexArray]:
+    def fit(terms: int) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
         basis = np.hstack([one[:, :terms] for one in bases])
         size = np.linalg.lstsq(basis, real, rcond=None)[0]
-        left_over = np.ascontiguousarray(real - basis @ size).view(np.complex128)
-        return np.ascontiguousarray(size[:terms]).view(np.complex128), left_over
+        after = np.ascontiguousarray(real - basis @ size).view(np.complex128)
+        first = np.ascontiguousarray(size[:terms]).view(np.complex128)
+        return first, np.asarray(bases[0][:, :terms] @ first), after
 
-    def of_first(size: ComplexArray) -> ComplexArray:
-        return np.asarray(bases[0][:, : len(size)] @ size)
-
-    most, after = fit(choice[-1])
+    most, own, after = fit(choice[-1])
     level = left(after, widest, widest + _NEAR)
     far = left(after, widest + _NEAR, widest + _FAR)
     channel = int(np.argmax(np.sum(np.abs(most) ** 2, axis=0) / level))
     if not level[channel] <= constants.SINUSOID_RESIDUAL * far[channel]:
         return None
     for terms in choice[:-1]:
-        size, after = fit(terms)
+        fewer, part, after = fit(terms)
         width = _half_width(terms)
         if (left(after, width, width + _NEAR) <= _FIT_RATIO * level).all():
-            return size, of_first(size), level
-    return most, of_first(most), level
+            return fewer, part, level
+    return most, own, level
 
 
 def _residual_power(rest: ComplexArray, level: FloatArray) -> float:
