@@ -64,14 +64,18 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
             inner = slice(at - low, at - low + block.size)
             steady = _steady(velocity[low:high], lag, scale)[inner]
             moving = np.abs(block) > constants.VELOCITY_TOLERANCE * scale
-            index = np.arange(at, at + block.size)
-            last = np.maximum.accumulate(np.where(moving, index, last_move))
-            last_move = int(last[-1])
-            code = np.where(moving, steady, np.where(index - last <= settling, 2, 3))
-            cuts = [0, *(np.flatnonzero(np.diff(code)) + 1).tolist(), block.size]
+            code = np.where(moving, steady.view(np.int8), np.int8(2))
+            cuts = [0, *(np.flatnonzero(code[1:] != code[:-1]) + 1).tolist(), block.size]
             for a, b in pairwise(cuts):
-                mean = float(np.mean(block[a:b]))
-                _join(found, Segment(at + a, at + b, mean, _KINDS[int(code[a])]))
+                kind = int(code[a])
+                if kind < 2:
+                    last_move, settled = at + b - 1, b
+                else:
+                    settled = min(max(last_move + settling + 1 - at, a), b)
+                for low, high, own in ((a, settled, kind), (settled, b, 3)):
+                    if low < high:
+                        mean = float(np.mean(block[low:high]))
+                        _join(found, Segment(at + low, at + high, mean, _KINDS[own]))
         phases += found
     return tuple(phases)
 

@@ -18,7 +18,8 @@ from lmshealth.signal.tone_removal import remove_sinusoids
 
 # Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
-# Segments of more samples than this lose a few at their end for a fast transform.
+# Samples that fit into the processor's cache. Longer segments lose a few at their end for a fast
+# transform.
 _LONG = 1 << 14
 # Only segments of at least this many samples are averaged: the parts of a long segment.
 _LEAST_PART = MINUTE // 2
@@ -212,8 +213,10 @@ def transform_segment(
     frequency = _frequencies(n, sample_rate, ceiling)
     transforms = np.empty((frequency.size, len(channels)), dtype=complex)
     for c, (x, lag) in enumerate(parts):
-        x = x[short - lag : n + short - lag]
-        transforms[:, c] = _transform(x, lag, frequency, sample_rate)
+        transforms[:, c] = transform_detrended(x[short - lag : n + short - lag], frequency.size)
+        if lag:
+            transforms[:, c] *= lag_gain(frequency, lag, sample_rate)
+    transforms *= np.sqrt(2 / (n * sample_rate))
     duration = n / sample_rate
     protected = np.any([r.unresolved(frequency, duration) for r in resonances], axis=0)
     rest, free, sinusoids = remove_sinusoids(transforms, duration, protected)
@@ -267,17 +270,25 @@ def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
     )
 
 
-def _transform(x: FloatArray, lag: int, frequency: FloatArray, sample_rate: float) -> ComplexArray:
-    """Transform the result of `as_acceleration`; the squared magnitude is the periodogram."""
-    ramp = np.arange(x.size, dtype=np.float64)
-    ramp -= (x.size - 1) / 2
-    ramp *= ramp @ x / (ramp @ ramp)
-    rest: FloatArray = x - x.mean()
-    rest -= ramp
-    transform: ComplexArray = fft.rfft(rest)[1 : frequency.size + 1]
-    transform *= np.sqrt(2 / (x.size * sample_rate))
-    if lag:
-        transform *= lag_gain(frequency, lag, sample_rate)
+def transform_detrended(x: FloatArray, n_ordinates: int) -> ComplexArray:
+    """Transform samples without their mean and linear trend: the first ordinates, but the zeroth.
+
+    Of a long segment the transforms of every m-th sample, which fit into the processor's cache, are
+    combined by Horner's rule.
+    """
+    n, centre = x.size, (x.size - 1) / 2
+    turn = np.exp(-2j * np.pi / n * np.arange(1, n_ordinates + 1))
+    most = max(1, n // max(_LONG, 2 * n_ordinates))
+    m = max(m for m in range(1, most + 1) if n % m == 0)
+    x = x - x[0]  # a channel without a signal has a transform of exactly zero
+    parts = fft.rfft(x.reshape(-1, m), axis=0)[1 : n_ordinates + 1]
+    transform: ComplexArray = parts[:, -1]
+    for k in range(m - 2, -1, -1):
+        transform = transform * turn + parts[:, k]
+    blocks = ((first, x[first : first + _LONG]) for first in range(0, n, _LONG))
+    moment = sum(float((np.arange(own.size) + (first - centre)) @ own) for first, own in blocks)
+    # Σ k exp(-iθk) = n / (exp(-iθ) - 1)
+    transform = transform - moment / ((n**2 - 1) / 12) / (turn - 1)
     return transform
 
 

@@ -76,9 +76,8 @@ def _remove(
         found = _fit(rest[near], places - near.start, choice)
         if found is None:
             continue
-        size, level = found
+        size, fitted, level = found
         terms = len(size)
-        fitted = _basis(near, places[0], terms) @ size
         # Of sinusoids too close to each other, as of a comb, one may exceed the sum of all.
         if _residual_power(rest[near] - fitted, level) > _residual_power(rest[near], level):
             continue
@@ -89,8 +88,10 @@ def _remove(
         removed.append(Sinusoid(channel, float(places[0]), own))
         # Its skirt falls with the square of the distance.
         reach = max(_REACH, int(np.sqrt(np.max(power / level) / _SKIRT) / np.pi))
-        reached = slice(max(0, at - reach), min(at + reach + 1, len(rest)))
-        rest[reached] -= _basis(reached, places[0], terms) @ size
+        if reach > _REACH:
+            near = slice(max(0, at - reach), min(at + reach + 1, len(rest)))
+            fitted = _basis(near, places[0], terms) @ size
+        rest[near] -= fitted
         width = _half_width(terms)
         free[max(0, at - width) : at + width + 1] = False
     return removed
@@ -148,39 +149,46 @@ def _contrast(power: FloatArray) -> FloatArray:
 
 def _fit(
     rest: ComplexArray, places: FloatArray, choice: tuple[int, ...]
-) -> tuple[ComplexArray, FloatArray] | None:
+) -> tuple[ComplexArray, ComplexArray, FloatArray] | None:
     """Fit several sinusoids by the fewest polynomials of a choice that suffice.
 
-    Coefficients of the first one, ``(n_terms, n_channels)``, and power of its surroundings,
-    ``(n_channels,)``; None where no polynomial explains it.
+    Coefficients of the first one, ``(n_terms, n_channels)``, its part of ``rest``, and power of its
+    surroundings, ``(n_channels,)``; None where no polynomial explains it.
     """
     apart = np.abs(np.arange(len(rest)) - places[:, None])
     widest = _half_width(choice[-1])
     # Around the other sinusoids the noise is fitted, too.
     alone = (apart[1:] > widest).all(axis=0)
 
-    def left(fit: ComplexArray, inner: int, outer: int) -> FloatArray:
+    def left(after: ComplexArray, inner: int, outer: int) -> FloatArray:
         there = alone & (apart[0] > inner) & (apart[0] <= outer)
         if not there.any():
             return np.full(rest.shape[1], np.nan)
-        return np.asarray(np.median(np.abs(fit[there]) ** 2, axis=0) / np.log(2))
+        return np.asarray(np.median(np.abs(after[there]) ** 2, axis=0) / np.log(2))
 
-    sizes, fits = [], []
-    for terms in choice:
-        basis = np.hstack([_basis(slice(0, len(rest)), place, terms) for place in places])
-        size = np.linalg.lstsq(basis, rest, rcond=None)[0]
-        sizes.append(np.asarray(size[:terms], dtype=np.complex128))
-        fits.append(rest - basis @ size)
-    level = left(fits[-1], widest, widest + _NEAR)
-    far = left(fits[-1], widest + _NEAR, widest + _FAR)
-    channel = int(np.argmax(np.sum(np.abs(sizes[-1]) ** 2, axis=0) / level))
+    bases = [_basis(slice(0, len(rest)), place, choice[-1]) for place in places]
+
+    real = np.ascontiguousarray(rest).view(np.float64)
+
+    def fit(terms: int) -> tuple[ComplexArray, ComplexArray, ComplexArray]:
+        basis = np.hstack([one[:, :terms] for one in bases])
+        size = np.linalg.lstsq(basis, real, rcond=None)[0]
+        after = np.ascontiguousarray(real - basis @ size).view(np.complex128)
+        first = np.ascontiguousarray(size[:terms]).view(np.complex128)
+        return first, np.asarray(bases[0][:, :terms] @ first), after
+
+    most, own, after = fit(choice[-1])
+    level = left(after, widest, widest + _NEAR)
+    far = left(after, widest + _NEAR, widest + _FAR)
+    channel = int(np.argmax(np.sum(np.abs(most) ** 2, axis=0) / level))
     if not level[channel] <= constants.SINUSOID_RESIDUAL * far[channel]:
         return None
-    for size, fit in zip(sizes, fits, strict=True):
-        width = _half_width(len(size))
-        if (left(fit, width, width + _NEAR) <= _FIT_RATIO * level).all():
-            return size, level
-    return sizes[-1], level
+    for terms in choice[:-1]:
+        fewer, part, after = fit(terms)
+        width = _half_width(terms)
+        if (left(after, width, width + _NEAR) <= _FIT_RATIO * level).all():
+            return fewer, part, level
+    return most, own, level
 
 
 def _residual_power(rest: ComplexArray, level: FloatArray) -> float:

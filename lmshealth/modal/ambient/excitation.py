@@ -21,9 +21,8 @@ _BAND = 3.4
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
-# Log evidence over that of a white force below which a coloured one is not fitted, and decrement at
-# which its fit ends.
-_UNLIKELY, _NEAR = -4.0, 0.03
+# Log evidence over that of a white force below which a coloured one is not fitted.
+_UNLIKELY = -4.0
 
 
 class Unsteadiness(NamedTuple):
@@ -101,13 +100,14 @@ def average_colours(
         flat = marginalise(likelihood, p)
     bumps = place_bumps(*np.exp(white.mean).reshape(2, -1))
     q = np.append(p, np.zeros(bumps.shape[1]))
-    guess = marginalise(likelihood.coloured(bumps, constants.WIDTHS_COLOUR[0]), q)
+    coloured = likelihood.coloured(bumps, constants.WIDTHS_COLOUR[0])
+    guess = marginalise(coloured, q)
     if np.isfinite(guess.decrement) and guess.log_evidence - flat.log_evidence < _UNLIKELY:
         return Colour(white.mean, white.cov, 0.0)
     found = [flat]
     for std in constants.WIDTHS_COLOUR:
-        coloured = likelihood.coloured(bumps, std)
-        moved = coloured.minimise(q, _NEAR)
+        coloured = coloured.with_bump_std(std)
+        moved = coloured.minimise(q)
         one = marginalise(coloured, moved)
         # Another resonance than that of the white force is no estimate of it.
         most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))

@@ -26,7 +26,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import cho_factor, cho_solve
-from scipy.optimize import OptimizeResult, minimize
+from scipy.optimize import brentq
 from scipy.special import logsumexp, softmax
 
 from lmshealth._arrays import ComplexArray, FloatArray
@@ -34,7 +34,7 @@ from lmshealth.modal import constants
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Layout:
     """Places of the unknowns; the floors of the channels are the components after the modes."""
 
@@ -45,68 +45,73 @@ class Layout:
     has_static: bool = False  # third unknown of each mode: its static response
     n_bumps: int = 0  # of the log spectrum of the modal forces; their heights are the last unknowns
 
-    @property
+    @cached_property
     def _of_modes(self) -> tuple[int, ...]:
         """Derivatives of h by the unknowns of a mode."""
         return (1, 2, 3) if self.has_static else (1, 2)
 
-    @property
+    @cached_property
     def n_components(self) -> int:
         """Number of modes and floors."""
         return self.n_modes + self.n_channels
 
-    @property
+    @cached_property
     def n_poles(self) -> int:
         """Number of the unknowns of h, which come first: two per mode, three per floor."""
         return len(self._of_modes) * self.n_modes + 3 * self.n_channels
 
-    @property
+    @cached_property
     def pole(self) -> list[tuple[int, int]]:
         """Component of each unknown of h, and the index of its derivative of h."""
         modes = [(i, q) for q in self._of_modes for i in range(self.n_modes)]
         floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
         return modes + floors
 
-    @property
+    @cached_property
     def forces(self) -> slice:
         """Unknowns of L."""
         return slice(self.n_poles, self.n_poles + len(self.force))
 
-    @property
+    @cached_property
     def shared(self) -> list[int]:
         """Unknowns of L that make floors coherent with modes."""
         m, first = self.n_modes, self.forces.start
         return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
 
-    @property
+    @cached_property
     def common(self) -> list[int]:
         """Unknowns of L that make floors coherent with each other."""
         m, first = self.n_modes, self.forces.start
         return [first + a for a, (_, j) in enumerate(self.force) if j >= m]
 
-    @property
+    @cached_property
     def bends(self) -> list[int]:
         """Unknowns b of the floors."""
         return list(range(self.n_poles - 3 * self.n_channels + 2, self.n_poles, 3))
 
-    @property
+    @cached_property
     def shapes(self) -> slice:
         """Unknowns of the shapes."""
         return slice(self.forces.stop, self.forces.stop + len(self.shape))
 
-    @property
+    @cached_property
     def bumps(self) -> slice:
         """Heights of the bumps."""
         return slice(self.shapes.stop, self.size)
 
-    @property
-    def coloured(self) -> FloatArray:
-        """Powers of the gain of forces in the change of E by each unknown but the heights."""
-        m = self.n_modes
-        rows = [i for i, *_ in (*self.pole, *self.force)]
-        return np.array([*((i < m) / 2 for i in rows), *(0.5 for _ in self.shape)])
+    @cached_property
+    def places(self) -> tuple[tuple[NDArray[np.intp], NDArray[np.intp]], ...]:
+        """Columns of `pole`, `force` and `shape`."""
+        pairs = (self.pole, self.force, self.shape)
+        columns = (np.array(own, dtype=np.intp).reshape(-1, 2).T for own in pairs)
+        return tuple((first, second) for first, second in columns)
 
-    @property
+    @cached_property
+    def power(self) -> FloatArray:
+        """Power of the gain of forces in the response of each component."""
+        return (np.arange(self.n_components) < self.n_modes) / 2
+
+    @cached_property
     def size(self) -> int:
         """Number of unknowns."""
         return self.n_poles + len(self.force) + len(self.shape) + self.n_bumps
@@ -162,14 +167,16 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     return np.stack([h, -d_x * square, -damping * square, none, *by_x, none, by_z, none, none])
 
 
-# Newton decrement, a square in standard deviations, below which the search ends; along a valley as
-# flat as that of two modes at one frequency, after so many steps, a larger one.
-_ARRIVED, _NEARLY, _MANY_STEPS = 1e-4, 0.1, 25
+# Newton decrement, a square in standard deviations, below which the search ends, and most steps.
+_ARRIVED, _MOST_STEPS = 1e-5, 100
+# First radius of the trust region, and shares of the expected gain: steps count above the first,
+# the radius shrinks below the second and grows above the third.
+_FIRST_RADIUS, _ACCEPTED, _POOR, _GOOD = 0.3, 0.15, 0.25, 0.75
 # Slopes of E that are computed at a time: more channels would not fit into the processor's cache.
-_CACHED = 1 << 18
+_CACHED = 1 << 14
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Likelihood:
     """Negative log posterior of the unknowns of a cluster."""
 
@@ -181,8 +188,10 @@ class Likelihood:
     spread: float  # half width of the band in ln f
     bumps: FloatArray = field(default_factory=lambda: np.empty((2, 0)))  # centres, widths in Hz
     bump_std: float = 1.0  # standard deviation of the prior of their heights
+    # Models at the latest unknowns, by the bytes of these.
+    _latest: dict[bytes, list[_Point]] = field(default_factory=dict, init=False, repr=False)
 
-    @property
+    @cached_property
     def prior_std(self) -> FloatArray:
         """Standard deviations of the weak priors, shape ``(n_unknowns,)``."""
         lay = self.layout
@@ -206,45 +215,52 @@ class Likelihood:
         layout, start = replace(self.layout, n_bumps=n), np.append(self.start, np.zeros(n))
         return replace(self, layout=layout, start=start, bumps=bumps, bump_std=std)
 
-    def value(self, p: FloatArray, points: list[_Point] | None = None) -> float:
-        """Negative log posterior up to a constant; ``points`` are the models at p."""
-        total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
-        with np.errstate(over="ignore", invalid="ignore"):
-            try:
-                total += sum(point.misfit() for point in points or self._at(p))
-            except np.linalg.LinAlgError:
-                return np.inf
-        return total if np.isfinite(total) else np.inf
+    def with_bump_std(self, std: float) -> Likelihood:
+        """Return the likelihood with another prior of the heights, for which no model changes."""
+        other = replace(self, bump_std=std)
+        other._latest.update(self._latest)
+        return other
 
-    def derivatives(
-        self, p: FloatArray, points: list[_Point] | None = None
-    ) -> tuple[FloatArray, FloatArray]:
+    def value(self, p: FloatArray) -> float:
+        """Negative log posterior up to a constant."""
+        with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
+            total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
+            total += self.data_value(p)
+            if np.isfinite(total):
+                return total
+        return np.inf
+
+    def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
         gradient = (p - self.start) / self.prior_std**2
         hessian = np.diag(1 / self.prior_std**2)
-        for point in points or self._at(p):
-            first, second = point.derivatives()
-            gradient = gradient + first
-            hessian = hessian + second
+        for point in self._at(p):
+            gradient = gradient + point.derivatives[0]
+            hessian = hessian + point.derivatives[1]
         return gradient, hessian
 
     def data_value(self, p: FloatArray) -> float:
         """Negative log likelihood without the priors."""
-        return sum(point.misfit() for point in self._at(p))
+        return sum(point.misfit for point in self._at(p))
 
     def expected(self, p: FloatArray) -> list[ComplexArray]:
         """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
         return [point.expected for point in self._at(p)]
 
     def _at(self, p: FloatArray) -> list[_Point]:
-        with np.errstate(over="ignore", invalid="ignore"):
-            return [_Point(self, p, block) for block in self.blocks]
+        key = p.tobytes()
+        if key not in self._latest:
+            while len(self._latest) > 1:
+                del self._latest[next(iter(self._latest))]
+            with np.errstate(over="ignore", invalid="ignore"):
+                self._latest[key] = [_Point(self, p, block) for block in self.blocks]
+        return self._latest[key]
 
     def shapes(self, p: FloatArray) -> FloatArray:
         """Shapes of the modes, shape ``(n_channels, n_modes)``."""
         phi = np.ones((self.layout.n_channels, self.layout.n_modes))
         if self.layout.shape:
-            phi[tuple(_columns(self.layout.shape))] = p[self.layout.shapes]
+            phi[self.layout.places[2]] = p[self.layout.shapes]
         return phi
 
     def strength(self, p: FloatArray) -> FloatArray:
@@ -261,49 +277,60 @@ class Likelihood:
         at = MeanOrdinates(np.exp(p[:m]), np.empty((m, 0, 0), dtype=complex), np.ones(m), None)
         return _Point(self, p, at)
 
-    def minimise(self, start: FloatArray, arrived: float = _ARRIVED) -> FloatArray:
-        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
+    def minimise(self, start: FloatArray) -> FloatArray:
+        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""
+        p, value, (slope, curvature) = start, self.value(start), self.derivatives(start)
+        radius = _FIRST_RADIUS
+        for _ in range(_MOST_STEPS):
+            newton = _newton_step(slope, curvature)
+            if newton is not None and -float(slope @ newton) < _ARRIVED:
+                break
+            if newton is not None and np.linalg.norm(newton) <= radius:
+                step, growth = newton, 1
+            else:
+                step, growth = _step_to(radius, slope, curvature), 2
+            moved = p + step
+            after = self.value(moved)
+            share = (value - after) / -float(slope @ step + 0.5 * step @ curvature @ step)
+            if share > _ACCEPTED and (found := self._finite_derivatives(moved)) is not None:
+                p, value, (slope, curvature) = moved, after, found
+                radius *= growth if share > _GOOD else 1 / 4 if share < _POOR else 1
+            else:
+                radius /= 4
+        return p
 
-        The search ends below the decrement ``arrived``.
-        """
+    def _finite_derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray] | None:
+        """Return `derivatives`; None where they overflow."""
+        with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
+            found = self.derivatives(p)
+            if all(np.isfinite(part).all() for part in found):
+                return found
+        return None
 
-        @lru_cache(maxsize=2)  # the point of a step, and the one before, to which it may return
-        def at(raw: bytes) -> tuple[float, FloatArray, FloatArray]:
-            p = np.frombuffer(raw)
-            points = self._at(p)
-            with suppress(np.linalg.LinAlgError), np.errstate(over="ignore", invalid="ignore"):
-                slope, curvature = self.derivatives(p, points)
-                if np.isfinite(slope).all() and np.isfinite(curvature).all():
-                    return self.value(p, points), slope, curvature
-            # Overflow far away: the optimiser takes derivatives before it sees that the value is
-            # infinite and refuses the step.
-            return np.inf, np.full(p.size, np.nan), np.eye(p.size)
 
-        def value(p: FloatArray) -> tuple[float, FloatArray]:
-            return at(p.tobytes())[:2]
+def _newton_step(slope: FloatArray, curvature: FloatArray) -> FloatArray | None:
+    """Return the step to the minimum of a quadratic; None if it has none."""
+    with suppress(np.linalg.LinAlgError):
+        return np.asarray(-cho_solve(cho_factor(curvature), slope))
+    return None
 
-        def hessian(p: FloatArray) -> FloatArray:
-            return at(p.tobytes())[2]
 
-        steps = iter(range(1, 1000))
+def _step_to(radius: float, slope: FloatArray, curvature: FloatArray) -> FloatArray:
+    """Return the step of this length to the least value of a quadratic (Moré and Sorensen)."""
+    values, vectors = np.linalg.eigh(curvature)
+    along = vectors.T @ slope
+    least = max(0.0, 1e-12 * np.abs(values).max() - values[0])
 
-        def check(intermediate_result: OptimizeResult) -> None:
-            near = arrived if next(steps) < _MANY_STEPS else _NEARLY
-            _, slope, curvature = at(intermediate_result.x.tobytes())
-            with suppress(np.linalg.LinAlgError):  # no minimum near
-                if float(slope @ cho_solve(cho_factor(curvature), slope)) < near:
-                    raise StopIteration
+    def excess(shift: float) -> float:
+        return float(1 / radius - 1 / np.linalg.norm(along / (values + shift)))
 
-        found = minimize(
-            value,
-            start,
-            jac=True,
-            hess=hessian,
-            method="trust-exact",
-            callback=check,
-            options={"gtol": 1e-9, "maxiter": 100, "initial_trust_radius": 0.3},
-        )
-        return np.asarray(found.x)
+    step = -along / (values + least)
+    if excess(least) > 0:
+        most = least + float(np.linalg.norm(slope)) / radius
+        step = -along / (values + brentq(excess, least, most, rtol=1e-6))
+    else:  # no slope along the lowest curvature
+        step[0] += np.sqrt(radius**2 - step @ step)
+    return np.asarray(vectors @ step)
 
 
 class _Point:
@@ -315,8 +342,8 @@ class _Point:
         m, n = lay.n_modes, lay.n_components
         self._root = np.zeros((n, n))
         self._root[range(m, n), range(m, n)] = 1.0
-        for value, (i, j) in zip(p[lay.forces], lay.force, strict=True):
-            self._root[i, j] = self._scale[i] * value
+        driven, force = lay.places[1]
+        self._root[driven, force] = self._scale[driven] * p[lay.forces]
         self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
         self._s = np.asarray(self._root @ self._root.T)
         f, zeta = np.exp(p[: 2 * m].reshape(2, m, 1))
@@ -361,55 +388,45 @@ class _Point:
         expected = np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
         return expected if self._block.foreign is None else expected + self._block.foreign
 
+    @cached_property
+    def _whitening(self) -> tuple[ComplexArray, ComplexArray]:
+        """C⁻¹ with C Cᴴ = E, and C⁻¹ W C⁻ᴴ; shapes as `expected`."""
+        whiten = np.asarray(np.linalg.inv(np.linalg.cholesky(self.expected)), dtype=np.complex128)
+        return whiten, whiten @ self._block.matrix @ whiten.conj().swapaxes(1, 2)
+
+    @cached_property
     def misfit(self) -> float:
         """Σ n (ln det E + tr E⁻¹ W)."""
-        root = np.linalg.cholesky(self.expected)
-        white = np.linalg.solve(self.expected, self._block.matrix)
-        log_det = 2 * np.log(np.diagonal(root, axis1=-2, axis2=-1).real).sum(axis=-1)
-        return float(self._block.count @ (log_det + np.trace(white, axis1=-2, axis2=-1).real))
+        whiten, white = (np.diagonal(part, axis1=1, axis2=2).real for part in self._whitening)
+        return float(self._block.count @ (white - 2 * np.log(whiten)).sum(axis=1))
 
+    @cached_property
     def derivatives(self) -> tuple[FloatArray, FloatArray]:
         """Gradient and Hessian of the misfit (README.md)."""
-        count, eye = self._block.count, np.eye(self._layout.n_channels)
-        whiten = np.linalg.inv(np.linalg.cholesky(self.expected))
-        adjoint = whiten.conj().swapaxes(1, 2)
-        excess = eye - whiten @ self._block.matrix @ adjoint
-        row, w = self._slopes()
+        count, eye = self._block.count[:, None, None], np.eye(self._layout.n_channels)
+        packing, size = _packing(len(eye)), self._layout.bumps.start
+        whiten, white = self._whitening
+        excess = count * (eye - white)
+        row, w = self._slopes
+        gradient = np.zeros(self._layout.size)
+        hessian = self._curvature(whiten.conj().swapaxes(1, 2) @ excess @ whiten)
         # The columns of Φ for the floors are the unit vectors of the channels.
-        basis = _frequency_last(whiten @ self._phi)
-        g = _frequency_last(adjoint @ (count[:, None, None] * excess) @ whiten)
-        b = _congruent(self._phi, g)  # Φᵀ G Φ, (components, components, n)
-        size, n = self._layout.bumps.start, count.size
-        excess_last = _frequency_last(excess) * count
-        weight = _frequency_last(eye - 2 * excess) * count
-        gradient, hessian = np.zeros(size), np.zeros((size, size))
-        along, own, heights = np.zeros((size, n)), np.zeros(n), np.zeros(n)
+        near = whiten @ self._phi
+        first, w = packing.pack(excess), np.ascontiguousarray(w.transpose(2, 1, 0))
         step = max(1, _CACHED // (eye.size * row.size))
-        for part in (slice(first, first + step) for first in range(0, n, step)):
-            near = basis[..., part]
-            half = _combined(near, w[..., part].conj().swapaxes(0, 1)).conj()
-            half = near[:, row][:, None] * half[None]
-            slopes = half + half.conj().swapaxes(0, 1)  # (channels, channels, unknowns, part)
-            slopes, by_gain = slopes[:, :, :size], slopes[:, :, size:].sum(axis=2)
-            turned = _combined(weight[..., part], slopes)
-            gradient += _inner(slopes, excess_last[:, :, None, part])[:, 0]
-            hessian += _inner(slopes, turned)
+        for part in (slice(at, at + step) for at in range(0, len(count), step)):
+            slopes = packing.slopes(near[part], near[part].conj() @ w[part], row)
             if self._layout.n_bumps:
                 # Heights change E as the gain of the forces does, times their bump.
-                across = _combined(weight[..., part], by_gain[:, :, None])
-                along[:, part] = np.sum((by_gain[:, :, None] * turned.conj()).real, axis=(0, 1))
-                own[part] = np.sum((by_gain * across[:, :, 0].conj()).real, axis=(0, 1))
-                heights[part] = np.sum((by_gain * excess_last[..., part].conj()).real, axis=(0, 1))
-        hessian += self._curvature(w[:size], g, b)
-        if not self._layout.n_bumps:
-            return gradient, hessian
-        along += self._with_gain(row[:size], w[:size], b)
-        own += self._gains(b)
-        mixed = along @ self._bump.T
-        return np.append(gradient, heights @ self._bump.T), np.block(
-            [[hessian, mixed], [mixed.T, (self._bump * own) @ self._bump.T]]
-        )
+                heights = slopes[:, :, size:].sum(axis=2, keepdims=True) * self._bump.T[part, None]
+                slopes = np.concatenate([slopes[:, :, :size], heights], axis=2)
+            turned = packing.product(count[part] * (2 * white[part] - eye)) @ slopes
+            slopes = slopes.reshape(-1, gradient.size)
+            gradient += first[part].ravel() @ slopes
+            hessian += slopes.T @ turned.reshape(slopes.shape)
+        return gradient, hessian
 
+    @cached_property
     def _slopes(self) -> tuple[NDArray[np.intp], ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
 
@@ -417,19 +434,13 @@ class _Point:
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
         lay, h, s = self._layout, self._h, self._s
-        pole, slope = _columns(lay.pole)
-        driven, _ = _columns(lay.force)
+        (pole, slope), (driven, _), (channel, mode) = lay.places
         by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
         pairs = self._block.smear(h[0][:, None] * h[0].conj())
-        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven]]
-        row = [pole, driven]
+        row = [pole, driven, lay.n_modes + channel]
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven], self._modal[mode]]
         if lay.n_bumps:
-            w = [part * self._gain[i] for part, i in zip(w, row, strict=True)]
-        if lay.shape:
-            channel, mode = _columns(lay.shape)
-            row.append(lay.n_modes + channel)
-            w.append(self._modal[mode])
-        if lay.n_bumps:
+            w[:2] = [part * self._gain[i] for part, i in zip(w[:2], row[:2], strict=True)]
             row.append(np.arange(lay.n_modes))
             w.append(self._modal[: lay.n_modes] / 2)
         return np.concatenate(row), np.concatenate(w)
@@ -437,29 +448,40 @@ class _Point:
     @cached_property
     def _change(self) -> FloatArray:
         """Change of the row and column of S that belong to each force, ``(forces, components)``."""
-        driven, force = _columns(self._layout.force)
+        driven, force = self._layout.places[1]
         return np.asarray(self._scale[driven, None] * self._root.T[force])
 
-    def _curvature(self, w: ComplexArray, g: ComplexArray, b: ComplexArray) -> FloatArray:
-        """Σ tr G E_ab over all pairs of unknowns but the heights, the counts in G; b = Φᵀ G Φ."""
-        lay = self._layout
-        curvature = np.zeros((lay.bumps.start, lay.bumps.start))
-        pull = np.tensordot(self._phi.T, g, axes=(1, 0))  # Φᵀ G, (components, channels, n)
+    def _curvature(self, g: ComplexArray) -> FloatArray:
+        """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
+        lay, (row, w) = self._layout, self._slopes
+        size = lay.bumps.start
+        curvature = np.zeros((lay.size, lay.size))
+        g = np.ascontiguousarray(np.moveaxis(g, 0, -1))
+        # Φᵀ G, (components, channels, n), and the transpose of Φᵀ G Φ
+        pull = np.tensordot(self._phi.T, g, axes=(1, 0))
+        turned = np.tensordot(self._phi.T, pull, axes=(1, 1))
         if lay.n_bumps:
-            b = b * self._gain
+            (pole, _), (driven, _), (_, mode) = lay.places
+            power = lay.power[:, None] + lay.power
+            part = (w[:size] * turned[row[:size]]).real
+            along = 2 * np.einsum("ajk,aj->ak", part, power[np.concatenate([pole, driven, mode])])
+            own = np.einsum("ijk,ijk,ij->k", self._modal, turned, power**2).real
+            curvature[:size, size:] = along @ self._bump.T
+            curvature[size:, :size] = curvature[:size, size:].T
+            curvature[size:, size:] = (self._bump * own) @ self._bump.T
+            turned = turned * self._gain
         if self._block.kernel is not None:
-            b = self._block.kernel.spread(b)
-        turned = b.swapaxes(0, 1)
+            turned = self._block.kernel.spread(turned)
         self._by_poles(curvature, turned)
         self._by_forces(curvature, turned)
         if lay.shape:
-            self._by_shapes(curvature, w, g, pull)
+            self._by_shapes(curvature, g, pull)
         return curvature
 
     def _by_poles(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """Add the part of two unknowns of h: Q = Σ_ij S_ij B_ji h_i h_j*."""
         h, n = self._h, self._layout.n_poles
-        component, slope = _columns(self._layout.pole)
+        component, slope = self._layout.places[0]
         weight = self._s[..., None] * turned
         first = h[slope, component]
         pairs = weight[component[:, None], component]
@@ -474,12 +496,12 @@ class _Point:
     def _by_forces(self, curvature: FloatArray, turned: ComplexArray) -> None:
         """Add the part of two forces, and of a force and an unknown of h."""
         lay, h = self._layout, self._h
-        driven, force = _columns(lay.force)
+        driven, force = lay.places[1]
         overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
         overlap *= np.outer(self._scale, self._scale)
         same = force[:, None] == force
         curvature[lay.forces, lay.forces] += 2 * same * overlap[driven[:, None], driven]
-        component, slope = _columns(lay.pole)
+        component, slope = lay.places[0]
         mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
         # S changes in row and column.
         term = (driven[:, None] == component) * (self._change @ mixed.T)
@@ -487,41 +509,19 @@ class _Point:
         curvature[lay.forces, : lay.n_poles] += 2 * term
         curvature[: lay.n_poles, lay.forces] += 2 * term.T
 
-    def _by_shapes(
-        self, curvature: FloatArray, w: ComplexArray, g: ComplexArray, pull: ComplexArray
-    ) -> None:
+    def _by_shapes(self, curvature: FloatArray, g: ComplexArray, pull: ComplexArray) -> None:
         """Add the part of two shapes, and of a shape and an unknown of D."""
-        lay = self._layout
-        channel, mode = _columns(lay.shape)
+        lay, first = self._layout, self._layout.shapes.start
+        channel, mode = lay.places[2]
+        row, inner = (own[:first] for own in self._slopes)
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
         own = own[mode[:, None], mode, channel, channel[:, None]]
         curvature[lay.shapes, lay.shapes] += 2 * own.real
-        inner = w[: lay.shapes.start]
         along = np.einsum("ajk,jck->ac", inner, pull)
-        row = np.array([i for i, *_ in (*lay.pole, *lay.force)], dtype=int)
         across = inner.conj() @ pull[row].swapaxes(1, 2)  # (a, i, c)
         term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
-        curvature[: lay.shapes.start, lay.shapes] += 2 * term.real
-        curvature[lay.shapes, : lay.shapes.start] += 2 * term.real.T
-
-    def _with_gain(self, row: NDArray[np.intp], w: ComplexArray, b: ComplexArray) -> FloatArray:
-        """Compute tr G E_ab of the unknowns and the log gain of the forces, ``(unknowns, n)``."""
-        power = self._power[:, None] + self._layout.coloured[:, None, None]
-        return np.asarray(2 * np.sum((w * b.swapaxes(0, 1)[row]).real * power, axis=1))
-
-    def _gains(self, b: ComplexArray) -> FloatArray:
-        """Compute tr G E_aa of the log gain of the forces, ``(n,)``."""
-        power = (self._power[:, None] + self._power) ** 2
-        return np.asarray(np.einsum("ijk,jik,ij->k", self._modal, b, power).real)
-
-    @property
-    def _power(self) -> FloatArray:
-        """Power of the gain of the forces in the response of each component."""
-        return (np.arange(self._layout.n_components) < self._layout.n_modes) / 2
-
-
-def _columns(pairs: Sequence[tuple[int, int]]) -> NDArray[np.intp]:
-    return np.array(pairs, dtype=np.intp).reshape(-1, 2).T
+        curvature[:first, lay.shapes] += 2 * term.real
+        curvature[lay.shapes, :first] += 2 * term.real.T
 
 
 def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
@@ -530,21 +530,49 @@ def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
     return np.asarray(np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2))
 
 
-def _combined(matrix: ComplexArray, vectors: ComplexArray) -> ComplexArray:
-    """Σ_d M_cd v_d at each frequency, the last axis; axes between are carried along."""
-    # One product per pair: their axes are too short for a loop inside.
-    return np.array([sum(m * v for m, v in zip(row, vectors, strict=True)) for row in matrix])
+class _Packing:
+    """Hermitian matrices as real vectors: the lower triangle, which keeps inner products."""
+
+    def __init__(self, n: int) -> None:
+        self._row, self._column = np.tril_indices(n)
+        self._off = np.flatnonzero(self._row != self._column)
+        self._scale = np.where(self._row == self._column, 1.0, np.sqrt(2))
+        # The matrices of which the elements of the vectors are coefficients.
+        basis = np.zeros((n * n, n, n), dtype=complex)
+        parts = np.append(1 / self._scale, np.full(self._off.size, 1j / np.sqrt(2)))
+        row, column = (np.append(own, own[self._off]) for own in (self._row, self._column))
+        basis[range(n * n), row, column] = parts
+        basis[range(n * n), column, row] = parts.conj()
+        table = np.einsum("lca,kab->bckl", basis, basis).reshape(n * n, 1, -1)
+        self._table = np.concatenate([table.real, -table.imag], axis=1).reshape(2 * n * n, -1)
+
+    def pack(self, matrices: ComplexArray) -> FloatArray:
+        """Return vectors ``(n, size)`` of matrices ``(n, n_channels, n_channels)``."""
+        return self._join((matrices[:, self._row, self._column] * self._scale)[..., None])[..., 0]
+
+    def slopes(
+        self, near: ComplexArray, other: ComplexArray, index: NDArray[np.intp]
+    ) -> FloatArray:
+        """Return vectors ``(n, size, n_unknowns)`` of b cᵀ + adjoint.
+
+        The column b of each unknown is that of this index in ``near``.
+        """
+        row, column, scale = self._row, self._column, self._scale[:, None]
+        lower = (near[:, row] * scale)[..., index] * other[:, column]
+        lower += ((near[:, column] * scale)[..., index] * other[:, row]).conj()
+        return self._join(lower)
+
+    def _join(self, lower: ComplexArray) -> FloatArray:
+        return np.concatenate([lower.real, lower[:, self._off].imag], axis=1)
+
+    def product(self, matrices: ComplexArray) -> FloatArray:
+        """Return P with aᵀ P b = Re tr A M B for packed A and B, ``(n, size, size)``."""
+        flat = np.ascontiguousarray(matrices).view(np.float64).reshape(len(matrices), -1)
+        size = matrices.shape[1] ** 2
+        return np.asarray(flat @ self._table).reshape(-1, size, size)
 
 
-def _inner(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    """Σ tr A_i B_j of Hermitian matrices ``(channels, channels, i or j, n)``, shape ``(i, j)``."""
-    pairs = zip(a.reshape(-1, *a.shape[2:]), b.reshape(-1, *b.shape[2:]), strict=True)
-    parts = (np.ascontiguousarray(x).view(float) @ y.view(float).T for x, y in pairs)
-    return np.asarray(sum(parts))
-
-
-def _frequency_last(matrices: ComplexArray | FloatArray) -> ComplexArray:
-    return np.ascontiguousarray(np.moveaxis(matrices, 0, -1), dtype=np.complex128)
+_packing = lru_cache(maxsize=4)(_Packing)
 
 
 class Marginal(NamedTuple):
@@ -563,8 +591,7 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     weighted by their evidence (README.md). ``p`` is near the posterior mode.
     """
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
-    points = likelihood._at(p)
-    gradient, hessian = likelihood.derivatives(p, points)
+    gradient, hessian = likelihood.derivatives(p)
     try:
         root = np.linalg.cholesky(hessian)  # exists at a maximum only
     except np.linalg.LinAlgError:
@@ -573,7 +600,7 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     # The search ends at a small gradient: one Newton step to the centre of the normal.
     step = cov @ gradient
     decrement = float(gradient @ step)
-    evidence = 0.5 * decrement - likelihood.value(p, points) - np.log(np.diag(root)).sum()
+    evidence = 0.5 * decrement - likelihood.value(p) - np.log(np.diag(root)).sum()
     p = p - step
     groups = (layout.shared, layout.common, layout.bends)
     index = np.array([unknown for group in groups for unknown in group], dtype=int)

@@ -166,8 +166,8 @@ def test_a_search_without_end_leaves_the_estimate_for_a_white_force_with_a_flag(
     log = humped(1)
     plain = Likelihood.minimise
 
-    def astray(self: Likelihood, start: np.ndarray, *arrived: float) -> np.ndarray:
-        return start + 0.02 if self.layout.n_bumps else plain(self, start, *arrived)
+    def astray(self: Likelihood, start: np.ndarray) -> np.ndarray:
+        return start + 0.02 if self.layout.n_bumps else plain(self, start)
 
     monkeypatch.setattr(Likelihood, "minimise", astray)
     found = identify(log, STAGE)

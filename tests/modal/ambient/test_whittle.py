@@ -341,12 +341,10 @@ def test_a_search_turns_back_where_derivatives_overflow(
     free = target.minimise(start)
     plain, turned = Likelihood.derivatives, 0
 
-    def derivatives(
-        self: Likelihood, p: np.ndarray, points: object
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def derivatives(self: Likelihood, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         nonlocal turned
         if np.linalg.norm(p - start) <= 0.1 or turned >= 2:
-            return plain(self, p, points)  # type: ignore[arg-type]
+            return plain(self, p)
         turned += 1
         if beyond is None:
             raise np.linalg.LinAlgError
