@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
@@ -21,7 +20,6 @@ from lmshealth.health.importance_sampling import (
     importance_sample_again,
     importance_sample_to_ess,
 )
-from lmshealth.health.results import QUANTILES
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import Grid, LifeLikelihood
 from lmshealth.prognosis.scenarios import Scenario
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 _STEP = 1 << 20  # of the random stream: beyond the epochs of health
-_N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
+_N_ENSEMBLES, _N_SETTINGS = 4, 500
 _N_ROUGH, _N_FINE = 600, 2000
 # Effective draws below which an evidence may miss most of its integral.
 _LEAST_ESS = 20.0
@@ -40,7 +38,7 @@ _LEAST_ESS = 20.0
 _N_UPDATE, _N_START = 4000, 300
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
 _NEGLIGIBLE = 0.01
-_CHECKS = ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage")
+_CHECKS = ("ess_bulk", "ess_tail", "r_hat")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -133,9 +131,6 @@ class ScenarioPosterior:
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray
-    # One minus the squared ratio of posterior to prior width of the 90 % interval of each
-    # natural parameter, at least 0, shape ``(n_dim,)``.
-    interval_shrinkage: FloatArray
     # Draws of each ensemble that represent this scenario in the mixture of all.
     n_mixture_draws: int
 
@@ -242,20 +237,6 @@ class LifePosterior:
         found = [value for one in self.scenarios for value in one.r_hat if np.isfinite(value)]
         return float(np.max(found, initial=1.0))
 
-    def to_frame(self) -> pd.DataFrame:
-        """Return quantiles of health now, then of the natural parameters of each scenario."""
-        rows = [
-            {"way": 0, "probability": 1.0, "parameter": name} | _quantiles(self.health[..., j])
-            for j, name in enumerate(self.parameters)
-        ]
-        for k, one in enumerate(self.scenarios, start=1):
-            chains = one.chains
-            for i, name in enumerate(self._names(one)):
-                head = {"way": k, "probability": one.probability, "parameter": name}
-                checks = {check: getattr(one, check)[i] for check in _CHECKS}
-                rows.append(head | _quantiles(chains[..., i]) | checks)
-        return pd.DataFrame(rows).assign(stage=self.stage)
-
     def to_arviz(self) -> DataTree:
         """Return health now and the natural parameters of each scenario for ArviZ; see `Health`."""
         import arviz_base  # late: its import takes a second
@@ -282,10 +263,6 @@ class LifePosterior:
             since = f"@{path.begin / 1000:.0f}km" if path.begin else ""
             names += [f"{parameter}.{path.law.kind}{since}.{own}" for own in path.names]
         return names
-
-
-def _quantiles(draws: FloatArray) -> dict[str, float]:
-    return {name: float(np.quantile(draws, level)) for name, level in QUANTILES.items()}
 
 
 def fit_life(
@@ -503,26 +480,15 @@ def _sampled_scenarios(
             y = weighted.resampled(np.random.default_rng(seeds[k]), _N_ENSEMBLES * n_kept)
             ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
             draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown)
-        coordinates = thin(draws.draws, n_kept)
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
             evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
-            coordinates=coordinates,
+            coordinates=thin(draws.draws, n_kept),
             ess_bulk=draws.ess_bulk,
             ess_tail=draws.ess_tail,
             r_hat=draws.r_hat,
-            interval_shrinkage=_interval_shrinkage(density.scenario, coordinates),
             n_mixture_draws=int(share),
         )
         sampled.append(one)
     return tuple(sampled)
-
-
-def _interval_shrinkage(scenario: Scenario, y: FloatArray) -> FloatArray:
-    if not scenario.n_dim:
-        return np.empty(0)
-    prior = scenario.natural(scenario.draw(np.random.default_rng(0), _N_PRIOR))
-    theta = scenario.natural(y.reshape(-1, scenario.n_dim))
-    before, after = (np.ptp(np.quantile(x, (0.05, 0.95), axis=0), axis=0) for x in (prior, theta))
-    return np.asarray(np.clip(1 - (after / before) ** 2, 0, 1))
