@@ -21,9 +21,12 @@ from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
-from lmshealth.report import constants, text
+from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
+    count,
+    in_brackets,
+    interval,
     km,
     percent,
     probability,
@@ -444,11 +447,11 @@ def changes(before: Summary, now: Summary, parameters: tuple[ParameterSpec, ...]
         yield "The stage description has changed: not all differences are wear."
     if before.baseline_at != now.baseline_at:
         yield (
-            f"The baseline has changed from {text.day(before.baseline_at)} to "
-            f"{text.day(now.baseline_at)}: percentages of the two reports cannot be compared."
+            f"The baseline has changed from {before.baseline_at.date()} to "
+            f"{now.baseline_at.date()}: percentages of the two reports cannot be compared."
         )
     was, present = (
-        verdict_text(one.verdict, parameters) + text.in_brackets(one.probability)
+        verdict_text(one.verdict, parameters) + in_brackets(one.probability)
         for one in (before, now)
     )
     if before.verdict != now.verdict:
@@ -463,8 +466,8 @@ def changes(before: Summary, now: Summary, parameters: tuple[ParameterSpec, ...]
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service.by, now.service.by)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
-    logs = f"{abs(more)} log{_s(more)} {'more' if more > 0 else 'fewer'}" if more else ""
-    further = f", {text.km(travel)} further." if travel > 0 else "."
+    logs = f"{count(abs(more), 'log')} {'more' if more > 0 else 'fewer'}" if more else ""
+    further = f", {km(travel)} further." if travel > 0 else "."
     yield (logs or "Same number of logs") + further
 
 
@@ -478,8 +481,8 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
             for found in (was, present)
         ]
         own = present.get(name)
-        spread = f" (90{GAP}%: {text.interval(own.low, own.high)})" if own else ""
-        yield f"{text.spell(name).capitalize()}: {' → '.join(medians)}{spread}."
+        spread = f" (90{GAP}%: {interval(own.low, own.high)})" if own else ""
+        yield f"{spell(name).capitalize()}: {' → '.join(medians)}{spread}."
 
 
 def _life_change(before: Summary, now: Summary) -> str:
@@ -498,14 +501,10 @@ def _service_change(before: date | None, now: date | None) -> str:
     shift = ""
     if before and now and before != now:
         later = (now - before).days
-        shift = f", {abs(later)} day{_s(later)} {'later' if later > 0 else 'earlier'}"
+        shift = f", {count(abs(later), 'day')} {'later' if later > 0 else 'earlier'}"
     days = [one.isoformat() if one else "none" for one in (before, now)]
     return f"Service date: {_from_to(*days)}{shift}."
 
 
 def _from_to(before: str, now: str) -> str:
     return f"still {now}" if before == now else f"{before} → {now}"
-
-
-def _s(count: int) -> str:
-    return "" if abs(count) == 1 else "s"

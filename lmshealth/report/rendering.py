@@ -1,5 +1,6 @@
 """Rendering: templates to HTML pages (Jinja2, everything escaped), pages to PDF (WeasyPrint)."""
 
+import inspect
 import re
 from collections.abc import Iterable
 from datetime import datetime
@@ -11,21 +12,6 @@ from typing import Any
 from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
-
-_FILTERS = (
-    *(
-        text.change,
-        text.count,
-        text.fixed,
-        text.interval,
-        text.km,
-        text.law,
-        text.moment,
-        text.number,
-    ),
-    *(text.percent, text.probability, text.probability_range, text.signed, text.spell),
-    *(text.time_left, text.travel_left, text.whole_km),
-)
 
 
 def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
@@ -52,7 +38,7 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters |= {function.__name__: function for function in (*_FILTERS, place)}
+    pages.filters |= dict(inspect.getmembers(text, inspect.isfunction)) | {"place": place}
     pages.globals |= {"covariate": text.covariate, "constants": constants}
     return pages
 
