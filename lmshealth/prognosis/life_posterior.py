@@ -125,18 +125,11 @@ class ScenarioPosterior:
     density: LifeDensity
     probability: float  # posterior probability of the scenario
     evidence_std: float  # relative standard deviation of its evidence
-    coordinates: FloatArray  # draws, shape ``(n_ensembles, n_draws, n_dim)``
-    # ess_bulk, ess_tail, r_hat: as in `Health`, of the coordinates, shape ``(n_dim,)``; after
-    # importance sampling the effective sample size, and NaN for R-hat.
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    r_hat: FloatArray
+    # Draws of the coordinates, ``(n_ensembles, n_draws, n_dim)``, with the checks of the chains;
+    # after importance sampling the effective sample size, and NaN for R-hat.
+    sample: Sample
     # Draws of each ensemble that represent this scenario in the mixture of all.
     n_mixture_draws: int
-
-    def __post_init__(self) -> None:
-        n = self.scenario.n_dim
-        freeze(self, ("coordinates", *self.coordinates.shape[:2], n), (" ".join(_CHECKS), n))
 
     @property
     def scenario(self) -> Scenario:
@@ -146,13 +139,13 @@ class ScenarioPosterior:
     @property
     def chains(self) -> FloatArray:
         """Draws of the natural parameters (lengths in m), ``(n_ensembles, n_draws, n_dim)``."""
-        natural = self.scenario.natural(np.concatenate(self.coordinates))
-        return natural.reshape(self.coordinates.shape)
+        natural = self.scenario.natural(np.concatenate(self.sample.draws))
+        return natural.reshape(self.sample.draws.shape)
 
     @property
     def mixture_draws(self) -> FloatArray:
         """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
-        return np.concatenate(thin(self.coordinates, self.n_mixture_draws))
+        return np.concatenate(thin(self.sample.draws, self.n_mixture_draws))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -226,16 +219,14 @@ class LifePosterior:
         After an update by importance sampling it is that of the weights.
         """
         least = constants.MIN_CHAIN_PROBABILITY
-        sizes = [
-            (*one.ess_bulk, *one.ess_tail) for one in self.scenarios if one.probability >= least
-        ]
-        return float(np.min(np.concatenate([*sizes, []]), initial=np.inf))
+        by_chains = [one.sample for one in self.scenarios if one.probability >= least]
+        sizes = [size for one in by_chains for size in (*one.ess_bulk, *one.ess_tail)]
+        return float(min(sizes, default=np.inf))
 
     @property
     def worst_r_hat(self) -> float:
         """Largest R-hat of any scenario."""
-        found = [value for one in self.scenarios for value in one.r_hat if np.isfinite(value)]
-        return float(np.max(found, initial=1.0))
+        return float(np.nanmax([1.0, *(x for one in self.scenarios for x in one.sample.r_hat)]))
 
     def to_arviz(self) -> DataTree:
         """Return health now and the natural parameters of each scenario for ArviZ; see `Health`."""
@@ -251,7 +242,7 @@ class LifePosterior:
                 groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
             checks[f"probability_{k}"] = np.array(one.probability)
             for what in _CHECKS:
-                values = zip(names, getattr(one, what), strict=True)
+                values = zip(names, getattr(one.sample, what), strict=True)
                 checks |= {f"{what}_{k}_{name}": value for name, value in values}
         attrs = {"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}}
         return arviz_base.from_dict(groups | {"checks_data": checks}, attrs=attrs)
@@ -484,10 +475,7 @@ def _sampled_scenarios(
             density=density,
             probability=float(own),
             evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
-            coordinates=thin(draws.draws, n_kept),
-            ess_bulk=draws.ess_bulk,
-            ess_tail=draws.ess_tail,
-            r_hat=draws.r_hat,
+            sample=replace(draws, draws=thin(draws.draws, n_kept)),
             n_mixture_draws=int(share),
         )
         sampled.append(one)
