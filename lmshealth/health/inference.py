@@ -323,10 +323,7 @@ def _infer_epoch(
 
 
 def _change(name: str, drawn: Sample, quantiles: FloatArray) -> dict[str, FloatArray]:
-    """Return the shift of the median in standard deviations, and the ratio of the 90 % intervals.
-
-    Of quantiles ``(3, n_parameters)`` from draws.
-    """
+    """Return shift and ratio of quantiles ``(3, n_parameters)`` from draws, as in `Health`."""
     low, middle, high = np.quantile(drawn.flat, _LEVELS, axis=0)
     shift = (quantiles[1] - middle) / drawn.flat.std(axis=0)
     return {f"{name}_shift": shift, f"{name}_ratio": np.ptp(quantiles[::2], axis=0) / (high - low)}

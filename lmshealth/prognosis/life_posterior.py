@@ -313,17 +313,18 @@ def fit_life(
     n_kept = n_draws // _N_ENSEMBLES
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
-        found = None
-        if before is not None:
-            # Updates one after the other must not repeat their random numbers.
-            *seeds, off_seed = stream(seed, _STEP, len(history.logs)).spawn(3)
-            found = _updated(likelihood, before, seeds, n_kept)
-        if found is None:
-            *seeds, off_seed = stream(seed, _STEP).spawn(3)
-            weighted, start = _weighted_scenarios(likelihood, seeds[0])
-            min_probability = constants.MIN_CHAIN_PROBABILITY if chains else np.inf
-            found = _sampled_scenarios(weighted, seeds[1], n_kept, min_probability), start
-        scenarios, start = found
+        # Updates one after the other must not repeat their random numbers.
+        steps = () if before is None else (len(history.logs),)
+        *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
+        try:
+            weighted, start = _weighted_scenarios(likelihood, seeds[0], before)
+        except NotConverged:
+            if before is None:
+                raise
+            return fit_life(history, stage, seed, chains=chains, n_draws=n_draws)
+        chained = chains and before is None
+        min_probability = constants.MIN_CHAIN_PROBABILITY if chained else np.inf
+        scenarios = _sampled_scenarios(weighted, seeds[1], n_kept, min_probability)
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.data.now])
     draws, settings = [], []
@@ -364,35 +365,14 @@ def _log_probability(found: _Explored) -> float:
     return float(np.log(found[0].scenario.weight) + found[1].log_evidence)
 
 
-def _updated(
-    likelihood: LifeLikelihood,
-    before: LifeStart,
-    seeds: Sequence[np.random.SeedSequence],
-    n_kept: int,
-) -> tuple[tuple[ScenarioPosterior, ...], LifeStart] | None:
-    """Sample the scenarios by importance from earlier draws; None where weights are unreliable.
-
-    The weights are those of the posterior with all logs, not of the last log alone: errors of one
-    update do not reach the next.
-    """
-    try:
-        found, start = _weighted_scenarios(likelihood, seeds[0], before)
-    except NotConverged:
-        return None
-    probability = softmax([_log_probability(one) for one in found])
-    drawn = [one for one, own in zip(found, probability, strict=True)
-             if own >= constants.MIN_CHAIN_PROBABILITY and one[0].scenario.n_dim]  # fmt: skip
-    if not all(draws.pareto_k < MAX_PARETO_K for _, draws in drawn):
-        return None
-    return _sampled_scenarios(found, seeds[1], n_kept, np.inf), start
-
-
 def _weighted_scenarios(
     likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None = None
 ) -> tuple[list[_Explored], LifeStart]:
     """Return weighted draws and evidences of the scenarios that a rough evidence does not drop.
 
     The start of the next posterior has draws of all scenarios: one that is dropped may return.
+    `NotConverged` is raised where the weights of an update are unreliable: they are those of the
+    posterior with all logs, so that errors of one update do not reach the next.
     """
     grid = likelihood.grid
     densities = [LifeDensity(likelihood, one, grid) for one in likelihood.data.scenarios]
@@ -422,12 +402,18 @@ def _weighted_scenarios(
             start = draws.resampled(generators[k], _N_ROUGH)
             how = start, generators[k], 3 * sizes[k], needed
             explored[k] = density, importance_sample_to_ess(density.log_probability, *how)
+    found = [explored[k] for k in likely]
+    shares = softmax([_log_probability(one) for one in found])
+    for (density, draws), own in zip(found, shares, strict=True):
+        judged = before is not None and own >= constants.MIN_CHAIN_PROBABILITY
+        if judged and density.scenario.n_dim and draws.pareto_k >= MAX_PARETO_K:
+            raise NotConverged(f"Pareto k of an update is {draws.pareto_k:.2f}", draws.points)
     widest = max(one.scenario.n_dim for one in densities)
     points = np.zeros((len(densities), _N_START, widest))
     for k, (density, draws) in enumerate(explored):
         points[k, :, : density.scenario.n_dim] = draws.resampled(generators[k], _N_START)
     next_start = LifeStart(tuple(one.scenario.name for one in densities), points)
-    return [explored[k] for k in likely], next_start
+    return found, next_start
 
 
 def _rough(density: LifeDensity, rng: np.random.Generator, before: LifeStart | None) -> _Explored:
