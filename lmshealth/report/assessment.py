@@ -139,8 +139,7 @@ class Assessment:
     def _relative(self, health: Health | None) -> Health | None:
         if health is None or not (health.recorded_at and health.parameters):
             return None
-        specs = {spec.name: spec.baseline for spec in self.stage.parameters}
-        return health.relative_to(np.array([specs[name] for name in health.parameters]))
+        return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: days until the service; without a verdict before safe machines."""
@@ -380,9 +379,8 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     health = assessment._relative(assessment.present)
     if health is None:
         return
-    specs = {spec.name: spec for spec in assessment.stage.parameters}
-    for k, name in enumerate(health.parameters):
-        limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
+    for k, spec in enumerate(assessment.stage.parameters):
+        limit, draws = limit_of(spec), health.samples[-1, :, k]
         below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         determined = bool(health.publishable_parameters()[k])
@@ -393,7 +391,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
         course = np.stack([at[rows], *bands], axis=1).round(4)
         yield ParameterHealth(
-            name=name,
+            name=spec.name,
             determined=determined,
             converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
@@ -402,8 +400,8 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             high=high,
             limit=limit,
             below_limit=below,
-            baseline=specs[name].baseline,
-            unit=specs[name].unit,
+            baseline=spec.baseline,
+            unit=spec.unit,
             course=tuple(map(tuple, course.tolist())) if determined else (),
         )
 
@@ -428,11 +426,11 @@ def _by_both_methods(
     health, prognosis = assessment.latest_health, assessment.prognosis
     if health is None or prognosis is None:
         return
-    specs = {spec.name: spec for spec in assessment.stage.parameters}
     for k in np.flatnonzero(health.publishable_parameters()).tolist():
-        if (name := health.parameters[k]) in prognosis.parameters:
-            by_laws = prognosis.health[:, prognosis.parameters.index(name)] / specs[name].baseline
-            yield specs[name], health.samples[-1, :, k], by_laws
+        spec = assessment.stage.parameters[k]
+        if spec.name in prognosis.parameters:
+            by_laws = prognosis.health[:, prognosis.parameters.index(spec.name)] / spec.baseline
+            yield spec, health.samples[-1, :, k], by_laws
 
 
 # Changes since the last report

@@ -219,15 +219,13 @@ def _tracks(assessment: Assessment) -> list[Any]:
             base = float(np.exp((track.ln_frequency[:, k] - track.drift[:, k])[at][-1]))
             _level(plot, track.travel, base, GREEN, "baseline")
         _legend(plot)
-    specs = {spec.name: spec for spec in assessment.stage.parameters}
-    for k, name in enumerate(health.parameters if health else ()):
+    for k in np.flatnonzero(health.publishable_parameters()).tolist() if health else ():
         assert health is not None
-        if not health.publishable_parameters()[k]:
-            continue
-        plot = new(f"{spell(name).capitalize()}, each epoch by itself", "% of baseline")
+        spec = assessment.stage.parameters[k]
+        plot = new(f"{spell(spec.name).capitalize()}, each epoch by itself", "% of baseline")
         bands = 100 * health.quantile(np.array(constants.LEVELS))[:, :, k]
         _band(plot, health.travel, bands, "median, 90 % band")
-        if (limit := limit_of(specs[name])) is not None:
+        if (limit := limit_of(spec)) is not None:
             _level(plot, health.travel, 100 * limit, RED, "limit")
         _legend(plot)
     return plots
