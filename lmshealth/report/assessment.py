@@ -25,6 +25,7 @@ from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
     count,
+    day,
     in_brackets,
     interval,
     km,
@@ -445,8 +446,8 @@ def changes(before: Summary, now: Summary, parameters: tuple[ParameterSpec, ...]
         yield "The stage description has changed: not all differences are wear."
     if before.baseline_at != now.baseline_at:
         yield (
-            f"The baseline has changed from {before.baseline_at.date()} to "
-            f"{now.baseline_at.date()}: percentages of the two reports cannot be compared."
+            f"The baseline has changed from {day(before.baseline_at)} to {day(now.baseline_at)}: "
+            "percentages of the two reports cannot be compared."
         )
     was, present = (
         verdict_text(one.verdict, parameters) + in_brackets(one.probability)

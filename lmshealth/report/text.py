@@ -44,6 +44,11 @@ def moment(when: datetime) -> str:
     return when.strftime("%Y-%m-%d %H:%M %Z").strip()
 
 
+def day(when: datetime) -> str:
+    """Format the day of a moment."""
+    return when.date().isoformat()
+
+
 def number(value: Number, digits: int = 3) -> str:
     """Format a number with significant digits and grouped thousands; NaN is a dash."""
     if np.isnan(value):
