@@ -161,10 +161,9 @@ def passages(
             )
             if path.law.names:
                 proven = now + early_life(path.law, limit, rng)
-                opened = _beyond_laws(
+                columns[-1], halves[-1] = _beyond_laws(
                     rng, path.law, columns[-1], halves[-1], now=now, proven=proven
                 )
-                columns[-1], halves[-1] = opened
         first = np.argmin(columns, axis=0)[None]
         half = np.take_along_axis(np.array(halves), first, axis=0)[0]
         found = np.column_stack([*columns, np.min(columns, axis=0), half])
