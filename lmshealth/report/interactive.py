@@ -51,8 +51,8 @@ _SHOW = """for (const item of JSON.parse(document.getElementById("pictures").tex
 def interactive_page(assessment: Assessment, static: str) -> str:
     """Make the interactive page of a machine, which links to its static page."""
     sections = {
-        "Spectra of the last log and of the baseline": _spectra(assessment),
-        "Modes and health over the odometer": _tracks(assessment),
+        "Spectra of the last log and of the baseline": [*_spectra(assessment)],
+        "Modes and health over the odometer": [*_tracks(assessment)],
         "Posterior of the last epoch, and remaining life": [
             *_draws(assessment),
             *_survival(assessment),
@@ -62,6 +62,8 @@ def interactive_page(assessment: Assessment, static: str) -> str:
     items = []
     for k, plots in enumerate(shown.values()):
         _link_cursor(plots)
+        for plot in plots:
+            _place_legend(plot)
         options: Any = {"ncols": 1, "merge_tools": True, "sizing_mode": "stretch_width"}
         items.append(embed.json_item(plotting.gridplot(plots, **options), f"section-{k}"))
     return render(
@@ -85,7 +87,7 @@ def _script() -> str:
 
 
 def _new(title: str, x: str, y: str, **options: Any) -> Any:
-    """Return an empty picture; one that gets the range of another is linked with it."""
+    """Return an empty picture; pictures of one ``x_range`` are linked."""
     plot = plotting.figure(
         title=title, x_axis_label=x, y_axis_label=y, height=_HEIGHT, tools=_TOOLS,
         active_drag="box_zoom", active_scroll=None, output_backend="canvas", **options,
@@ -107,7 +109,7 @@ def _hover(plot: Any, renderer: Any, *rows: tuple[str, str]) -> None:
     plot.add_tools(models.HoverTool(renderers=[renderer], tooltips=list(rows)))
 
 
-def _legend(plot: Any) -> None:
+def _place_legend(plot: Any) -> None:
     """Place the legend where it covers nothing; a click hides a curve."""
     if plot.legend:
         plot.legend.click_policy = "hide"
@@ -117,17 +119,17 @@ def _legend(plot: Any) -> None:
         plot.add_layout(plot.legend[0], "below")
 
 
-def _spectra(assessment: Assessment) -> list[Any]:
-    """Return a picture per channel of the last log, over that of the baseline."""
+def _spectra(assessment: Assessment) -> Iterator[Any]:
+    """Yield a picture per channel of the last log, over that of the baseline."""
     latest, before = assessment.latest, assessment.compared
     if latest is None or latest.spectra is None:
-        return []
-    plots: list[Any] = []
+        return
+    x_range = models.DataRange1d()
     declared = [mode.frequency_hz for mode in assessment.stage.modes]
     for channel, derived in zip(latest.spectra.channels, latest.spectra.derived, strict=True):
         name = f"{channel}, 2nd derivative" if derived else channel
-        linked = {"x_range": plots[0].x_range} if plots else {}
-        plot = _new(name, "frequency in Hz", "(m/s²)²/Hz", y_axis_type="log", **linked)
+        axes: Any = {"y_axis_type": "log", "x_range": x_range}
+        plot = _new(name, "frequency in Hz", "(m/s²)²/Hz", **axes)
         if before is not None:
             _curve(plot, before, channel, MUTED, "baseline")
         _curve(plot, latest, channel, INK, "last log")
@@ -140,9 +142,7 @@ def _spectra(assessment: Assessment) -> list[Any]:
             if latest.spectra.low <= f <= latest.spectra.high:
                 style = {"dimension": "height", "line_color": GREEN, "line_dash": "dashed"}
                 plot.add_layout(models.Span(location=f, **style))
-        _legend(plot)
-        plots.append(plot)
-    return plots
+        yield plot
 
 
 def _curve(plot: Any, found: LogEstimates, channel: str, colour: str, name: str) -> None:
@@ -184,20 +184,14 @@ def _lines(plot: Any, found: LogEstimates, channel: str) -> None:
     _hover(plot, drawn, ("line", "@kind, @x{0.00} Hz"), ("amplitude", "@amplitude"))
 
 
-def _tracks(assessment: Assessment) -> list[Any]:
-    """Return a picture of each tracked mode and of each health parameter over the odometer."""
+def _tracks(assessment: Assessment) -> Iterator[Any]:
+    """Yield a picture of each tracked mode and of each health parameter over the odometer."""
     track, history, health = assessment.track, assessment.history, assessment.latest_health
     if track is None or not history.has_odometer:
-        return []
-    plots: list[Any] = []
-
-    def new(title: str, y: str) -> Any:
-        linked = {"x_range": plots[0].x_range} if plots else {}
-        plots.append(_new(title, "odometer in km", y, **linked))
-        return plots[-1]
-
+        return
+    x, x_range = "odometer in km", models.DataRange1d()
     for k, mode in enumerate(track.modes):
-        plot = new(f"Frequency of {spell(mode)}", "Hz")
+        plot = _new(f"Frequency of {spell(mode)}", x, "Hz", x_range=x_range)
         level, reach = track.ln_frequency[:, k], 1.96 * track.ln_frequency_std[:, k]
         bands = np.exp([level - reach, level, level + reach])
         _band(plot, track.travel, bands, "filtered, 95 % band")
@@ -213,17 +207,17 @@ def _tracks(assessment: Assessment) -> list[Any]:
         if at.any():
             base = float(np.exp((track.ln_frequency[:, k] - track.drift[:, k])[at][-1]))
             _level(plot, track.travel, base, GREEN, "baseline")
-        _legend(plot)
+        yield plot
     for k in np.flatnonzero(health.publishable_parameters()).tolist() if health else ():
         assert health is not None
         spec = assessment.stage.parameters[k]
-        plot = new(f"{spell(spec.name).capitalize()}, each epoch by itself", "% of baseline")
+        title = f"{spell(spec.name).capitalize()}, each epoch by itself"
+        plot = _new(title, x, "% of baseline", x_range=x_range)
         bands = 100 * health.quantile(np.array(constants.LEVELS))[:, :, k]
         _band(plot, health.travel, bands, "median, 90 % band")
         if (limit := limit_of(spec)) is not None:
             _level(plot, health.travel, 100 * limit, RED, "limit")
-        _legend(plot)
-    return plots
+        yield plot
 
 
 def _level(plot: Any, travel: FloatArray, y: float, colour: str, name: str) -> None:
@@ -293,5 +287,4 @@ def _survival(assessment: Assessment) -> Iterator[Any]:
         style = {"color": colours[name], "line_width": 3 if name == "any" else 1}
         drawn = plot.line(ahead / _KM, chance, legend_label=spell(name), **style)
         _hover(plot, drawn, (f"{spell(name)} limit", "@y{0.0} % after @x{0} km"))
-    _legend(plot)
     yield plot
