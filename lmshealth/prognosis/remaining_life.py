@@ -195,11 +195,9 @@ def _beyond_laws(
     now: float,
     proven: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Open passages by a law, in m from now: README.md, "Beyond the laws".
+    """Open the travel left and that to half of the loss, ``(n,)``: README.md, "Beyond the laws".
 
-    The rate of the law drifts, and an end that no log shows yet may come sooner: `proven` is the
-    travel in m without such an onset. For the travel left and that to half of the loss, shape
-    ``(n,)`` each.
+    `proven` is the travel in m without the onset of an end that no log shows yet.
     """
     ahead = np.where(np.isfinite(left), np.maximum(left, 0.0), 0.0)
     factor = np.exp(
