@@ -112,7 +112,7 @@ def sample_by_importance(
     for own in seed.spawn(constants.N_ENSEMBLES):
         rng = np.random.default_rng(own)
         found = importance_sample(log_probability, draw_prior(rng, _N_PRIOR), rng, _N_WEIGHTED)
-        if found.ess < constants.MIN_ESS or found.pareto_k >= constants.MAX_PARETO_K:
+        if not (found.ess >= constants.MIN_ESS and found.pareto_k < constants.MAX_PARETO_K):
             raise NotConverged(
                 f"{found.ess:.0f} draws are effective, Pareto k is {found.pareto_k:.2f}",
                 found.points,

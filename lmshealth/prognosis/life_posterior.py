@@ -406,7 +406,7 @@ def _weighted_scenarios(
     shares = softmax([_log_probability(one) for one in found])
     for (density, draws), own in zip(found, shares, strict=True):
         judged = before is not None and own >= constants.MIN_CHAIN_PROBABILITY
-        if judged and density.scenario.n_dim and draws.pareto_k >= MAX_PARETO_K:
+        if judged and density.scenario.n_dim and not draws.pareto_k < MAX_PARETO_K:
             raise NotConverged(f"Pareto k of an update is {draws.pareto_k:.2f}", draws.points)
     widest = max(one.scenario.n_dim for one in densities)
     points = np.zeros((len(densities), _N_START, widest))
