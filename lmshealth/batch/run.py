@@ -28,7 +28,6 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
-from lmshealth.report.interactive import interactive_page
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -240,6 +239,8 @@ def write_interactive(url: str | URL, result: RunResult) -> tuple[Path, ...]:
     They are in the folder ``interactive`` beside the static pages, under the same names.
     `InteractiveError` if Bokeh is missing.
     """
+    from lmshealth.report.interactive import interactive_page  # late: it needs Bokeh
+
     folder, written = result.index.with_name("interactive"), list[Path]()
     with closing(Store(url, create=False)) as store:
         keys = {one.machine: one.key for one in store.published()}

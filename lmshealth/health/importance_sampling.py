@@ -48,10 +48,6 @@ class WeightedDraws(ReadOnly):
         weight = np.maximum(self.weight, np.finfo(float).tiny)
         return float(diagnostic.psislw(-np.log(weight))[1])
 
-    def reliable(self) -> bool:
-        """Return whether enough draws are effective, and their weights have light tails."""
-        return self.ess >= constants.MIN_ESS and self.pareto_k < constants.MAX_PARETO_K
-
     def resampled(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw points of equal weight, shape ``(n, n_dim)``."""
         return np.asarray(self.points[rng.choice(self.weight.size, n, p=self.weight)])

@@ -260,14 +260,14 @@ def draw(
     posterior: EpochPosterior,
     seed: np.random.SeedSequence,
     n_ensembles: int = constants.N_ENSEMBLES,
-) -> tuple[Sample, Laplace | None]:
-    """Draw ln parameters of an epoch by emcee; return Laplace's approximation, its start, too."""
+) -> Sample:
+    """Draw ln parameters of an epoch by emcee, started from Laplace's approximation if possible."""
     normal = laplace(posterior)
     if normal is None:
         start = start_from_prior(posterior.log_probability, posterior.prior.draw)
     else:
         start = start_near(normal.mode, normal.cov, posterior.log_probability)
-    return sample(posterior.log_probability, start, seed, n_ensembles), normal
+    return sample(posterior.log_probability, start, seed, n_ensembles)
 
 
 def laplace(posterior: EpochPosterior) -> Laplace | None:
@@ -286,7 +286,7 @@ def _drawn(posterior: EpochPosterior, seed: np.random.SeedSequence) -> tuple[Sam
     try:
         return sample_by_importance(logp, prior.draw, by_importance), True
     except NotConverged:
-        return draw(posterior, by_chains)[0], False
+        return draw(posterior, by_chains), False
 
 
 def _infer_epoch(
@@ -315,7 +315,7 @@ def _infer_epoch(
             found |= _change("prior", drawn, wider)
         if judged and weighted:
             with suppress(NotConverged):  # only the judge is missing
-                other = draw(posterior, judge_seed, constants.JUDGE_ENSEMBLES)[0].flat
+                other = draw(posterior, judge_seed, constants.JUDGE_ENSEMBLES).flat
                 found |= _change("judge", drawn, np.quantile(other, _LEVELS, axis=0))
     converged = bool(np.isfinite(found["r_hat"]).all())
     fit, edge = posterior.fit(x[:: max(x.shape[0] // _N_FIT, 1)]), posterior.at_edge(x)
@@ -323,10 +323,7 @@ def _infer_epoch(
 
 
 def _change(name: str, drawn: Sample, quantiles: FloatArray) -> dict[str, FloatArray]:
-    """Return the shift of the median in standard deviations, and the ratio of the 90 % intervals.
-
-    Of quantiles ``(3, n_parameters)`` from draws.
-    """
+    """Return shift and ratio of quantiles ``(3, n_parameters)`` from draws, as in `Health`."""
     low, middle, high = np.quantile(drawn.flat, _LEVELS, axis=0)
     shift = (quantiles[1] - middle) / drawn.flat.std(axis=0)
     return {f"{name}_shift": shift, f"{name}_ratio": np.ptp(quantiles[::2], axis=0) / (high - low)}

@@ -41,12 +41,6 @@ def degraded_words(verdict: str) -> tuple[str, ...]:
     return () if verdict in _WITHOUT_LOSS else tuple(verdict.split("+"))
 
 
-_NO_PARAMETER = (
-    "The stage description has no [[parameter]]: the modes are tracked, and no health parameter is "
-    "inferred."
-)
-
-
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """State of a stage at its last log with its probability, and sentences that explain it.
@@ -130,7 +124,10 @@ def judge(
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
     if not stage.parameters:
-        return _NO_PARAMETER
+        return (
+            "The stage description has no [[parameter]]: the modes are tracked, and no health "
+            "parameter is inferred."
+        )
     if n_logs < needed:
         logs = "log" if n_logs == 1 else "logs"
         return f"{n_logs} usable {logs} since the baseline began; it needs {needed}."

@@ -177,14 +177,11 @@ def _average(history: History, part: slice) -> tuple[FloatArray, FloatArray]:
 
 
 def _clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
-    """Return the travel since the baseline in m of each log, and of each step halfway between two.
-
-    At least 1 m is between a step and the log before.
-    """
+    """Return the travel in m since the baseline of each log, and of each step between two logs."""
     steps = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
     first = sorted(steps)
     clock = history.clock()
-    for k in reversed(first):
+    for k in reversed(first):  # at least 1 m is between the logs before and after a step
         before = clock[:k]
         before[before >= clock[k]] = clock[k] - 1.0
     if len(first) > constants.MAX_STEPS:

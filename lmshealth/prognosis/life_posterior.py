@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
@@ -21,7 +20,6 @@ from lmshealth.health.importance_sampling import (
     importance_sample_again,
     importance_sample_to_ess,
 )
-from lmshealth.health.results import QUANTILES
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import Grid, LifeLikelihood
 from lmshealth.prognosis.scenarios import Scenario
@@ -32,7 +30,7 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 _STEP = 1 << 20  # of the random stream: beyond the epochs of health
-_N_ENSEMBLES, _N_PRIOR, _N_SETTINGS = 4, 10_000, 500
+_N_ENSEMBLES, _N_SETTINGS = 4, 500
 _N_ROUGH, _N_FINE = 600, 2000
 # Effective draws below which an evidence may miss most of its integral.
 _LEAST_ESS = 20.0
@@ -40,7 +38,7 @@ _LEAST_ESS = 20.0
 _N_UPDATE, _N_START = 4000, 300
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
 _NEGLIGIBLE = 0.01
-_CHECKS = ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage")
+_CHECKS = ("ess_bulk", "ess_tail", "r_hat")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,21 +125,11 @@ class ScenarioPosterior:
     density: LifeDensity
     probability: float  # posterior probability of the scenario
     evidence_std: float  # relative standard deviation of its evidence
-    coordinates: FloatArray  # draws, shape ``(n_ensembles, n_draws, n_dim)``
-    # ess_bulk, ess_tail, r_hat: as in `Health`, of the coordinates, shape ``(n_dim,)``; after
-    # importance sampling the effective sample size, and NaN for R-hat.
-    ess_bulk: FloatArray
-    ess_tail: FloatArray
-    r_hat: FloatArray
-    # One minus the squared ratio of posterior to prior width of the 90 % interval of each
-    # natural parameter, at least 0, shape ``(n_dim,)``.
-    interval_shrinkage: FloatArray
+    # Draws of the coordinates, ``(n_ensembles, n_draws, n_dim)``, with the checks of the chains;
+    # after importance sampling the effective sample size, and NaN for R-hat.
+    sample: Sample
     # Draws of each ensemble that represent this scenario in the mixture of all.
     n_mixture_draws: int
-
-    def __post_init__(self) -> None:
-        n = self.scenario.n_dim
-        freeze(self, ("coordinates", *self.coordinates.shape[:2], n), (" ".join(_CHECKS), n))
 
     @property
     def scenario(self) -> Scenario:
@@ -151,13 +139,13 @@ class ScenarioPosterior:
     @property
     def chains(self) -> FloatArray:
         """Draws of the natural parameters (lengths in m), ``(n_ensembles, n_draws, n_dim)``."""
-        natural = self.scenario.natural(np.concatenate(self.coordinates))
-        return natural.reshape(self.coordinates.shape)
+        natural = self.scenario.natural(np.concatenate(self.sample.draws))
+        return natural.reshape(self.sample.draws.shape)
 
     @property
     def mixture_draws(self) -> FloatArray:
         """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
-        return np.concatenate(thin(self.coordinates, self.n_mixture_draws))
+        return np.concatenate(thin(self.sample.draws, self.n_mixture_draws))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -231,30 +219,14 @@ class LifePosterior:
         After an update by importance sampling it is that of the weights.
         """
         least = constants.MIN_CHAIN_PROBABILITY
-        sizes = [
-            (*one.ess_bulk, *one.ess_tail) for one in self.scenarios if one.probability >= least
-        ]
-        return float(np.min(np.concatenate([*sizes, []]), initial=np.inf))
+        by_chains = [one.sample for one in self.scenarios if one.probability >= least]
+        sizes = [size for one in by_chains for size in (*one.ess_bulk, *one.ess_tail)]
+        return float(min(sizes, default=np.inf))
 
     @property
     def worst_r_hat(self) -> float:
         """Largest R-hat of any scenario."""
-        found = [value for one in self.scenarios for value in one.r_hat if np.isfinite(value)]
-        return float(np.max(found, initial=1.0))
-
-    def to_frame(self) -> pd.DataFrame:
-        """Return quantiles of health now, then of the natural parameters of each scenario."""
-        rows = [
-            {"way": 0, "probability": 1.0, "parameter": name} | _quantiles(self.health[..., j])
-            for j, name in enumerate(self.parameters)
-        ]
-        for k, one in enumerate(self.scenarios, start=1):
-            chains = one.chains
-            for i, name in enumerate(self._names(one)):
-                head = {"way": k, "probability": one.probability, "parameter": name}
-                checks = {check: getattr(one, check)[i] for check in _CHECKS}
-                rows.append(head | _quantiles(chains[..., i]) | checks)
-        return pd.DataFrame(rows).assign(stage=self.stage)
+        return float(np.nanmax([1.0, *(x for one in self.scenarios for x in one.sample.r_hat)]))
 
     def to_arviz(self) -> DataTree:
         """Return health now and the natural parameters of each scenario for ArviZ; see `Health`."""
@@ -270,7 +242,7 @@ class LifePosterior:
                 groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
             checks[f"probability_{k}"] = np.array(one.probability)
             for what in _CHECKS:
-                values = zip(names, getattr(one, what), strict=True)
+                values = zip(names, getattr(one.sample, what), strict=True)
                 checks |= {f"{what}_{k}_{name}": value for name, value in values}
         attrs = {"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}}
         return arviz_base.from_dict(groups | {"checks_data": checks}, attrs=attrs)
@@ -282,10 +254,6 @@ class LifePosterior:
             since = f"@{path.begin / 1000:.0f}km" if path.begin else ""
             names += [f"{parameter}.{path.law.kind}{since}.{own}" for own in path.names]
         return names
-
-
-def _quantiles(draws: FloatArray) -> dict[str, float]:
-    return {name: float(np.quantile(draws, level)) for name, level in QUANTILES.items()}
 
 
 def fit_life(
@@ -345,17 +313,18 @@ def fit_life(
     n_kept = n_draws // _N_ENSEMBLES
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
-        found = None
-        if before is not None:
-            # Updates one after the other must not repeat their random numbers.
-            *seeds, off_seed = stream(seed, _STEP, len(history.logs)).spawn(3)
-            found = _updated(likelihood, before, seeds, n_kept)
-        if found is None:
-            *seeds, off_seed = stream(seed, _STEP).spawn(3)
-            weighted, start = _weighted_scenarios(likelihood, seeds[0])
-            min_probability = constants.MIN_CHAIN_PROBABILITY if chains else np.inf
-            found = _sampled_scenarios(weighted, seeds[1], n_kept, min_probability), start
-        scenarios, start = found
+        # Updates one after the other must not repeat their random numbers.
+        steps = () if before is None else (len(history.logs),)
+        *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
+        try:
+            weighted, start = _weighted_scenarios(likelihood, seeds[0], before)
+        except NotConverged:
+            if before is None:
+                raise
+            return fit_life(history, stage, seed, chains=chains, n_draws=n_draws)
+        chained = chains and before is None
+        min_probability = constants.MIN_CHAIN_PROBABILITY if chained else np.inf
+        scenarios = _sampled_scenarios(weighted, seeds[1], n_kept, min_probability)
     rng = np.random.default_rng(off_seed)
     now = np.array([likelihood.data.now])
     draws, settings = [], []
@@ -396,35 +365,14 @@ def _log_probability(found: _Explored) -> float:
     return float(np.log(found[0].scenario.weight) + found[1].log_evidence)
 
 
-def _updated(
-    likelihood: LifeLikelihood,
-    before: LifeStart,
-    seeds: Sequence[np.random.SeedSequence],
-    n_kept: int,
-) -> tuple[tuple[ScenarioPosterior, ...], LifeStart] | None:
-    """Sample the scenarios by importance from earlier draws; None where weights are unreliable.
-
-    The weights are those of the posterior with all logs, not of the last log alone: errors of one
-    update do not reach the next.
-    """
-    try:
-        found, start = _weighted_scenarios(likelihood, seeds[0], before)
-    except NotConverged:
-        return None
-    probability = softmax([_log_probability(one) for one in found])
-    drawn = [one for one, own in zip(found, probability, strict=True)
-             if own >= constants.MIN_CHAIN_PROBABILITY and one[0].scenario.n_dim]  # fmt: skip
-    if not all(draws.pareto_k < MAX_PARETO_K for _, draws in drawn):
-        return None
-    return _sampled_scenarios(found, seeds[1], n_kept, np.inf), start
-
-
 def _weighted_scenarios(
     likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None = None
 ) -> tuple[list[_Explored], LifeStart]:
     """Return weighted draws and evidences of the scenarios that a rough evidence does not drop.
 
     The start of the next posterior has draws of all scenarios: one that is dropped may return.
+    `NotConverged` is raised where the weights of an update are unreliable: they are those of the
+    posterior with all logs, so that errors of one update do not reach the next.
     """
     grid = likelihood.grid
     densities = [LifeDensity(likelihood, one, grid) for one in likelihood.data.scenarios]
@@ -454,12 +402,18 @@ def _weighted_scenarios(
             start = draws.resampled(generators[k], _N_ROUGH)
             how = start, generators[k], 3 * sizes[k], needed
             explored[k] = density, importance_sample_to_ess(density.log_probability, *how)
+    found = [explored[k] for k in likely]
+    shares = softmax([_log_probability(one) for one in found])
+    for (density, draws), own in zip(found, shares, strict=True):
+        judged = before is not None and own >= constants.MIN_CHAIN_PROBABILITY
+        if judged and density.scenario.n_dim and not draws.pareto_k < MAX_PARETO_K:
+            raise NotConverged(f"Pareto k of an update is {draws.pareto_k:.2f}", draws.points)
     widest = max(one.scenario.n_dim for one in densities)
     points = np.zeros((len(densities), _N_START, widest))
     for k, (density, draws) in enumerate(explored):
         points[k, :, : density.scenario.n_dim] = draws.resampled(generators[k], _N_START)
     next_start = LifeStart(tuple(one.scenario.name for one in densities), points)
-    return [explored[k] for k in likely], next_start
+    return found, next_start
 
 
 def _rough(density: LifeDensity, rng: np.random.Generator, before: LifeStart | None) -> _Explored:
@@ -503,26 +457,12 @@ def _sampled_scenarios(
             y = weighted.resampled(np.random.default_rng(seeds[k]), _N_ENSEMBLES * n_kept)
             ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
             draws = Sample(y.reshape(_N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown)
-        coordinates = thin(draws.draws, n_kept)
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
             evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
-            coordinates=coordinates,
-            ess_bulk=draws.ess_bulk,
-            ess_tail=draws.ess_tail,
-            r_hat=draws.r_hat,
-            interval_shrinkage=_interval_shrinkage(density.scenario, coordinates),
+            sample=replace(draws, draws=thin(draws.draws, n_kept)),
             n_mixture_draws=int(share),
         )
         sampled.append(one)
     return tuple(sampled)
-
-
-def _interval_shrinkage(scenario: Scenario, y: FloatArray) -> FloatArray:
-    if not scenario.n_dim:
-        return np.empty(0)
-    prior = scenario.natural(scenario.draw(np.random.default_rng(0), _N_PRIOR))
-    theta = scenario.natural(y.reshape(-1, scenario.n_dim))
-    before, after = (np.ptp(np.quantile(x, (0.05, 0.95), axis=0), axis=0) for x in (prior, theta))
-    return np.asarray(np.clip(1 - (after / before) ** 2, 0, 1))

@@ -161,10 +161,9 @@ def passages(
             )
             if path.law.names:
                 proven = now + early_life(path.law, limit, rng)
-                opened = _beyond_laws(
+                columns[-1], halves[-1] = _beyond_laws(
                     rng, path.law, columns[-1], halves[-1], now=now, proven=proven
                 )
-                columns[-1], halves[-1] = opened
         first = np.argmin(columns, axis=0)[None]
         half = np.take_along_axis(np.array(halves), first, axis=0)[0]
         found = np.column_stack([*columns, np.min(columns, axis=0), half])
@@ -196,11 +195,9 @@ def _beyond_laws(
     now: float,
     proven: float,
 ) -> tuple[FloatArray, FloatArray]:
-    """Open passages by a law, in m from now: README.md, "Beyond the laws".
+    """Open the travel left and that to half of the loss, ``(n,)``: README.md, "Beyond the laws".
 
-    The rate of the law drifts, and an end that no log shows yet may come sooner: `proven` is the
-    travel in m without such an onset. For the travel left and that to half of the loss, shape
-    ``(n,)`` each.
+    `proven` is the travel in m without the onset of an end that no log shows yet.
     """
     ahead = np.where(np.isfinite(left), np.maximum(left, 0.0), 0.0)
     factor = np.exp(

@@ -21,9 +21,13 @@ from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
 from lmshealth.prognosis.results import LawWeight, Prognosis
-from lmshealth.report import constants, text
+from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
+    count,
+    day,
+    in_brackets,
+    interval,
     km,
     percent,
     probability,
@@ -136,8 +140,7 @@ class Assessment:
     def _relative(self, health: Health | None) -> Health | None:
         if health is None or not (health.recorded_at and health.parameters):
             return None
-        specs = {spec.name: spec.baseline for spec in self.stage.parameters}
-        return health.relative_to(np.array([specs[name] for name in health.parameters]))
+        return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: days until the service; without a verdict before safe machines."""
@@ -377,9 +380,8 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
     health = assessment._relative(assessment.present)
     if health is None:
         return
-    specs = {spec.name: spec for spec in assessment.stage.parameters}
-    for k, name in enumerate(health.parameters):
-        limit, draws = limit_of(specs[name]), health.samples[-1, :, k]
+    for k, spec in enumerate(assessment.stage.parameters):
+        limit, draws = limit_of(spec), health.samples[-1, :, k]
         below = np.nan if limit is None else float(np.mean(draws < limit))
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         determined = bool(health.publishable_parameters()[k])
@@ -390,7 +392,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
         course = np.stack([at[rows], *bands], axis=1).round(4)
         yield ParameterHealth(
-            name=name,
+            name=spec.name,
             determined=determined,
             converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
@@ -399,8 +401,8 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             high=high,
             limit=limit,
             below_limit=below,
-            baseline=specs[name].baseline,
-            unit=specs[name].unit,
+            baseline=spec.baseline,
+            unit=spec.unit,
             course=tuple(map(tuple, course.tolist())) if determined else (),
         )
 
@@ -425,11 +427,11 @@ def _by_both_methods(
     health, prognosis = assessment.latest_health, assessment.prognosis
     if health is None or prognosis is None:
         return
-    specs = {spec.name: spec for spec in assessment.stage.parameters}
     for k in np.flatnonzero(health.publishable_parameters()).tolist():
-        if (name := health.parameters[k]) in prognosis.parameters:
-            by_laws = prognosis.health[:, prognosis.parameters.index(name)] / specs[name].baseline
-            yield specs[name], health.samples[-1, :, k], by_laws
+        spec = assessment.stage.parameters[k]
+        if spec.name in prognosis.parameters:
+            by_laws = prognosis.health[:, prognosis.parameters.index(spec.name)] / spec.baseline
+            yield spec, health.samples[-1, :, k], by_laws
 
 
 # Changes since the last report
@@ -444,11 +446,11 @@ def changes(before: Summary, now: Summary, parameters: tuple[ParameterSpec, ...]
         yield "The stage description has changed: not all differences are wear."
     if before.baseline_at != now.baseline_at:
         yield (
-            f"The baseline has changed from {text.day(before.baseline_at)} to "
-            f"{text.day(now.baseline_at)}: percentages of the two reports cannot be compared."
+            f"The baseline has changed from {day(before.baseline_at)} to {day(now.baseline_at)}: "
+            "percentages of the two reports cannot be compared."
         )
     was, present = (
-        verdict_text(one.verdict, parameters) + text.in_brackets(one.probability)
+        verdict_text(one.verdict, parameters) + in_brackets(one.probability)
         for one in (before, now)
     )
     if before.verdict != now.verdict:
@@ -463,8 +465,8 @@ def changes(before: Summary, now: Summary, parameters: tuple[ParameterSpec, ...]
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service.by, now.service.by)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
-    logs = f"{abs(more)} log{_s(more)} {'more' if more > 0 else 'fewer'}" if more else ""
-    further = f", {text.km(travel)} further." if travel > 0 else "."
+    logs = f"{count(abs(more), 'log')} {'more' if more > 0 else 'fewer'}" if more else ""
+    further = f", {km(travel)} further." if travel > 0 else "."
     yield (logs or "Same number of logs") + further
 
 
@@ -478,8 +480,8 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
             for found in (was, present)
         ]
         own = present.get(name)
-        spread = f" (90{GAP}%: {text.interval(own.low, own.high)})" if own else ""
-        yield f"{text.spell(name).capitalize()}: {' → '.join(medians)}{spread}."
+        spread = f" (90{GAP}%: {interval(own.low, own.high)})" if own else ""
+        yield f"{spell(name).capitalize()}: {' → '.join(medians)}{spread}."
 
 
 def _life_change(before: Summary, now: Summary) -> str:
@@ -498,14 +500,10 @@ def _service_change(before: date | None, now: date | None) -> str:
     shift = ""
     if before and now and before != now:
         later = (now - before).days
-        shift = f", {abs(later)} day{_s(later)} {'later' if later > 0 else 'earlier'}"
+        shift = f", {count(abs(later), 'day')} {'later' if later > 0 else 'earlier'}"
     days = [one.isoformat() if one else "none" for one in (before, now)]
     return f"Service date: {_from_to(*days)}{shift}."
 
 
 def _from_to(before: str, now: str) -> str:
     return f"still {now}" if before == now else f"{before} → {now}"
-
-
-def _s(count: int) -> str:
-    return "" if abs(count) == 1 else "s"

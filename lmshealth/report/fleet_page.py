@@ -1,13 +1,10 @@
 """Fleet page ``index.html``: all machines, most urgent first, from their summaries."""
 
-import hashlib
 import re
-from base64 import b64encode
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime, timedelta
-from importlib import resources
 from pathlib import Path
 
 import numpy as np
@@ -16,8 +13,7 @@ from lmshealth._files import write_text
 from lmshealth.io.log import Refusal
 from lmshealth.report import constants
 from lmshealth.report.assessment import Summary
-from lmshealth.report.constants import RUL_LEVELS
-from lmshealth.report.rendering import render
+from lmshealth.report.rendering import read, render
 from lmshealth.report.text import number
 
 # Names of devices on Windows, with any file name extension.
@@ -69,10 +65,7 @@ def write_index(
     ``refused`` are logs that belong to no machine; ``generated`` is printed on the page.
     """
     ranked = by_urgency(summaries)
-    script = ""
-    if len(ranked) > constants.MANY_MACHINES:
-        templates = resources.files("lmshealth") / "report" / "templates"
-        script = (templates / "index.js").read_text(encoding="utf-8")
+    script = read("index.js") if len(ranked) > constants.MANY_MACHINES else ""
     newest = max((one.recorded_at.date() for one in ranked), default=date.min)
     by_reason = [
         (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])
@@ -91,7 +84,6 @@ def write_index(
         refused=by_reason,
         fold=len(refused) > constants.REFUSED_UNFOLDED,
         script=script,
-        script_hash=b64encode(hashlib.sha256(script.encode()).digest()).decode() if script else "",
     )
     path = folder / "index.html"
     write_text(path, text)
@@ -101,7 +93,8 @@ def write_index(
 
 def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     """Count machines by their median remaining travel; the last bin is beyond the horizon."""
-    left = [one.life.any.travel[len(RUL_LEVELS) // 2] / 1000 for one in summaries if one.life]
+    median = len(constants.RUL_LEVELS) // 2
+    left = [one.life.any.travel[median] / 1000 for one in summaries if one.life]
     edges = [0.0, *constants.LIFE_EDGES, np.inf]
     labels = ["passed", *(f"to {number(edge)}" for edge in edges[1:-1]), "more", "beyond"]
     places = Counter(int(np.searchsorted(edges, km)) + (km == np.inf) for km in left)

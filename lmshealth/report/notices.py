@@ -9,7 +9,7 @@ from lmshealth.prognosis.constants import CALIBRATED_RISK, SURPRISE
 from lmshealth.prognosis.results import ModeError
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, disagreements
-from lmshealth.report.text import quantiles, spell
+from lmshealth.report.text import quantiles, signed, spell
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -101,11 +101,11 @@ def _of_map(errors: tuple[ModeError, ...]) -> Notice:
     upto = np.cumsum([one.probability for one in errors])
     likely = errors[: int(np.searchsorted(upto, constants.NAMED)) + 1]
     texts = [
-        f"{spell(one.mode)} drifts by {100 * one.size:+.0f} ± {100 * one.std:.0f} % of what the "
-        f"map predicts from the other modes (probability {one.probability:.0%})"
+        f"{spell(one.mode)} drifts by {signed(100 * one.size, 0)} ± {100 * one.std:.0f} % of what "
+        f"the map predicts from the other modes (probability {one.probability:.0%})"
         for one in likely
     ]
-    what = " or ".join(texts).replace("-", "−")
+    what = " or ".join(texts)
     to_do = (
         "Check the name and the sensitivities of the mode; correct the map, or declare its error "
         "(model_std). The intervals allow for three times the declared one."

@@ -1,6 +1,9 @@
 """Rendering: templates to HTML pages (Jinja2, everything escaped), pages to PDF (WeasyPrint)."""
 
+import hashlib
+import inspect
 import re
+from base64 import b64encode
 from collections.abc import Iterable
 from datetime import datetime
 from functools import cache
@@ -12,27 +15,23 @@ from lmshealth._files import write_bytes
 from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
 
-_FILTERS = (
-    *(
-        text.change,
-        text.count,
-        text.fixed,
-        text.interval,
-        text.km,
-        text.law,
-        text.moment,
-        text.number,
-    ),
-    *(text.percent, text.probability, text.probability_range, text.signed, text.spell),
-    *(text.time_left, text.travel_left, text.whole_km),
-)
-
 
 def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
     """Render a template with the values of its names, and a time to print unless it is None."""
     version = metadata.version("lmshealth")
     page = _environment().get_template(template)
     return str(page.render(content, generated=generated, version=version))
+
+
+def read(name: str) -> str:
+    """Return the text of a style sheet or script beside the templates."""
+    folder = resources.files("lmshealth") / "report" / "templates"
+    return (folder / name).read_text(encoding="utf-8")
+
+
+def sha256(script: str) -> str:
+    """Return the hash of a script for the content security policy of its page."""
+    return b64encode(hashlib.sha256(script.encode()).digest()).decode()
 
 
 def place(value: float, length: float) -> float:
@@ -52,7 +51,8 @@ def _environment() -> Any:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    pages.filters |= {function.__name__: function for function in (*_FILTERS, place)}
+    pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
+    pages.filters |= {"place": place, "sha256": sha256}
     pages.globals |= {"covariate": text.covariate, "constants": constants}
     return pages
 
@@ -68,9 +68,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     WeasyPrint is missing or cannot lay out a page.
     """
     html, fetcher = _library()
-    templates = resources.files("lmshealth") / "report" / "templates"
-    style = (templates / "pdf.css").read_text(encoding="utf-8")
-    written = []
+    style, written = read("pdf.css"), []
     for page in pages:
         source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
         # WeasyPrint does not resolve CSS variables inside SVG.

@@ -69,7 +69,7 @@ def exact(posterior: EpochPosterior, points: int) -> Array:
 def ours(posterior: EpochPosterior, seed: int) -> Found:
     """Draw as `lmshealth infer` does: Laplace's start, four ensembles, arviz's judgement."""
     begin = time.process_time()
-    found, _ = draw(posterior, stream(seed))
+    found = draw(posterior, stream(seed))
     ess = float(min(found.ess_bulk.min(), found.ess_tail.min()))
     quantiles = np.quantile(found.flat, LEVELS, axis=0)
     return Found(quantiles, ess, time.process_time() - begin)

@@ -116,7 +116,7 @@ def ranks_of(
             found = importance_sample_to_ess(posterior.log_probability, start, rng, N_POINTS)
             draws.append(found.resampled(rng, N_DRAWS))
         except NotConverged:
-            draws.append(thinned(draw_chains(posterior, stream(key, k))[0].flat))
+            draws.append(thinned(draw_chains(posterior, stream(key, k)).flat))
             chains = 1
     return ranks(drawn.truth, draws, rng), chains
 

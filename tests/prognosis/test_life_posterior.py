@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._arrays import FloatArray
 from lmshealth.errors import NotConverged
+from lmshealth.health.ensemble_sampling import Sample
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_posterior as lifefit
@@ -110,11 +111,12 @@ def forked(unchained: LifePosterior) -> LifePosterior:
         replace(
             way,
             probability=probability,
-            coordinates=way.coordinates[:, :: 1 - 2 * k],
-            ess_bulk=900.0 - 100 * k - steps,
-            ess_tail=800.0 - 100 * k - steps,
-            r_hat=1.001 + 0.004 * k + 1e-4 * steps,
-            interval_shrinkage=0.9 - 0.4 * k - 0.01 * steps,
+            sample=Sample(
+                draws=way.sample.draws[:, :: 1 - 2 * k],
+                ess_bulk=900.0 - 100 * k - steps,
+                ess_tail=800.0 - 100 * k - steps,
+                r_hat=1.001 + 0.004 * k + 1e-4 * steps,
+            ),
             n_mixture_draws=int(100 * probability),
         )
         for k, probability in enumerate((0.75, 0.25))
@@ -170,15 +172,15 @@ def test_importance_sampling_alone_has_the_same_posterior(
     quick = fit_life(history, stage, 11, chains=False, n_draws=2000)
     assert quick.health.shape == (4, 500, 2)
     (way,) = quick.scenarios
-    assert np.isnan(way.r_hat).all()
-    assert way.ess_bulk.min() >= 400
-    assert quick.ess == way.ess_bulk.min()
+    assert np.isnan(way.sample.r_hat).all()
+    assert way.sample.ess_bulk.min() >= 400
+    assert quick.ess == way.sample.ess_bulk.min()
     assert quick.worst_r_hat == 1
     one, two = (
         np.concatenate([fit.health, fit.scenarios[0].chains], axis=2).reshape(-1, 6)
         for fit in (quick, found)
     )
-    ess = both_ess(found.ess, both_ess(float(way.ess_bulk.min()), 2000))
+    ess = both_ess(found.ess, both_ess(float(way.sample.ess_bulk.min()), 2000))
     assert agree(one, two, ess)
     assert not agree(one, 1.01 * two, ess)  # negative control
 
@@ -189,7 +191,7 @@ def test_a_life_updated_log_by_log_is_that_from_nothing(history: History, stage:
     one = fit_life(history.first_logs(7), stage, 11, chains=False, n_draws=400)
     for n in range(8, 13):
         one = fit_life(history.first_logs(n), stage, 11, n_draws=2000, before=one.start)
-        assert np.isnan(one.scenarios[0].r_hat).all()  # no chains
+        assert np.isnan(one.scenarios[0].sample.r_hat).all()  # no chains
     whole = fit_life(history, stage, 12, chains=False, n_draws=2000)
     draws = [
         np.concatenate([fit.health, fit.scenarios[0].chains], axis=2).reshape(-1, 6)
@@ -251,8 +253,8 @@ def test_linear_algebra_keeps_to_one_thread(
 
 def test_importance_sampling_alone_has_no_chains(unchained: LifePosterior) -> None:
     """Without chains there is no R-hat to be worse than 1, and the sample size is of weights."""
-    assert np.isnan(unchained.scenarios[0].r_hat).all()
-    assert unchained.ess == unchained.scenarios[0].ess_bulk.min()
+    assert np.isnan(unchained.scenarios[0].sample.r_hat).all()
+    assert unchained.ess == unchained.scenarios[0].sample.ess_bulk.min()
     assert unchained.worst_r_hat == 1
 
 
@@ -273,8 +275,6 @@ def test_a_life_has_its_diagnostics(found: LifePosterior) -> None:
     assert way.n_mixture_draws == found.health.shape[1] == 2500
     assert found.worst_r_hat < 1.01
     assert found.ess > 1000
-    assert way.interval_shrinkage[0] > 0.9
-    assert way.interval_shrinkage[1] < way.interval_shrinkage[0]
     assert np.corrcoef(np.log(found.health.reshape(-1, 2)).T)[0, 1] < -0.5
     ratio = found.chi_square / found.degrees_of_freedom
     assert 0.2 < ratio < 2.5
@@ -310,9 +310,9 @@ def test_a_prognosis_is_of_the_same_draws(
 def test_the_seed_alone_decides(found: LifePosterior, history: History, stage: Stage) -> None:
     """The same seed gives the same chains, another one others."""
     same, other = (fit_life(history, stage, seed) for seed in ((3, 4), (3, 5)))
-    np.testing.assert_array_equal(same.scenarios[0].coordinates, found.scenarios[0].coordinates)
+    np.testing.assert_array_equal(same.scenarios[0].sample.draws, found.scenarios[0].sample.draws)
     np.testing.assert_array_equal(same.health, found.health)
-    assert not np.array_equal(other.scenarios[0].coordinates, found.scenarios[0].coordinates)
+    assert not np.array_equal(other.scenarios[0].sample.draws, found.scenarios[0].sample.draws)
 
 
 @pytest.mark.slow
@@ -387,7 +387,7 @@ def test_a_scenario_of_little_probability_has_no_chains(
     with_law = [way for way in fit.scenarios if way.scenario.n_dim]
     assert {way.probability >= 0.5 for way in with_law} == {True, False}
     for way in with_law:
-        assert np.isfinite(way.r_hat).all() == (way.probability >= 0.5)
+        assert np.isfinite(way.sample.r_hat).all() == (way.probability >= 0.5)
         # As many effective draws as its share needs; the share itself is an estimate.
         share = way.probability / max(one.probability for one in fit.scenarios)
         assert 0 < way.evidence_std**2 * 400 * np.sqrt(share) < 1.25
@@ -472,7 +472,7 @@ def test_a_life_goes_to_arviz_and_back(found: LifePosterior, tmp_path: Path) -> 
     assert float(checks["chi_square"]) == found.chi_square
     assert float(checks["probability_1"]) == 1
     name = "mount_stiffness.loosening.floor"
-    assert float(checks[f"interval_shrinkage_1_{name}"]) == found.scenarios[0].interval_shrinkage[2]
+    assert float(checks[f"ess_bulk_1_{name}"]) == found.scenarios[0].sample.ess_bulk[2]
 
 
 @pytest.mark.slow
@@ -484,41 +484,24 @@ def test_a_scenario_without_parameters_has_no_group_in_arviz(faded: LifePosterio
         assert float(tree["checks_data"][f"probability_{k + 1}"]) == way.probability
 
 
-@pytest.mark.slow
-def test_a_life_is_a_table(found: LifePosterior) -> None:
-    """Health now, then laws with their checks, one row each."""
-    table = found.to_frame().set_index("parameter")
-    assert list(table.index) == [
-        *NAMES,
+def test_arviz_has_every_scenario(forked: LifePosterior) -> None:
+    """Draws, checks and probability of each scenario have its number."""
+    tree = forked.to_arviz()
+    checks = tree["checks_data"]
+    np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])
+    names = [
         "guide_preload.hertz-wear.life_m",
         "guide_preload.hertz-wear.exponent",
         "mount_stiffness.loosening.floor",
         "mount_stiffness.loosening.life_m",
     ]
-    assert list(table["way"]) == [0, 0, 1, 1, 1, 1]
-    assert table.loc["guide_preload", "median"] == np.median(found.health[..., 0])
-    shrinkage = found.scenarios[0].interval_shrinkage
-    assert table.loc["guide_preload.hertz-wear.life_m", "interval_shrinkage"] == shrinkage[0]
-    assert (table["q05"] < table["q95"]).all()
-
-
-def test_a_table_and_arviz_have_every_scenario(forked: LifePosterior) -> None:
-    """Draws, checks and probability of each scenario have its number in both."""
-    table, tree = forked.to_frame(), forked.to_arviz()
-    checks = tree["checks_data"]
-    np.testing.assert_array_equal(tree["posterior/guide_preload"], forked.health[..., 0])
     for k, way in enumerate(forked.scenarios, 1):
-        rows = table[table["way"] == k].set_index("parameter")
-        assert len(rows) == way.scenario.n_dim
-        assert set(tree[f"way_{k}"].data_vars) == set(rows.index)
-        assert (rows["probability"] == way.probability).all()
+        assert list(tree[f"way_{k}"].data_vars) == names
         assert float(checks[f"probability_{k}"]) == way.probability
-        for i, name in enumerate(rows.index):
+        for i, name in enumerate(names):
             np.testing.assert_array_equal(tree[f"way_{k}"][name], way.chains[..., i])
-            assert rows.loc[name, "median"] == np.median(way.chains[..., i])
-            for what in ("ess_bulk", "ess_tail", "r_hat", "interval_shrinkage"):
-                value = getattr(way, what)[i]
-                assert rows.loc[name, what] == float(checks[f"{what}_{k}_{name}"]) == value
+            for what in ("ess_bulk", "ess_tail", "r_hat"):
+                assert float(checks[f"{what}_{k}_{name}"]) == getattr(way.sample, what)[i]
 
 
 @pytest.mark.slow

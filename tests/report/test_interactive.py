@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-import builtins
+import importlib
 import json
 import re
+import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -13,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lmshealth.report.interactive import InteractiveError, interactive_page
+from lmshealth.errors import LmshealthError
+from lmshealth.report.interactive import interactive_page
 from tests.assessments import Maker, chromium, make, nothing, watch
 from tests.report.test_readable import seen_in_a_log
 
@@ -50,18 +52,12 @@ def test_what_is_missing_is_left_out(make: Maker) -> None:
     assert items(text) == [] and "do not determine anything" in text
 
 
-def test_without_bokeh_the_way_out_is_named(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_bokeh_the_way_out_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """The error names the extra and the command that repeats the pages."""
-    whole = builtins.__import__
-
-    def refuse(name: str, *rest: Any) -> Any:
-        if name.startswith("bokeh"):
-            raise ImportError(name)
-        return whole(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", refuse)
-    with pytest.raises(InteractiveError, match=r"lmshealth\[interactive\].*report --interactive"):
-        interactive_page(make(), "a.html")
+    monkeypatch.setitem(sys.modules, "bokeh.plotting", None)
+    monkeypatch.delitem(sys.modules, "lmshealth.report.interactive")
+    with pytest.raises(LmshealthError, match=r"lmshealth\[interactive\].*report --interactive"):
+        importlib.import_module("lmshealth.report.interactive")
 
 
 @pytest.mark.slow

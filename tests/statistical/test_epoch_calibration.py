@@ -84,7 +84,7 @@ def test_chains_are_as_calibrated_as_grids(
     errors = []
     for k, x in enumerate(stage.prior.draw(rng, claims.trials)):
         posterior = EpochPosterior.of(stage, MODES, seen(rng, stage, x), COV)
-        found, _ = draw(posterior, stream(int(rng.integers(1 << 32)), k))
+        found = draw(posterior, stream(int(rng.integers(1 << 32)), k))
         middle = np.median(found.flat, axis=0)
         closer = middle + 0.75 * (found.flat - middle)
         level = np.array(marginals(posterior, x))
