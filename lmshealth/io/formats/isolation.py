@@ -190,8 +190,9 @@ class _Reader:
             if dtype.kind not in "fiu":
                 raise ValueError(f"samples are of type {dtype}")
             part = np.frombuffer(self._window, dtype, answer.size)
-            spool = spools.setdefault(answer.column, Spool(answer.expected))
-            spool.append(part if spool.expected else part.copy())
+            if answer.column not in spools:
+                spools[answer.column] = Spool(answer.expected)
+            spools[answer.column].append(part)
             requests.write(b"\n")
             requests.flush()
 
