@@ -10,6 +10,7 @@ import re
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from importlib.metadata import version
@@ -24,7 +25,7 @@ from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
-from lmshealth.io.formats.unit_channels import choose, present
+from lmshealth.io.formats.unit_channels import choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
@@ -153,16 +154,16 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
     dialect = stated or find_dialect(lines, columns)
     guessed += dialect.guessed
-    chosen, names = choose(dialect.channels, columns), present(dialect.channels)
-    metadata, samples = chosen.metadata | dialect.metadata, dict[str, Samples]()
-    if chosen.columns:
-        times = {c: _unit_of(target, columns) for c in chosen.columns
+    chosen, content = choose(dialect.channels, columns)
+    metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
+    if chosen:
+        times = {c: _unit_of(target, columns) for c in chosen
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
-        samples = _numbers(text, chosen.columns, dialect, times)
+        samples = _numbers(text, chosen, dialect, times)
         for name, unit in times.items():
             samples[name], ticks, moment = _since_first(samples[name], unit)
             guessed, metadata = [*guessed, *ticks], moment | metadata
-    return Content(samples, metadata, names, chosen.refused, tuple(guessed))
+    return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
 class _Measurement:
