@@ -1,7 +1,5 @@
 """Commands that read single logs: init, modes, error, spectrum, frf."""
 
-import csv
-import io
 import math
 import re
 import shlex
@@ -12,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+import pandas as pd
 
 from lmshealth._files import write_text
 from lmshealth._toml import decode
@@ -79,8 +78,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     The description has the modes of the first log that is read. Check and edit all three.
     """
     logs = tuple(path for path in logs if path.name not in NOT_LOGS) or logs
-    map_file, sheet, stage = out / "map.toml", out / MANIFEST, out / "my-stage.toml"
-    there = [str(path) for path in (map_file, sheet, stage) if path.exists()]
+    map_file, sheet, stage = files = out / "map.toml", out / MANIFEST, out / "my-stage.toml"
+    there = [str(path) for path in files if path.exists()]
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
     text, guesses = propose(logs[0], rate=given["rate"], max_memory=given["max_memory"])
@@ -121,11 +120,9 @@ def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
         why = f"not written, {outside[0]} is not in its folder: choose --out with the logs in it"
         terminal.print_notes([f"{sheet}: {why}"])
         return
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row | {"file": row["file"].relative_to(folder).as_posix()} for row in rows)
-    write_text(sheet, table.getvalue())
+    table = pd.DataFrame(rows)
+    table["file"] = [path.relative_to(folder).as_posix() for path in table["file"]]
+    write_text(sheet, table.to_csv(index=False))
     why = "stage is the folder where the file names none; fill in what is empty (see remark)"
     terminal.print_notes([f"{sheet}: {why}"])
 

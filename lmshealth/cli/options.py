@@ -89,11 +89,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-FOLLOW_LINKS = click.option(
+# Read before the others: it may decide how they are read.
+eager_option = partial(click.option, is_eager=True, expose_value=False)
+FOLLOW_LINKS = eager_option(
     "--follow-links",
     is_flag=True,
-    is_eager=True,  # it decides how --stage is read
-    expose_value=False,
     callback=lambda ctx, option, given: ctx.meta.update({__name__: given}),
     help="Follow links out of the folder of logs, and maps out of that of a description.",
 )
@@ -228,29 +228,20 @@ def _log(ctx: click.Context, option: click.Parameter, given: Any) -> None:
 
 
 _OUTPUT = (
-    click.option(
+    eager_option(
         *("-q", "--quiet"),
         is_flag=True,
-        is_eager=True,
-        expose_value=False,
         callback=lambda ctx, option, given: ctx.meta.update({terminal.__name__: given}),
         help="Print results and errors only: no notes and no progress.",
     ),
-    click.option(
+    eager_option(
         *("-v", "--verbose"),
         is_flag=True,
-        is_eager=True,
-        expose_value=False,
         callback=_log,
         help="Print a line per event on standard error, with its time.",
     ),
-    click.option(
-        "--log-file",
-        type=OUT,
-        is_eager=True,
-        expose_value=False,
-        callback=_log,
-        help="Append events, notes and errors to a file.",
+    eager_option(
+        "--log-file", type=OUT, callback=_log, help="Append events, notes and errors to a file."
     ),
 )
 

@@ -569,7 +569,9 @@ def print_life(
     ``before`` is a day with the probabilities that each limit is reached before it.
     """
     blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
-    same = _same_as_any(blocks)
+    # Rows of any limit that are those of one limit, but for its name, are not repeated.
+    *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
+    same = blocks[each.index(last)][0][0] if last in each else None
     title = (
         f"{life.stage}: remaining life after {day(life.recorded_at)}, at {whole_km(life.travel)} "
         f"(horizon {km(life.horizon)})"
@@ -619,12 +621,6 @@ def _limit_cells(
 
 def _below(one: LimitLife) -> str:
     return f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
-
-
-def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
-    """Return the limit whose rows equal those of any limit, but for its name."""
-    *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
-    return next((rows[0][0] for rows, own in zip(blocks, each, strict=False) if own == last), None)
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:
