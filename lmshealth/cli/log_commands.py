@@ -33,8 +33,7 @@ from lmshealth.report.tables import Row
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
-from lmshealth.stage.proposal import moment_of, propose
-from lmshealth.stage.skeleton import searches, write_skeleton
+from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
 from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
