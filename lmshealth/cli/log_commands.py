@@ -217,17 +217,15 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
-        if found:
-            views.print_modes(rows, rejected, off)
-            if given["shapes"]:
-                views.print_shapes(content["shapes"], content["mac"])
-            if rows and stage is None and band is None:
-                terminal.print_text(_NO_BAND)
+        views.print_modes(rows, rejected, off)
+        if given["shapes"]:
+            views.print_shapes(content["shapes"], content["mac"])
+        if rows and stage is None and band is None:
+            terminal.print_text(_NO_BAND)
 
-    _publish(ctx, content, refused, lost, show)
     if given["save"] and found:
         _save(given["save"], found[0])
-    _exit(ctx, found, lost)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
@@ -299,8 +297,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, lost, show)
-    _exit(ctx, found, lost)
+    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
 
 
 @options.command(
@@ -332,8 +329,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _publish(ctx, content, refused, lost, show)
-    _exit(ctx, found, lost)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 @options.command(
@@ -417,16 +413,11 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         "lines": _line_rows((log.name, own.modes.lines) for log, own in found),
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
-
-    def show(rejected: list[Row]) -> None:
-        if found:
-            views.print_frf(content["fit"], content["frf"], rows, rejected)
-
-    _publish(ctx, content, refused, lost, show)
     if stage and given["style"] != "json":
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
-    _exit(ctx, found, lost)
+    show = partial(views.print_frf, content["fit"], content["frf"], rows)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 def _responses(
@@ -454,10 +445,11 @@ def _publish(
     ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
+    found: Sequence[object],
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
 ) -> None:
-    """Print results as csv (the first table of the content), as json, or as tables.
+    """Print results as csv (the first table of the content), json, or tables, and exit.
 
     Tables list refused parts of logs, but not lost logs.
     """
@@ -467,8 +459,9 @@ def _publish(
         click.echo(table.to_csv(index=False), nl=False)
     elif ctx.params["style"] == "json":
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
-    else:
+    elif found:
         show(tables.refused_rows(refused))
+    _exit(ctx, found, lost)
 
 
 def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:
