@@ -17,7 +17,7 @@ from loky import cpu_count
 from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
-from lmshealth.io.column_map import ColumnMap, load_columns
+from lmshealth.io.column_map import load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
@@ -46,10 +46,6 @@ def day(value: str) -> date:
     except ValueError as error:
         detail = f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01."
         raise click.BadParameter(detail) from error
-
-
-def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
-    return None if path is None else load_columns(path)
 
 
 def _band(
@@ -126,7 +122,10 @@ store_option = partial(
     click.option, "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL"
 )
 _COLUMNS = click.option(
-    "--columns", type=click.Path(), callback=_column_map, help="Column map of the export."
+    "--columns",
+    type=click.Path(),
+    callback=lambda ctx, option, path: path if path is None else load_columns(path),
+    help="Column map of the export.",
 )
 MOST_MEMORY = click.option(
     "--max-memory",

@@ -11,7 +11,7 @@ from lmshealth.cli.terminal import cells, print_refused, print_table, print_text
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
-from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, Summary
+from lmshealth.report.assessment import Life, ParameterHealth, Summary
 from lmshealth.report.tables import Row, health_rows, track_rows
 from lmshealth.report.text import (
     GAP,
@@ -601,7 +601,8 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], constants.RUL_LEVELS
-    text = "any limit" if one.parameter == "any" else _below(one)
+    text = f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
+    text = "any limit" if one.parameter == "any" else text
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):
@@ -617,10 +618,6 @@ def _limit_cells(
         asked, bounds = before
         chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
         yield (f"  before {asked}: {chance}",)
-
-
-def _below(one: LimitLife) -> str:
-    return f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:

@@ -157,7 +157,7 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     chosen, content = choose(dialect.channels, columns)
     metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
     if chosen:
-        times = {c: _unit_of(target, columns) for c in chosen
+        times = {c: columns.signal(target).factor for c in chosen
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
         samples = _numbers(text, chosen, dialect, times)
         for name, unit in times.items():
@@ -330,14 +330,6 @@ def _moments(values: Any) -> Any:
     day_first = bool(values.astype(str).str.match(r"\d{1,2}\.").any())
     text = values.astype(str).str.replace(",", ".") if values.dtype == object else values
     return pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
-
-
-def _unit_of(target: str, columns: ColumnMap) -> float:
-    """Return the unit of a column of times in s; 1 where it has none, which is refused later."""
-    try:
-        return columns.signal(target).factor
-    except Unusable:
-        return 1.0
 
 
 def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
