@@ -14,6 +14,8 @@ from lmshealth.io.refusal import Unusable
 MINUTE = 1_200_000
 # Samples per block: small enough that temporary arrays stay in the processor's cache.
 BLOCK = 1 << 18
+# A column in memory has room for so many times what it held when it was full.
+_GROWTH = 8
 
 
 class Stored:
@@ -55,7 +57,7 @@ def blocks(
 
 
 class Spool:
-    """Collects the samples of one column in blocks; the number expected saves copies.
+    """Collects the samples of one column in blocks.
 
     The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
     ``send`` is set, in the process that reads for others, blocks go there and are not kept.
@@ -63,9 +65,8 @@ class Spool:
 
     send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
 
-    def __init__(self, expected: int = 0) -> None:
-        self.expected = expected
-        self._memory = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
+    def __init__(self) -> None:
+        self._memory = np.empty(0)
         self._file: IO[bytes] | None = None
         self.size = 0
 
@@ -81,7 +82,8 @@ class Spool:
                 self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
                 return
             if self.size > self._memory.size:
-                grown = np.empty(max(self.size, 2 * start))
+                # Memory that is never written to costs nothing.
+                grown = np.empty(max(self.size, min(_GROWTH * start, MINUTE)))
                 grown[:start] = self._memory[:start]
                 self._memory = grown
             self._memory[start : self.size] = block
@@ -119,7 +121,7 @@ def as_samples(values: np.ndarray) -> Samples:
 
 def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
     """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    spool = Spool(samples.size)
+    spool = Spool()
     for _, values in blocks(samples):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):
