@@ -41,7 +41,9 @@ _NO_ROWS = "a header line and no rows; needed rows"
 # Lines of a LabVIEW measurement that are no rows, and those of them that all segments share.
 _MAY_BE_MIXED = re.compile(rb"\n[A-Za-z*\r\n]")
 _NO_ROW = re.compile(rb"^(?:[A-Za-z*][^\n]*|[ \t\r]*)\n", re.MULTILINE)
-_SEGMENT = re.compile(rb"^(X_Value|Channels|Y_Unit_Label|Delta_X)(?:\t([^\n]*)|\r?$)", re.MULTILINE)
+_SEGMENT = re.compile(
+    rb"^(X_Value|Channels|Y_Unit_Label|Delta_X)(?:[\t,]([^\n]*)|\r?$)", re.MULTILINE
+)
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # The last row of some exports.
@@ -176,9 +178,10 @@ class _Measurement:
     def __init__(self, stream: IO[bytes], start: bytes) -> None:
         self._stream = stream
         header = start[: start.find(b"\nX_Value") + 1]
-        self._keys = dict(line.rstrip().partition(b"\t")[::2] for line in header.splitlines())
         names = start[len(header) :].split(b"\n", 1)[0]
-        self._keys[b"X_Value"] = names.rstrip().partition(b"\t")[2]
+        separator = b"," if b"\nSeparator," in header else b"\t"
+        pairs = (line.rstrip().partition(separator) for line in (*header.splitlines(), names))
+        self._keys = {key: value for key, _, value in pairs}
         self._is_timed = self._keys.get(b"X_Columns") == b"One"
         self.readline = stream.readline
         self.seek(0)
@@ -186,7 +189,7 @@ class _Measurement:
     def seek(self, position: int) -> None:
         """Go to the beginning."""
         self._stream.seek(position)
-        sizes = self._keys.get(b"Samples", b"").split()
+        sizes = re.findall(rb"\d+", self._keys.get(b"Samples", b""))
         self._n_left = math.inf if self._is_timed or not sizes else max(map(int, sizes))
 
     def read(self, size: int) -> bytes:
