@@ -272,13 +272,12 @@ def _numbers(
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places, {}, {})
+            return _spooled(partial(read, dtype=numbers), text, places, {})
         except (ValueError, pd.errors.ParserWarning):
             # Half as fast, but accepts blanks and locates the fault.
             begin()
         try:
-            careful = partial(read, skipinitialspace=True)
-            return _spooled(careful, text, places, times, dict.fromkeys(times, None))
+            return _spooled(partial(read, skipinitialspace=True), text, places, times)
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
@@ -288,14 +287,11 @@ def _numbers(
 
 
 def _spooled(
-    read: Callable[[], Any],
-    text: Text,
-    places: dict[str, int],
-    times: Mapping[str, float],
-    first: dict[str, Any],
+    read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, float]
 ) -> dict[str, Samples]:
-    """Read the rows block by block; ``first`` receives the first moments of its columns."""
+    """Read the rows block by block."""
     n_rows = n_blank = 0
+    first: dict[str, Any] = {}  # moments
     taken = {name: Spool() for name in places}
     with read() as tables:
         for table in tables:
@@ -310,10 +306,10 @@ def _spooled(
                 n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
                 values = table[place]
-                if values.dtype.kind not in "fiu" and name in first:
+                if values.dtype.kind not in "fiu" and name in times:
                     values = _moments(values)
-                    first[name] = values.min() if first[name] is None else first[name]
-                    values = (values - first[name]).dt.total_seconds() / times[name]
+                    since = values - first.setdefault(name, values.min())
+                    values = since.dt.total_seconds() / times[name]
                 if values.dtype.kind not in "fiu":
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
                 if n_used:
