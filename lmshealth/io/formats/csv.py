@@ -165,6 +165,10 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
         for name, unit in times.items():
             samples[name], ticks, moment = _since_first(samples[name], unit)
             guessed, metadata = [*guessed, *ticks], moment | metadata
+    elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
+        text.begin(dialect.start)
+        while stream.read(_HEAD_BYTES):
+            pass
     return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
