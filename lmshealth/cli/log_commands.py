@@ -1,7 +1,5 @@
 """Commands that read single logs: init, modes, error, spectrum, frf."""
 
-import csv
-import io
 import math
 import re
 import shlex
@@ -12,6 +10,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
+import pandas as pd
 
 from lmshealth._files import write_text
 from lmshealth._toml import decode
@@ -34,8 +33,7 @@ from lmshealth.report.tables import Row
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
-from lmshealth.stage.proposal import moment_of, propose
-from lmshealth.stage.skeleton import searches, write_skeleton
+from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
 from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
@@ -79,8 +77,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     The description has the modes of the first log that is read. Check and edit all three.
     """
     logs = tuple(path for path in logs if path.name not in NOT_LOGS) or logs
-    map_file, sheet, stage = out / "map.toml", out / MANIFEST, out / "my-stage.toml"
-    there = [str(path) for path in (map_file, sheet, stage) if path.exists()]
+    map_file, sheet, stage = files = out / "map.toml", out / MANIFEST, out / "my-stage.toml"
+    there = [str(path) for path in files if path.exists()]
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
     text, guesses = propose(logs[0], rate=given["rate"], max_memory=given["max_memory"])
@@ -121,11 +119,9 @@ def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
         why = f"not written, {outside[0]} is not in its folder: choose --out with the logs in it"
         terminal.print_notes([f"{sheet}: {why}"])
         return
-    table = io.StringIO()
-    writer = csv.DictWriter(table, list(rows[0]), lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(row | {"file": row["file"].relative_to(folder).as_posix()} for row in rows)
-    write_text(sheet, table.getvalue())
+    table = pd.DataFrame(rows)
+    table["file"] = [path.relative_to(folder).as_posix() for path in table["file"]]
+    write_text(sheet, table.to_csv(index=False))
     why = "stage is the folder where the file names none; fill in what is empty (see remark)"
     terminal.print_notes([f"{sheet}: {why}"])
 
@@ -221,17 +217,15 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
-        if found:
-            views.print_modes(rows, rejected, off)
-            if given["shapes"]:
-                views.print_shapes(content["shapes"], content["mac"])
-            if rows and stage is None and band is None:
-                terminal.print_text(_NO_BAND)
+        views.print_modes(rows, rejected, off)
+        if given["shapes"]:
+            views.print_shapes(content["shapes"], content["mac"])
+        if rows and stage is None and band is None:
+            terminal.print_text(_NO_BAND)
 
-    _publish(ctx, content, refused, lost, show)
     if given["save"] and found:
         _save(given["save"], found[0])
-    _exit(ctx, found, lost)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
@@ -303,8 +297,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, lost, show)
-    _exit(ctx, found, lost)
+    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
 
 
 @options.command(
@@ -336,8 +329,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _publish(ctx, content, refused, lost, show)
-    _exit(ctx, found, lost)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 @options.command(
@@ -421,16 +413,11 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         "lines": _line_rows((log.name, own.modes.lines) for log, own in found),
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
-
-    def show(rejected: list[Row]) -> None:
-        if found:
-            views.print_frf(content["fit"], content["frf"], rows, rejected)
-
-    _publish(ctx, content, refused, lost, show)
     if stage and given["style"] != "json":
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
-    _exit(ctx, found, lost)
+    show = partial(views.print_frf, content["fit"], content["frf"], rows)
+    _publish(ctx, content, refused, found, lost, show)
 
 
 def _responses(
@@ -458,10 +445,11 @@ def _publish(
     ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
+    found: Sequence[object],
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
 ) -> None:
-    """Print results as csv (the first table of the content), as json, or as tables.
+    """Print results as csv (the first table of the content), json, or tables, and exit.
 
     Tables list refused parts of logs, but not lost logs.
     """
@@ -471,8 +459,9 @@ def _publish(
         click.echo(table.to_csv(index=False), nl=False)
     elif ctx.params["style"] == "json":
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
-    else:
+    elif found:
         show(tables.refused_rows(refused))
+    _exit(ctx, found, lost)
 
 
 def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:

@@ -17,7 +17,7 @@ from loky import cpu_count
 from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
-from lmshealth.io.column_map import ColumnMap, load_columns
+from lmshealth.io.column_map import load_columns
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
@@ -46,10 +46,6 @@ def day(value: str) -> date:
     except ValueError as error:
         detail = f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01."
         raise click.BadParameter(detail) from error
-
-
-def _column_map(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
-    return None if path is None else load_columns(path)
 
 
 def _band(
@@ -89,11 +85,11 @@ FOLDER = click.Path(file_okay=False, path_type=Path)
 SHARE = Finite(0, 1, min_open=True, max_open=True)
 
 LOGS = click.argument("logs", nargs=-1, required=True, type=click.Path(path_type=Path))
-FOLLOW_LINKS = click.option(
+# Read before the others: it may decide how they are read.
+eager_option = partial(click.option, is_eager=True, expose_value=False)
+FOLLOW_LINKS = eager_option(
     "--follow-links",
     is_flag=True,
-    is_eager=True,  # it decides how --stage is read
-    expose_value=False,
     callback=lambda ctx, option, given: ctx.meta.update({__name__: given}),
     help="Follow links out of the folder of logs, and maps out of that of a description.",
 )
@@ -126,7 +122,10 @@ store_option = partial(
     click.option, "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL"
 )
 _COLUMNS = click.option(
-    "--columns", type=click.Path(), callback=_column_map, help="Column map of the export."
+    "--columns",
+    type=click.Path(),
+    callback=lambda ctx, option, path: path if path is None else load_columns(path),
+    help="Column map of the export.",
 )
 MOST_MEMORY = click.option(
     "--max-memory",
@@ -228,29 +227,20 @@ def _log(ctx: click.Context, option: click.Parameter, given: Any) -> None:
 
 
 _OUTPUT = (
-    click.option(
+    eager_option(
         *("-q", "--quiet"),
         is_flag=True,
-        is_eager=True,
-        expose_value=False,
         callback=lambda ctx, option, given: ctx.meta.update({terminal.__name__: given}),
         help="Print results and errors only: no notes and no progress.",
     ),
-    click.option(
+    eager_option(
         *("-v", "--verbose"),
         is_flag=True,
-        is_eager=True,
-        expose_value=False,
         callback=_log,
         help="Print a line per event on standard error, with its time.",
     ),
-    click.option(
-        "--log-file",
-        type=OUT,
-        is_eager=True,
-        expose_value=False,
-        callback=_log,
-        help="Append events, notes and errors to a file.",
+    eager_option(
+        "--log-file", type=OUT, callback=_log, help="Append events, notes and errors to a file."
     ),
 )
 

@@ -11,7 +11,7 @@ from lmshealth.cli.terminal import cells, print_refused, print_table, print_text
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
-from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, Summary
+from lmshealth.report.assessment import Life, ParameterHealth, Summary
 from lmshealth.report.tables import Row, health_rows, track_rows
 from lmshealth.report.text import (
     GAP,
@@ -569,7 +569,9 @@ def print_life(
     ``before`` is a day with the probabilities that each limit is reached before it.
     """
     blocks = [list(_limit_cells(life, k, before)) for k in range(len(life.limits))]
-    same = _same_as_any(blocks)
+    # Rows of any limit that are those of one limit, but for its name, are not repeated.
+    *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
+    same = blocks[each.index(last)][0][0] if last in each else None
     title = (
         f"{life.stage}: remaining life after {day(life.recorded_at)}, at {whole_km(life.travel)} "
         f"(horizon {km(life.horizon)})"
@@ -599,7 +601,8 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], constants.RUL_LEVELS
-    text = "any limit" if one.parameter == "any" else _below(one)
+    text = f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
+    text = "any limit" if one.parameter == "any" else text
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):
@@ -615,16 +618,6 @@ def _limit_cells(
         asked, bounds = before
         chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
         yield (f"  before {asked}: {chance}",)
-
-
-def _below(one: LimitLife) -> str:
-    return f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
-
-
-def _same_as_any(blocks: Sequence[Sequence[tuple[str, ...]]]) -> str | None:
-    """Return the limit whose rows equal those of any limit, but for its name."""
-    *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
-    return next((rows[0][0] for rows, own in zip(blocks, each, strict=False) if own == last), None)
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:

@@ -14,6 +14,8 @@ from lmshealth.io.refusal import Unusable
 MINUTE = 1_200_000
 # Samples per block: small enough that temporary arrays stay in the processor's cache.
 BLOCK = 1 << 18
+# A column in memory has room for so many times what it held when it was full.
+_GROWTH = 8
 
 
 class Stored:
@@ -55,7 +57,7 @@ def blocks(
 
 
 class Spool:
-    """Collects the samples of one column in blocks, without a copy if their number is expected.
+    """Collects the samples of one column in blocks.
 
     The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
     ``send`` is set, in the process that reads for others, blocks go there and are not kept.
@@ -63,13 +65,9 @@ class Spool:
 
     send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
 
-    def __init__(self, expected: int = 0) -> None:
-        # Of a column in memory: its first samples, and what is more than expected.
-        self._whole = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
-        self._filled = 0
-        self._parts: list[FloatArray] = []
-        self._stored: Stored | None = None
-        self.expected = self._whole.size if Spool.send is None else expected
+    def __init__(self) -> None:
+        self._memory = np.empty(0)
+        self._file: IO[bytes] | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
@@ -80,47 +78,42 @@ class Spool:
         start, self.size = self.size, self.size + block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size <= self._whole.size:
-                self._whole[start : self.size] = block
-                self._filled = self.size
-            else:
-                self._parts.append(np.asarray(block, dtype=np.float64))
-        if self._stored is not None or self.size > MINUTE:
-            self._write()
+            if self.size > MINUTE:
+                self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
+                return
+            if self.size > self._memory.size:
+                # Memory that is never written to costs nothing.
+                grown = np.empty(max(self.size, min(_GROWTH * start, MINUTE)))
+                grown[:start] = self._memory[:start]
+                self._memory = grown
+            self._memory[start : self.size] = block
 
     def samples(self) -> Samples:
         """Return all samples."""
         if Spool.send is not None:
             return cast(Samples, self)  # a place for what was sent
-        if self._stored is not None:
-            self._stored.file.flush()
-            self._stored.size = self.size
-            return self._stored
-        if len(self._parts) == 1 and not self._filled:
-            return self._parts[0]
-        if self._parts or self._filled < self._whole.size:
-            self._parts = [np.concatenate([self._whole[: self._filled], *self._parts])]
-            self._filled = 0
-            return self._parts[0]
-        return self._whole
+        if self._file is None:
+            return self._memory[: self.size]
+        self._file.flush()
+        return Stored(self._file, self.size)
 
-    def _write(self) -> None:
+    def _write(self, *parts: FloatArray) -> None:
         try:
-            if self._stored is None:
-                file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
-                self._stored = Stored(file, 0)
-            for values in (self._whole[: self._filled], *self._parts):
-                self._stored.file.write(np.ascontiguousarray(values).data)
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+            for values in parts:
+                self._file.write(values.data)
         except OSError as error:
             found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
             needed = "set TMPDIR to a folder on a larger disk"
             raise Unusable("too-large", f"{found} ({error.strerror}); {needed}") from error
-        self._whole, self._filled = np.empty(0), 0
-        self._parts.clear()
+        self._memory = np.empty(0)
 
 
 def as_samples(values: np.ndarray) -> Samples:
     """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
+    if values.size <= MINUTE and values.dtype == np.float64 and Spool.send is None:
+        return values
     spool = Spool()
     spool.append(values)
     return spool.samples()
@@ -128,7 +121,7 @@ def as_samples(values: np.ndarray) -> Samples:
 
 def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
     """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    spool = Spool(samples.size)
+    spool = Spool()
     for _, values in blocks(samples):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):

@@ -95,12 +95,9 @@ def _measured(values: Samples) -> Iterator[FloatArray]:
 
 
 def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
-    """Count the samples at the maximum that a limited range explains; 0 where it does not.
+    """Count the samples at the maximum that clipping explains (README.md, "Method"), else 0.
 
-    Many samples at the maximum alone are no clipping: a sine of amplitude A in steps of an encoder
-    spends ``(d / 2A)^½ 2/π`` of its time in its outermost step of width d, and over the four steps
-    below it ``5^½ - 1 = 1.24`` times that, whereas a clipped signal crosses those steps quickly.
-    A signal of few steps has no such shape and is accepted. ``sign`` -1 examines the minimum.
+    A signal of few steps is accepted. ``sign`` -1 examines the minimum.
     """
     n_at = n_adjacent = 0
     below = low

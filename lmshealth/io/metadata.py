@@ -25,9 +25,12 @@ KEYS = (
     "velocity_mm_s",
 )
 
-# Fillers and selectors of variants are printable to Python, and yet nobody sees them.
-_INVISIBLE = re.compile(
-    "[\u034f\u115f\u1160\u17b4\u17b5\u180b-\u180f\u3164\ufe00-\ufe0f\uffa0\U000e0100-\U000e01ef]"
+# Characters that no name has, as a class of regular expressions: control and bidirectional ones,
+# and those that nobody sees (soft hyphens, fillers, byte order marks, tags, selectors of variants).
+INVISIBLE = (
+    "\x00-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f"
+    "\u2028-\u202e\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\uffff"
+    "\U000e0000-\U000e0fff\U000f0000-\U0010ffff"
 )
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
@@ -73,7 +76,8 @@ def parse_name(given: Mapping[str, str], key: str) -> str | None:
     name = given.get(key)
     if not name:
         return None
-    if not name.isprintable() or _INVISIBLE.search(name) or len(name) > constants.LONGEST_NAME:
+    is_odd = not name.isprintable() or re.search(f"[{INVISIBLE}]", name)
+    if is_odd or len(name) > constants.LONGEST_NAME:
         raise _bad(given, key, f"printable text of at most {constants.LONGEST_NAME} characters")
     return unicodedata.normalize("NFC", name)
 

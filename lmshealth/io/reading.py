@@ -18,7 +18,7 @@ from lmshealth.io.channel_checks import check_signal, independent, missing_range
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
-from lmshealth.io.formats.unit_channels import Described, choose, present
+from lmshealth.io.formats.unit_channels import Described, choose
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
@@ -129,10 +129,9 @@ def read_sep005(
     used = ColumnMap() if columns is None else columns
     try:
         given = [_sep005(one, k) for k, one in enumerate(channels)]
-        described = [one.channel for one in given]
-        chosen = choose(described, used)
-        read = [given[k] for k in chosen.columns.values()]
-        samples = {key: as_samples(one.data) for key, one in zip(chosen.columns, read, strict=True)}
+        chosen, content = choose([one.channel for one in given], used)
+        read = [given[k] for k in chosen.values()]
+        samples = {key: as_samples(given[k].data) for key, k in chosen.items()}
         times = [one.time for one in read if one.time is not None]
         if any(not np.array_equal(times[0], time) for time in times):
             raise Unusable("time", "channels have different times; needed the same of all")
@@ -141,8 +140,8 @@ def read_sep005(
         starts = sorted({one.start for one in read} - {""})
         if len(starts) > 1:
             raise Unusable("time", f"start_timestamp differs: {listed(starts)}; needed the same")
-        metadata = chosen.metadata | {"recorded_at": "".join(starts)}
-        content = Content(samples, metadata, present(described), chosen.refused)
+        metadata = content.metadata | {"recorded_at": "".join(starts)}
+        content = replace(content, columns=samples, metadata=metadata)
         digest = hashlib.sha256(repr([(one.channel, one.start) for one in given]).encode())
         for one in given:
             digest.update(one.data.tobytes())

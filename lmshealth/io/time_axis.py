@@ -84,10 +84,7 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
 
 
 def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
-    """Find the axis of increasing time stamps, rounded to a step in s.
-
-    ``slack`` in s is the rounding that an interval may have beyond its tolerance.
-    """
+    """Find the axis of stamps, rounded to a step in s; ``slack`` is allowed beyond tolerances."""
     breaks, note, interval, scatter = _interruptions(time, slack)
     if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
         found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"

@@ -18,7 +18,9 @@ from lmshealth._arrays import FloatArray
 from lmshealth._files import escapes, read_table
 from lmshealth._toml import decode
 from lmshealth.errors import BadStage
+from lmshealth.io.constants import LONGEST_NAME
 from lmshealth.io.log import Metadata
+from lmshealth.io.metadata import INVISIBLE
 from lmshealth.io.refusal import repeated
 from lmshealth.stage import constants
 from lmshealth.stage.degradation_laws import AnyLaw, Unchanging
@@ -28,14 +30,8 @@ from lmshealth.stage.priors import JointPrior, Prior
 _SHIPPED = Path(__file__).parent / "descriptions"
 Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
 Share = Annotated[float, Meta(gt=0, lt=1)]
-# Names appear on terminals, in tables and pages: no control or bidirectional characters, and none
-# that cannot be seen (soft hyphens, byte order marks, tags, selectors of variants).
-_NAME = (
-    "^[^\x00-\x1f\x7f-\x9f\xad\u034f\u061c\u115f\u1160\u17b4\u17b5\u180b-\u180f\u200b-\u200f"
-    "\u2028-\u202e\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\uffff"
-    "\U000e0000-\U000e0fff\U000f0000-\U0010ffff]*\\Z"
-)
-Name = Annotated[str, Meta(max_length=200, pattern=_NAME)]
+# Names appear on terminals, in tables and pages.
+Name = Annotated[str, Meta(max_length=LONGEST_NAME, pattern=f"^[^{INVISIBLE}]*\\Z")]
 CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
 

@@ -186,8 +186,7 @@ def _choose_sizes(
 ) -> tuple[list[int], FloatArray]:
     """Choose the coefficients of each axis with the least error at inner grid points left out.
 
-    The error of a fit without a point is r / (1 - h) there, r the residual and h the leverage of
-    the fit with it. The largest of each mode is returned, too, ``(n_modes,)``.
+    The largest error of each mode is returned, too, ``(n_modes,)`` (README.md, "Modal map").
     """
     interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None

@@ -3,7 +3,6 @@
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -97,43 +96,68 @@ def plan(
     10 s: 2 of them, 91% for one
     20 s: 1 of them, 100% for one
     """
-    test = _OneSidedTest(power, false_alarm)
+    if not 0 < false_alarm < power < 1:
+        raise BadQuestion(
+            f"power {power:g} at false-alarm probability {false_alarm:g}: needed 0 < false alarm "
+            "< power < 1, for example 0.95 at 0.01"
+        )
     information = identifiability_of(stage)
     j = _index(stage, parameter, loss)
     _expect_identifiable(stage, information, j)
-    size = -np.log1p(-loss)
-
-    def power_of_one(duration: float) -> float:
-        return test.power(size, _change_std(information, j, duration, 1))
-
+    test = _OneSidedTest(information, j, -np.log1p(-loss), power, false_alarm)
     seconds = range(max(1, int(np.ceil(information.least_duration))), constants.LONGEST_LOG + 1)
-    place = bisect_left(seconds, power, key=power_of_one)
-    efforts = tuple(_effort(information, j, test, size, duration) for duration in durations)
+    place = bisect_left(seconds, power, key=lambda duration: test.power(duration, 1))
+    efforts = tuple(test.effort(duration) for duration in durations)
     shortest = seconds[place] if place < len(seconds) else None
     return Plan(parameter, loss, power, false_alarm, information.n_baseline, efforts, shortest)
 
 
 @dataclass(frozen=True, slots=True)
 class _OneSidedTest:
-    """One-sided test of a Gaussian estimate."""
+    """One-sided test of a change of one ln parameter by Gaussian estimates of logs."""
 
-    required: float
+    information: Identifiability
+    index: int  # of the parameter
+    size: float  # of the loss in the ln parameter
+    required: float  # power
     false_alarm: float
 
-    def __post_init__(self) -> None:
-        if not 0 < self.false_alarm < self.required < 1:
-            raise BadQuestion(
-                f"power {self.required:g} at false-alarm probability {self.false_alarm:g}: needed "
-                "0 < false alarm < power < 1, for example 0.95 at 0.01"
-            )
+    def std(self, duration: float, n_logs: int, n_baseline: int | None = None) -> float:
+        """Return the standard deviation of the change."""
+        noise = self.information.drift_variance(duration, n_logs, n_baseline)
+        return float(self.information.change_std(noise)[self.index])
 
-    def power(self, size: float, std: float) -> float:
-        """Return the probability to detect a loss of this size in ln parameter."""
-        return float(ndtr(size / std + ndtri(self.false_alarm)))
+    def power(self, duration: float, n_logs: int, n_baseline: int | None = None) -> float:
+        """Return the probability to detect the loss."""
+        std = self.std(duration, n_logs, n_baseline)
+        return float(ndtr(self.size / std + ndtri(self.false_alarm)))
 
-    def smallest_loss(self, std: float) -> float:
+    def smallest_loss(self, duration: float, n_logs: int) -> float:
         """Return the fraction lost that is detected with the required power."""
-        return float(-np.expm1(-std * (ndtri(self.required) - ndtri(self.false_alarm))))
+        gap = ndtri(self.required) - ndtri(self.false_alarm)
+        return float(-np.expm1(-self.std(duration, n_logs) * gap))
+
+    def effort(self, duration: float) -> Effort:
+        """Return what logs of one duration detect."""
+        if duration < self.information.least_duration:
+            return Effort(duration, None, "too-short")
+        counts = range(1, constants.MOST_LOGS + 1)
+        place = bisect_left(counts, self.required, key=lambda n: self.power(duration, n))
+        hindrance: Hindrance = ""
+        if place == len(counts):
+            best = self.power(duration, constants.MOST_LOGS, constants.MOST_LOGS)
+            hindrance = "baseline" if best >= self.required else "parameters"
+        n_logs, many = None if hindrance else counts[place], self.information.n_baseline
+        noise = self.information.drift_variance(duration, many)
+        return Effort(
+            duration,
+            n_logs,
+            hindrance,
+            self.power(duration, 1),
+            self.smallest_loss(duration, 1),
+            self.smallest_loss(duration, many),
+            float(self.information.std(noise)[self.index]),
+        )
 
 
 def _index(stage: Stage, parameter: str, loss: float) -> int:
@@ -167,31 +191,3 @@ def _expect_identifiable(stage: Stage, information: Identifiability, j: int) -> 
         f"{100 * np.sqrt(information.prior[j]):.0f} % in the prior. Track a mode that depends on "
         "it more, or improve the map"
     )
-
-
-def _effort(
-    information: Identifiability, j: int, test: _OneSidedTest, size: float, duration: float
-) -> Effort:
-    if duration < information.least_duration:
-        return Effort(duration, None, "too-short")
-
-    std = partial(_change_std, information, j, duration)
-
-    counts = range(1, constants.MOST_LOGS + 1)
-    place = bisect_left(counts, test.required, key=lambda n: test.power(size, std(n)))
-    hindrance: Hindrance = ""
-    if place == len(counts):
-        best = test.power(size, std(constants.MOST_LOGS, constants.MOST_LOGS))
-        hindrance = "baseline" if best >= test.required else "parameters"
-    n_logs = None if hindrance else counts[place]
-    one, many = (test.smallest_loss(std(n)) for n in (1, information.n_baseline))
-    noise = information.drift_variance(duration, information.n_baseline)
-    value_std = float(information.std(noise)[j])
-    return Effort(duration, n_logs, hindrance, test.power(size, std(1)), one, many, value_std)
-
-
-def _change_std(
-    information: Identifiability, j: int, duration: float, n_logs: int, baseline: int | None = None
-) -> float:
-    noise = information.drift_variance(duration, n_logs, baseline)
-    return float(information.change_std(noise)[j])

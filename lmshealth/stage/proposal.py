@@ -1,20 +1,23 @@
-"""Column map proposed from a log: which columns are times, following error, accelerations.
+"""Files proposed from a log: its column map, and a stage description of the modes found in it.
 
-Names and units decide first, the samples where neither does. Every guess has its reason.
+For a column names and units decide first, the samples where neither does, each with the reason.
 """
 
+import glob
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from datetime import datetime
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from lmshealth._arrays import FloatArray
+from lmshealth._files import write_text
 from lmshealth._toml import quoted
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.formats.content import Content
@@ -23,6 +26,7 @@ from lmshealth.io.formats.text_layouts import LOCAL_TIME
 from lmshealth.io.log import Log
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
+from lmshealth.stage.description import ModeSpec
 
 # Words in the names of columns, in the languages of exporters, and units of times in names.
 _TIME = re.compile(
@@ -51,6 +55,8 @@ _DATE = re.compile(
     r"(?:[-_T ]?(?P<h>[01]\d|2[0-3])[-_.:h]?(?P<min>[0-5]\d)(?:[-_.:]?(?P<s>[0-5]\d))?)?(?!\d)"
 )
 _DEPTH = 3  # of structs in structs
+# Widest search of a mode, in relative distances of neighbouring modes, and its least value.
+_NEIGHBOURS, _LEAST_SEARCH = 2.0, 0.02
 _UNIT = re.compile(r"(?P<name>.+) \[(?P<unit>[^\]]*)\]")
 
 
@@ -255,3 +261,30 @@ def _lines(label: str, content: Content, guesses: list[Guess], rate: float | Non
     if content.guessed:
         yield f"\n[csv]  # found in the file: {listed(content.guessed)}"
     yield ""
+
+
+def searches(frequencies: Sequence[float]) -> list[float]:
+    """Return the search of each mode, ascending in Hz: the default, less near a neighbour."""
+    gaps = [np.inf, *(float(np.log(high / low)) for low, high in pairwise(frequencies)), np.inf]
+    nearest = [min(pair) for pair in pairwise(gaps)][: len(frequencies)]
+    most = ModeSpec("", 1.0, 0.01).search
+    return [min(most, max(_LEAST_SEARCH, _NEIGHBOURS * gap)) for gap in nearest]
+
+
+def write_skeleton(
+    path: Path, source: str, stage: str | None, modes: Sequence[tuple[ModeSpec, str]]
+) -> None:
+    """Write a description of modes, each with a comment, that `load_stage` reads as it is.
+
+    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. A file that
+    exists is replaced. `BadStage` if there is no mode, `BadTable` if it cannot be written.
+    """
+    if not modes:
+        raise BadStage(f"{path} is not written: a description needs at least one mode; none found")
+    from jinja2 import Template  # late: only this needs it
+
+    layout = (Path(__file__).parent / "descriptions" / "skeleton.toml.j2").read_text("utf-8")
+    template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
+    machines = glob.escape(stage) if stage else "*"
+    given = {"name": path.stem, "source": source, "stage": machines, "modes": modes}
+    write_text(path, template.render(given, quoted=quoted))

@@ -5,11 +5,12 @@ that are cut off, and allocates without bound for lines and quotes that do not e
 """
 
 import codecs
+import math
 import re
-import tempfile
 import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from importlib.metadata import version
@@ -24,7 +25,7 @@ from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
-from lmshealth.io.formats.unit_channels import choose, present
+from lmshealth.io.formats.unit_channels import choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
@@ -37,6 +38,12 @@ _HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
 _ROWS = 1 << 16
 _FIELDS = 1 << 18
 _NO_ROWS = "a header line and no rows; needed rows"
+# Lines of a LabVIEW measurement that are no rows, and those of them that all segments share.
+_MAY_BE_MIXED = re.compile(rb"\n[A-Za-z*\r\n]")
+_NO_ROW = re.compile(rb"^(?:[A-Za-z*][^\n]*|[ \t\r]*)\n", re.MULTILINE)
+_SEGMENT = re.compile(
+    rb"^(X_Value|Channels|Y_Unit_Label|Delta_X)(?:[\t,]([^\n]*)|\r?$)", re.MULTILINE
+)
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # The last row of some exports.
@@ -58,27 +65,24 @@ _DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
 class Text:
     """A text file, read by lines and then by blocks, and checked on the way.
 
-    The stream is seekable and decompressed; ``stored`` bytes on disk limit its size. From
-    ``position`` on, the byte that is read next, every row has ``n_fields`` (0 where no rows have
-    begun); ``pending`` counts the bytes since the last complete row.
+    The stream is decompressed; ``stored`` bytes on disk limit its size. From ``position`` on, the
+    byte that is read next, every row has ``n_fields`` (0 where no rows have begun); ``pending``
+    counts the bytes since the last complete row.
     """
 
-    def __init__(self, stream: IO[bytes], stored: int) -> None:
+    def __init__(self, stream: Any, stored: int) -> None:
         self._stream = stream
         self._stored = stored
-        self.begin_rows(",", 0)
-        self.seek(0)
+        self.begin()
 
-    def seek(self, position: int) -> None:
-        """Go to the beginning of a line, a former `position`."""
-        self._stream.seek(position)
-        self.position = position
-        self.pending = 0
+    def begin(self, n_lines: int = 0, delimiter: str = ",", n_fields: int = 0) -> None:
+        """Go behind the first lines, from where on rows are expected."""
+        self._stream.seek(0)
+        self.position = self.pending = self.n_fields = 0
         self._tail = b""  # bytes after the last line feed
         self._ahead = b""  # the block that is read next
-
-    def begin_rows(self, delimiter: str, n_fields: int) -> None:
-        """Expect rows from here on."""
+        for _ in range(n_lines):
+            self.line()
         self._delimiter, self.n_fields = delimiter, n_fields
 
     def line(self) -> bytes:
@@ -136,129 +140,103 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
 
     What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
     """
-    head = stream.read(_HEAD_BYTES)
-    encoding = columns.csv.encoding or encoding_of(head)
-    stream.seek(0)
-    if head.startswith(_LABVIEW) and _may_have_segments(stream, head):
-        with _one_segment(stream, stored) as whole:
-            return _parsed(Text(whole, stored), encoding, columns)
+    start = stream.read(_HEAD_BYTES)
+    encoding = columns.csv.encoding or encoding_of(start)
+    guessed = [f"{encoding} text"] if encoding != "utf-8" else []
+    if start.startswith(_LABVIEW):
+        stream = _Measurement(stream, start)
     if encoding.startswith(("utf-16", "utf-32")):
-        with _recoded(stream, stored, encoding) as recoded:
-            return _parsed(Text(recoded, 4 * stored), encoding, columns)
-    return _parsed(Text(stream, stored), encoding, columns)
-
-
-def _parsed(text: Text, encoding: str, columns: ColumnMap) -> Content:
-    """Find the dialect of a text, and read its wanted columns."""
-    head = _head(text, "utf-8" if encoding.startswith(("utf-16", "utf-32")) else encoding)
-    lines = [line for _, line in head]
+        stream, stored = codecs.EncodedFile(stream, "utf-8", encoding), 4 * stored
+        encoding = "utf-8"
+    text = Text(stream, stored)
+    lines = _head(text, encoding)
     if lines and lines[0].startswith("DIAEXTENDED"):
         detail = "the header of a DIAdem file, whose numbers are in others"
         raise Unusable("format", f"{detail}; export the data as TDMS or CSV")
     stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
     dialect = stated or find_dialect(lines, columns)
-    guessed = (*([f"{encoding} text"] if encoding != "utf-8" else []), *dialect.guessed)
-    chosen, names = choose(dialect.channels, columns), present(dialect.channels)
-    metadata, samples = chosen.metadata | dialect.metadata, dict[str, Samples]()
-    if chosen.columns:
-        text.seek(head[dialect.start][0] if dialect.start < len(head) else text.position)
-        text.begin_rows(dialect.delimiter, len(dialect.channels))
-        times = {c: _unit_of(target, columns) for c in chosen.columns
+    guessed += dialect.guessed
+    chosen, content = choose(dialect.channels, columns)
+    metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
+    if chosen:
+        times = {c: columns.signal(target).factor for c in chosen
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
-        samples = _numbers(text, chosen.columns, dialect, times)
+        samples = _numbers(text, chosen, dialect, times)
         for name, unit in times.items():
             samples[name], ticks, moment = _since_first(samples[name], unit)
-            guessed, metadata = (*guessed, *ticks), moment | metadata
-    return Content(samples, metadata, names, chosen.refused, guessed)
+            guessed, metadata = [*guessed, *ticks], moment | metadata
+    elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
+        text.begin(dialect.start)
+        while stream.read(_HEAD_BYTES):
+            pass
+    return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
-def _may_have_segments(stream: IO[bytes], head: bytes) -> bool:
-    """Return whether there are further headers, or more lines than samples; rewind the stream."""
-    n_head = head.count(b"\n", 0, head.find(b"\nX_Value") + 2)
-    samples = re.search(rb"^Samples([\t\d]*)", head, re.MULTILINE)
-    most = max(map(int, samples[1].split()), default=0) if samples else 0
-    n_lines = n_heads = 0
-    for block in iter(partial(stream.read, 1 << 20), b""):
-        n_lines += block.count(b"\n")
-        # A header that two blocks share has more lines than samples too.
-        n_heads += block.count(b"***End_of_Header***")
-    stream.seek(0)
-    return n_heads > 2 or n_lines > n_head + most + 1
-
-
-def _one_segment(stream: IO[bytes], stored: int) -> IO[bytes]:
-    """Copy a LabVIEW measurement without the headers of its later segments.
+class _Measurement:
+    """A LabVIEW measurement, of which `read` leaves out the headers of later segments.
 
     `Unusable` (``format``) for segments without X values, which place them in time, with or without
     headers of their own, and for segments of other channels.
     """
-    file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
-    kept: dict[bytes, bytes] = {}
-    begun, size, left = False, 0, -1
-    try:
-        for number, line in enumerate(iter(partial(stream.readline, constants.LONGEST_LINE), b"")):
-            key, _, rest = line.rstrip().partition(b"\t")
-            further = begun and (key[:1].isalpha() or key.startswith(b"*"))
-            timed = kept.get(b"X_Columns") == b"One"
-            if not begun:
-                kept[key] = rest
-                if begun := key == b"X_Value":
-                    counts = [int(word) for word in kept.get(b"Samples", b"").split()]
-                    left = -1 if timed else max(counts, default=-1)
-            elif not line.strip() or further:
-                fixed = further and key in (b"X_Value", b"Channels", b"Y_Unit_Label", b"Delta_X")
-                if fixed and (kept.get(key) != rest or not timed):
-                    raise _segment(number, f"{key.decode('cp1252')} {rest.decode('cp1252')}")
-                continue
-            elif (left := left - 1) == -1:
-                raise _segment(number, "more rows than Samples states")
-            size += file.write(line)
-            check_size(size, stored)
-    except BaseException:
-        file.close()
-        raise
-    file.seek(0)
-    return file
+
+    def __init__(self, stream: IO[bytes], start: bytes) -> None:
+        self._stream = stream
+        header = start[: start.find(b"\nX_Value") + 1]
+        names = start[len(header) :].split(b"\n", 1)[0]
+        separator = b"," if b"\nSeparator," in header else b"\t"
+        pairs = (line.rstrip().partition(separator) for line in (*header.splitlines(), names))
+        self._keys = {key: value for key, _, value in pairs}
+        self._is_timed = self._keys.get(b"X_Columns") == b"One"
+        self.readline = stream.readline
+        self.seek(0)
+
+    def seek(self, position: int) -> None:
+        """Go to the beginning."""
+        self._stream.seek(position)
+        sizes = re.findall(rb"\d+", self._keys.get(b"Samples", b""))
+        self._n_left = math.inf if self._is_timed or not sizes else max(map(int, sizes))
+
+    def read(self, size: int) -> bytes:
+        """Read rows of about so many bytes."""
+        rows = b""
+        while not rows and (block := self._stream.read(size)):
+            block += self.readline(constants.LONGEST_LINE)
+            rows = block
+            if _MAY_BE_MIXED.search(b"\n" + block):  # it is quick; most blocks are rows alone
+                rows = _NO_ROW.sub(b"", block)
+                for found in _SEGMENT.finditer(block):
+                    key, value = found[1], found[2].rstrip()
+                    if self._keys.get(key) != value or not self._is_timed:
+                        text = f"{key.decode()} {value.decode('cp1252')}"
+                        raise self._refusal(-block.count(b"\n", found.start()), text)
+            if self._n_left < math.inf:
+                self._n_left -= rows.count(b"\n")
+            if self._n_left < 0:
+                raise self._refusal(int(self._n_left), "more rows than Samples states")
+        return rows
+
+    def _refusal(self, n_more: int, found: str) -> Unusable:
+        """Name a line by its distance from the present one."""
+        end = self._stream.tell()
+        self._stream.seek(0)
+        line = self._stream.read(end).count(b"\n") + n_more + 1
+        needed = "needed X_Columns One, and the same channels in all segments"
+        return Unusable("format", f"line {line}: a further segment, {found}; {needed}")
 
 
-def _segment(number: int, found: str) -> Unusable:
-    needed = "needed X_Columns One, and the same channels in all segments"
-    return Unusable("format", f"line {number + 1}: a further segment, {found}; {needed}")
-
-
-def _recoded(stream: Any, stored: int, encoding: str) -> IO[bytes]:
-    """Copy a text to a temporary file as UTF-8."""
-    file, n_written = tempfile.TemporaryFile(prefix="lmshealth-"), 0  # noqa: SIM115
-    try:
-        reader = codecs.getreader(encoding)(stream)
-        while block := reader.read(_HEAD_BYTES):
-            n_written += file.write(block.removeprefix("\ufeff").encode())
-            check_size(n_written, stored)
-    except BaseException as error:
-        file.close()
-        if isinstance(error, UnicodeError):
-            raise corrupt(f"is no {encoding} text: {error}") from error
-        raise
-    file.seek(0)
-    return file
-
-
-def _head(text: Text, encoding: str) -> list[tuple[int, str]]:
-    """Read the first lines, each with the position of its beginning."""
-    head: list[tuple[int, str]] = []
-    while text.position < _HEAD_BYTES and len(head) < _HEAD_LINES:
-        start = text.position
-        if not (line := text.line()):
-            break
-        head.append((start, line.removeprefix(_BOM).decode(encoding, "replace")))
+def _head(text: Text, encoding: str) -> list[str]:
+    """Read the first lines."""
+    head: list[str] = []
+    while text.position < _HEAD_BYTES and len(head) < _HEAD_LINES and (line := text.line()):
+        head.append(line.removeprefix(_BOM).decode(encoding, "replace"))
     return head
 
 
 @cache
-def _exact_numbers() -> dict[str, Any]:
-    """Return options of pandas for numbers to the last digit, which its default is from 3.1 on."""
+def _is_old_pandas() -> bool:
+    """Return whether pandas is older than 3.1."""
     major, minor = version("pandas").split(".")[:2]
-    return {} if (int(major), int(minor)) >= (3, 1) else {"float_precision": "round_trip"}
+    return (int(major), int(minor)) < (3, 1)
 
 
 def _numbers(
@@ -271,11 +249,11 @@ def _numbers(
     """
     import pandas as pd
 
-    start = text.position
+    begin = partial(text.begin, dialect.start, dialect.delimiter, len(dialect.channels))
+    begin()
     # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas pull
-    # request 66944): a spare column receives it.
-    major, minor = pd.__version__.split(".")[:2]
-    n_spare = int((int(major), int(minor)) < (3, 1))
+    # request 66944): a spare column receives it. It also rounds the last digits of numbers.
+    n_spare = int(_is_old_pandas())
     read = partial(
         pd.read_csv,
         text,
@@ -285,7 +263,7 @@ def _numbers(
         encoding_errors="replace",
         header=None,
         names=list(range(text.n_fields + n_spare)),
-        **_exact_numbers(),
+        float_precision="round_trip" if _is_old_pandas() else None,
         index_col=False,
         # A block is small enough as a whole.
         low_memory=False,
@@ -298,13 +276,12 @@ def _numbers(
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
             numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places, {}, {})
+            return _spooled(partial(read, dtype=numbers), text, places, {})
         except (ValueError, pd.errors.ParserWarning):
             # Half as fast, but accepts blanks and locates the fault.
-            text.seek(start)
+            begin()
         try:
-            careful = partial(read, skipinitialspace=True)
-            return _spooled(careful, text, places, times, dict.fromkeys(times, None))
+            return _spooled(partial(read, skipinitialspace=True), text, places, times)
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
@@ -314,14 +291,11 @@ def _numbers(
 
 
 def _spooled(
-    read: Callable[[], Any],
-    text: Text,
-    places: dict[str, int],
-    times: Mapping[str, float],
-    first: dict[str, Any],
+    read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, float]
 ) -> dict[str, Samples]:
-    """Read the rows block by block; ``first`` receives the first moments of its columns."""
+    """Read the rows block by block."""
     n_rows = n_blank = 0
+    first: dict[str, Any] = {}  # moments
     taken = {name: Spool() for name in places}
     with read() as tables:
         for table in tables:
@@ -336,10 +310,10 @@ def _spooled(
                 n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
                 values = table[place]
-                if values.dtype.kind not in "fiu" and name in first:
+                if values.dtype.kind not in "fiu" and name in times:
                     values = _moments(values)
-                    first[name] = values.min() if first[name] is None else first[name]
-                    values = (values - first[name]).dt.total_seconds() / times[name]
+                    since = values - first.setdefault(name, values.min())
+                    values = since.dt.total_seconds() / times[name]
                 if values.dtype.kind not in "fiu":
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
                 if n_used:
@@ -359,14 +333,6 @@ def _moments(values: Any) -> Any:
     day_first = bool(values.astype(str).str.match(r"\d{1,2}\.").any())
     text = values.astype(str).str.replace(",", ".") if values.dtype == object else values
     return pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
-
-
-def _unit_of(target: str, columns: ColumnMap) -> float:
-    """Return the unit of a column of times in s; 1 where it has none, which is refused later."""
-    try:
-        return columns.signal(target).factor
-    except Unusable:
-        return 1.0
 
 
 def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:

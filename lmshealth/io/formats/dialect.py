@@ -117,7 +117,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     heads = [] if stated else list(_heads(lines[: found.first], skip, found))
     if layout.delimiter is None and layout.decimal is None:
         title = next((line.strip() for line in reversed(lines[skip : found.first])), "")
-        if found.n_fields == 2 and found.delimiter == "," and _is_one_name(title, columns):
+        is_pair = found.n_fields == 2 and found.delimiter == ","
+        if is_pair and "," not in title and columns.target(title) is not None:
             # One name over rows such as "1,5".
             found = found._replace(delimiter=";", decimal=",", n_fields=1)
             heads = list(_heads(lines[: found.first], skip, found))
@@ -303,8 +304,3 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
         (where is None and layout.header is None, _UNNAMED),
     ]
     return tuple(text for differs, text in listed if differs)
-
-
-def _is_one_name(title: str, columns: ColumnMap) -> bool:
-    """Return whether a line is the name of a single wanted column."""
-    return "," not in title and columns.target(title) is not None

@@ -68,7 +68,6 @@ class _Samples(msgspec.Struct, tag=True):
     column: int  # its number
     dtype: str
     size: Annotated[int, msgspec.Meta(ge=0)]
-    expected: int  # of the whole column
 
 
 class _Content(msgspec.Struct, tag=True):
@@ -190,8 +189,7 @@ class _Reader:
             if dtype.kind not in "fiu":
                 raise ValueError(f"samples are of type {dtype}")
             part = np.frombuffer(self._window, dtype, answer.size)
-            spool = spools.setdefault(answer.column, Spool(answer.expected))
-            spool.append(part if spool.expected else part.copy())
+            spools.setdefault(answer.column, Spool()).append(part)
             requests.write(b"\n")
             requests.flush()
 
@@ -281,7 +279,7 @@ def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
         for start in range(0, block.size, place.size):
             part = block[start : start + place.size]
             place[: part.size] = part
-            write(_Samples(number, block.dtype.str, part.size, spool.expected))
+            write(_Samples(number, block.dtype.str, part.size))
             answers.flush()
             sys.stdin.buffer.read(1)
 

@@ -10,6 +10,7 @@ memory.
 import re
 from collections.abc import Iterator
 from contextlib import suppress
+from dataclasses import replace
 from importlib import import_module
 from math import prod
 from pathlib import Path
@@ -22,7 +23,6 @@ from lmshealth.io.buffers import Samples, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, check_size, not_numeric
 from lmshealth.io.formats.unit_channels import Described, choose, rate_of
-from lmshealth.io.formats.unit_channels import present as present_channels
 from lmshealth.io.metadata import KEYS
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
@@ -48,10 +48,9 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     chosen = _chosen(names, columns)
     stored, n_samples = path.stat().st_size, 0
     if not chosen - set(KEYS) and (channels := _testlab(path, variables, max_memory)):
-        described = [channel for channel, _ in channels]
-        found = choose(described, columns)
-        samples = {name: as_samples(channels[k][1]) for name, k in found.columns.items()}
-        return Content(samples, found.metadata, present_channels(described), found.refused)
+        found, content = choose([channel for channel, _ in channels], columns)
+        samples = {name: as_samples(channels[k][1]) for name, k in found.items()}
+        return replace(content, columns=samples)
     read: dict[str, Samples] = {}
     metadata: dict[str, str] = {}
     present: list[str] = []

@@ -33,7 +33,7 @@ FORMATS: tuple[Format, ...] = (
     *(gzipped(CSV, TEXT_SUFFIXES), *map(gzipped, (RTX, TRACE, UFF))),
     *(RTX, TRACE, UFF, CSV),
 )
-SUFFIXES: tuple[str, ...] = tuple(sorted(s for form in FORMATS for s in form.suffixes))
+SUFFIXES = tuple(sorted(suffix for form in FORMATS for suffix in form.suffixes))
 GROUP = "lmshealth.formats"
 
 _HEAD = 4096
@@ -70,8 +70,7 @@ def _loaded(point: EntryPoint, others: list[Format]) -> Format:
 
 def is_log(path: Path) -> bool:
     """Return whether a file of a folder has the suffix of a log."""
-    name = path.name.lower()
-    return name.endswith(SUFFIXES) or any(name.endswith(form.suffixes) for form in plug_ins())
+    return not path.name.lower().endswith(TEXT_SUFFIXES) and format_of(path) is not None
 
 
 def format_of(path: Path) -> Format | None:

@@ -9,6 +9,7 @@ import re
 import struct
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +26,7 @@ from lmshealth.io.formats.content import (
     library,
     not_numeric,
 )
-from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
+from lmshealth.io.formats.unit_channels import Described, choose, rate_of
 from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
@@ -54,20 +55,18 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         channels = [channel for group in file.groups() for channel in group.channels()]
         _check_sizes(channels, sum(segments))
         _check_scales(one.properties for one in (file, *file.groups(), *channels))
-        described = _described(channels)
-        chosen = choose(described, columns)
-        wanted = {name: channels[k] for name, k in chosen.columns.items()}
+        chosen, content = choose(_described(channels), columns)
+        wanted = {name: channels[k] for name, k in chosen.items()}
         read = _read(file, wanted, path.stat().st_size)
         stamps = None if "time_s" in read else _stamps(path, [c.path for c in wanted.values()])
-        if stamps is not None:
-            # The increment of a channel is that of its last segment.
-            read["time_s"] = stamps
-            chosen.metadata.clear()
+        # The increment of a channel is that of its last segment.
+        clock = content.metadata if stamps is None else {}
+        read |= {} if stamps is None else {"time_s": stamps}
         starts = [channel.properties.get("wf_start_time") for channel in wanted.values()]
         own = {key: as_text(file.properties[key]) for key in KEYS if key in file.properties}
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
-    metadata = ({} if start is None else {"recorded_at": as_text(start)}) | chosen.metadata | own
-    return Content(read, metadata, present(described), chosen.refused)
+    metadata = ({} if start is None else {"recorded_at": as_text(start)}) | clock | own
+    return replace(content, columns=read, metadata=metadata)
 
 
 def _segments(path: Path) -> list[int]:

@@ -6,6 +6,7 @@ and pairs tags wrongly where a line of another data set ends like one.
 
 import re
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -16,7 +17,7 @@ from lmshealth._arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
-from lmshealth.io.formats.unit_channels import Described, choose, present, rate_of
+from lmshealth.io.formats.unit_channels import Described, choose, rate_of
 from lmshealth.io.refusal import Unusable, corrupt
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")
@@ -49,10 +50,10 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         file = _File(path, Path(folder), max_memory)
         names = _names(file.headers)
         described = [_describe(*named) for named in zip(file.headers, names, strict=True)]
-        chosen = choose(described, columns)
+        chosen, content = choose(described, columns)
         read: dict[str, Samples] = {}
         stamps: dict[str, Samples] = {}
-        for name, k in chosen.columns.items():
+        for name, k in chosen.items():
             header = file.headers[k]
             if not _is_time_record(header):
                 kind = header["func_type"]
@@ -67,7 +68,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             detail = "the records have different time stamps; needed the same for all"
             raise Unusable("time", detail)
         read["time_s"] = first
-    return Content(read, chosen.metadata, present(described), chosen.refused)
+    return replace(content, columns=read)
 
 
 class Function(NamedTuple):

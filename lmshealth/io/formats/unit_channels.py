@@ -2,11 +2,12 @@
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
+from lmshealth.io.formats.content import Content
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, listed
 
@@ -29,21 +30,12 @@ class Described:
     start: float = 0.0
 
 
-@dataclass(frozen=True, slots=True)
-class Chosen:
-    """Channels that make the log: name as a column of the log to the index in the file.
-
-    ``metadata`` holds their sample rate, where there is one; channels of another one, or of another
-    start, are refused.
-    """
-
-    columns: dict[str, int]
-    metadata: dict[str, str]
-    refused: tuple[Refusal, ...]
-
-
-def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
+def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str, int], Content]:
     """Choose the channels of one sample rate that the contract or the column map names.
+
+    Return the index in the file of each by its name as a column of the log, and a content that has
+    their sample rate, the names of all channels, and refusals, but no samples. Channels of another
+    rate or start are refused.
 
     Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
     with it, the named ones and those that keep the contract. Two channels that would be one column
@@ -81,17 +73,13 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> Chosen:
             refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
     metadata = {} if rate is None else {"sample_rate_hz": f"{rate:.10g}"}
-    return Chosen(kept, metadata, tuple(refused.values()))
+    present = tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels)
+    return kept, Content({}, metadata, present, tuple(refused.values()))
 
 
 def _agree(one: float, other: float) -> bool:
     """Return whether two sample rates agree."""
     return abs(one / other - 1) <= constants.AGREEMENT
-
-
-def present(channels: Iterable[Described]) -> tuple[str, ...]:
-    """List all channels with their units, for messages."""
-    return tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels)
 
 
 def rate_of(interval: object) -> float | None:

@@ -6,6 +6,7 @@ convention of the cross spectrum from a public sample with its time series.
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from xml.etree.ElementTree import Element, ParseError, iterparse, parse
@@ -17,7 +18,7 @@ from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size
 from lmshealth.io.formats.uff import Function
-from lmshealth.io.formats.unit_channels import Described, choose, present
+from lmshealth.io.formats.unit_channels import Described, choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 _RTX, _RTX_DATA, _RTX_END = b"HEADER::", b"Data:\r\n", b"EOF::"
@@ -43,10 +44,10 @@ def _load_rtx(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     if (end - start) % 8:
         raise corrupt(f"{end - start} bytes of data are no whole number of float64 values")
     rate = header.get("Actual sample rate", header.get("Sample rate", ""))
-    chosen = choose([Described("data", "")], columns)
+    chosen, content = choose([Described("data", "")], columns)
     values = as_samples(np.frombuffer(data[start:end], dtype="<f8"))
     metadata = {"sample_rate_hz": rate.strip()} if rate.strip() else {}
-    return Content(dict.fromkeys(chosen.columns, values), metadata, ("data",))
+    return replace(content, columns=dict.fromkeys(chosen, values), metadata=metadata)
 
 
 def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -54,19 +55,20 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     names: list[str] = []
     spools: dict[str, Spool] = {}
     records, n_rows = _records(path, names), 0
-    channels = [Described("time", "s")]
+    content = Content({}, {}, ())
     while rows := list(islice(records, _ROWS)):
         table = np.array(rows)
         table[np.abs(table) > _NO_VALUE] = np.nan
-        channels = [channels[0], *(Described(name, "") for name in names)]
-        for name, k in choose(channels, columns).columns.items():
+        channels = [Described("time", "s"), *(Described(name, "") for name in names)]
+        chosen, content = choose(channels, columns)
+        for name, k in chosen.items():
             spools.setdefault(name, Spool()).append(table[:, k])
         n_rows += len(rows)
         check_size(8 * n_rows * len(spools), path.stat().st_size)
     if not n_rows:
         detail = "no records (rec) of a trace; measured responses are read by `lmshealth frf`"
         raise Unusable("columns", detail)
-    return Content({name: one.samples() for name, one in spools.items()}, {}, present(channels))
+    return replace(content, columns={name: one.samples() for name, one in spools.items()})
 
 
 def _records(path: Path, names: list[str]) -> Iterator[list[float]]:

@@ -130,9 +130,16 @@ def test_labview_of_several_segments(tmp_path):
     path.write_text(LVM_HEAD.format("No") + lvm("No", ["\t1\t2"] * 401))
     with pytest.raises(BadLog, match="line 413: a further segment, more rows than Samples"):
         read_log(path)
-    path.write_text(LVM_HEAD.format("One") + parts[0] + parts[1].replace("pitch", "yaw"))
-    with pytest.raises(BadLog, match="same channels in all"):
+    path.write_text(path.read_text().replace("g\tm/s^2", "V\tV"))  # no signal
+    with pytest.raises(BadLog, match="line 413: a further segment, more rows than Samples"):
         read_log(path)
+    for separator in "\t,":
+        changed = LVM_HEAD.format("One") + parts[0] + parts[1].replace("pitch", "yaw")
+        path.write_text(changed.replace("Tab", "Comma").replace("\t", separator))
+        with pytest.raises(BadLog, match="same channels in all"):
+            read_log(path)
+    path.write_text((LVM_HEAD.format("One") + "".join(parts)).replace("\t", ","))
+    np.testing.assert_array_equal(read_log(path).channels[1].values, log.channels[1].values)
     path.write_text(LVM_HEAD.format("One") + parts[0] + parts[0])
     with pytest.raises(BadLog, match="time"):
         read_log(path)
