@@ -19,13 +19,13 @@ pytest_plugins = ["pytester", "tests.claims"]
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Begin with what takes longest, so that no worker ends long after the other.
 
-    These are studies, then other whole chains, which stand beside them, then statistical tests.
+    These are statistical tests, then studies, then other whole chains, which stand beside them.
     """
     items.sort(
         key=lambda item: (
+            item.get_closest_marker("statistical") is None,
             item.path.name != "test_studies.py",
             item.path.parent != ROOT / "tests",
-            item.get_closest_marker("statistical") is None,
         )
     )
 
