@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo notebooks picture check test slow studies coverage statistics bench fuzz compat lock locked sbom clean
+.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz compat lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -36,12 +36,17 @@ check: .venv/installed
 	$(BIN)/lint-imports
 
 # Tests run in parallel processes: one thread each for linear algebra.
-test slow studies coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
-test slow studies coverage statistics bench: export OMP_NUM_THREADS = 1
+test long slow studies coverage statistics bench: export OPENBLAS_NUM_THREADS = 1
+test long slow studies coverage statistics bench: export OMP_NUM_THREADS = 1
 # Tests start many programs: let them share compiled byte code.
 unexport PYTHONDONTWRITEBYTECODE
 test: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "not slow and not study and not statistical"
+
+# `make studies slow statistics` in one run: tests are collected once, and no processor waits for
+# the last test of each.
+long: .venv/installed
+	$(BIN)/pytest -n 2 --dist worksteal -m "study or slow or statistical"
 
 # Quick forms of all studies: the questions of studies/README.md on few data.
 studies: .venv/installed

@@ -17,8 +17,17 @@ pytest_plugins = ["pytester", "tests.claims"]
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Begin with studies, which take longest: then no worker ends long after the other."""
-    items.sort(key=lambda item: item.path.name != "test_studies.py")
+    """Begin with what takes longest, so that no worker ends long after the other.
+
+    These are statistical tests, then studies, then other whole chains, which stand beside them.
+    """
+    items.sort(
+        key=lambda item: (
+            item.get_closest_marker("statistical") is None,
+            item.path.name != "test_studies.py",
+            item.path.parent != ROOT / "tests",
+        )
+    )
 
 
 def _missing(name: str) -> str | None:

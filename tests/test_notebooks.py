@@ -20,12 +20,25 @@ def test_a_notebook_has_a_question_and_its_limits(path: Path) -> None:
     assert f"[{path.stem}]({path.name})" in path.with_name("README.md").read_text(encoding="utf-8")
 
 
+# Chains of full length are those of the README and of the examples, see `test_examples`.
+QUICK = (
+    "from studies.harness.command_line import quick_posteriors\n"
+    "quick = quick_posteriors()\n"
+    "quick.__enter__()"
+)
+
+
 def executed(path: Path, root: Path) -> list[tuple[str, list[str]]]:
-    """Execute a notebook; return the source of its cells and the types of what they show."""
+    """Execute a notebook with quick posteriors; return its cells and the types of what they show.
+
+    The cells are given by their sources.
+    """
     import jupytext
     import nbclient
+    from nbformat.v4 import new_code_cell
 
     notebook = jupytext.read(path)
+    notebook.cells.insert(0, new_code_cell(QUICK))
     metadata = {"metadata": {"path": str(root)}}
     nbclient.NotebookClient(
         notebook, timeout=LONGEST_S, kernel_name="python3", resources=metadata
@@ -50,9 +63,9 @@ def test_a_notebook_runs(path: Path, root: Path, needs: Callable[[str], None]) -
 
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
-def test_a_cell_that_fails_is_seen(tmp_path: Path) -> None:
+def test_a_cell_that_fails_is_seen(tmp_path: Path, root: Path) -> None:
     """Control: a notebook with a false statement does not pass."""
     path = tmp_path / "wrong.py"
     path.write_text("# %%\nassert 1 + 1 == 3\n", encoding="utf-8")
     with pytest.raises(Exception, match="AssertionError"):
-        executed(path, tmp_path)
+        executed(path, root)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.util import module_from_spec, spec_from_file_location
@@ -40,14 +41,19 @@ TASKS = [("a", k) for k in range(5)] + [("b", 0)]
 
 
 @pytest.fixture
-def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Write a script as a module, and forget what was known of its code."""
+def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
+    """Write a script as a module, and forget what was known of all code."""
+
+    def forget() -> None:
+        for known in (
+            provenance._digest, provenance._tree, provenance._content, provenance._imported
+        ):  # fmt: skip
+            known.cache_clear()
 
     def write(text: str) -> ModuleType:
         path = tmp_path / "script.py"
         path.write_text(text)
-        for known in (provenance._digest, provenance._tree):
-            known.cache_clear()
+        forget()
         spec = spec_from_file_location("script_of_a_study", path)
         assert spec is not None and spec.loader is not None
         module = module_from_spec(spec)
@@ -55,7 +61,8 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
         spec.loader.exec_module(module)
         return module
 
-    return write
+    yield write
+    forget()
 
 
 def test_interrupted_goes_on(written: Any, tmp_path: Path) -> None:

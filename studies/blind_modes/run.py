@@ -36,14 +36,14 @@ from studies.blind_modes.worlds import FAMILIES, World, log_of
 from studies.common.cost import one_thread
 from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, span
-from studies.harness.study import Study, judge_scores, spawn_pool
+from studies.harness.study import Study, judge_scores
 
 STEP = "identify"
 
 # Records of each family, and those on which peers run, too.
 SEEDS = {"four modes": 64, "varied": 64, "eight modes": 40, "turbine": 16}
 PEER_SEEDS = {"four modes": 16, "varied": 16, "eight modes": 6, "turbine": 2}
-QUICK_SEEDS = 2
+QUICK_SEEDS = (1,)  # the first of the varied records is one of the longest
 RECALL = {"four modes": 0.99, "varied": 0.99, "eight modes": 0.97, "turbine": 0.97}
 MOST_FALSE = 0.05
 COVERED = 0.93, 0.97
@@ -63,19 +63,19 @@ NOT_MET = {
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does two records of each family and records nothing."""
+    """Run the study; ``--quick`` does one record of each family and records nothing."""
     study = Study(__file__, __doc__)
     os.environ.update(one_thread() | {"TQDM_DISABLE": "1"})
     peers = not study.quick and find_spec("pyoma2") and find_spec("pyOMA")
     if not (peers or study.quick):
         raise SystemExit("pyOMA-2 and pyoma-toolbox not installed: pip install '.[peers]'")
-    seeds = {name: QUICK_SEEDS if study.quick else n for name, n in SEEDS.items()}
+    seeds = {name: QUICK_SEEDS if study.quick else range(n) for name, n in SEEDS.items()}
     tasks = [
         (name, seed, bool(peers) and seed < PEER_SEEDS[name])
-        for name, n in seeds.items()
-        for seed in range(n)
+        for name, own in seeds.items()
+        for seed in own
     ]
-    with spawn_pool(1) as pool:
+    with study.pool(1) as pool:
         records = study.trials.collect(examine, tasks, pool=pool)
     families = {name: summarise([r for r in records if r["family"] == name]) for name in seeds}
     passed = verdicts(families)

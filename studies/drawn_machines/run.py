@@ -55,7 +55,7 @@ FIRST_SEED = 1000
 # Machines with all answers, healthy ones, per circumstance, raw, of the control; logs; raw logs.
 FULL = {"machines": 100, "healthy": 60, "each": 15, "raw": 8, "control": 16,
         "logs": 20, "raw_logs": 2, "seconds": 20.0}  # fmt: skip
-QUICK = {"machines": 2, "healthy": 3, "each": 0, "raw": 1, "control": 1,
+QUICK = {"machines": 1, "healthy": 3, "each": 0, "raw": 1, "control": 1,
          "logs": 8, "raw_logs": 1, "seconds": 6.0}  # fmt: skip
 # Lives in which no part wears, each with one thing that may look like it; the last two do change.
 CIRCUMSTANCES = (

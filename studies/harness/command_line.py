@@ -32,8 +32,7 @@ def call(program: str, *arguments: object, quick: bool, some_refused: bool = Fal
     """
     words = [str(word) for word in arguments]
     if quick:
-        importance_sampling = patch.object(prognosis_constants, "MIN_CHAIN_PROBABILITY", inf)
-        with short_chains(), importance_sampling, no_pictures():
+        with quick_posteriors(), no_pictures():
             return call_here(program, words, some_refused=some_refused)
     command = [sys.executable, "-m", program, *words]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=ROOT)
@@ -60,6 +59,13 @@ def call_here(program: str, words: Sequence[str], *, some_refused: bool = False)
 def _insist(status: int, some_refused: bool, command: str, messages: str) -> None:
     if status not in ((0, _SOME_REFUSED) if some_refused else (0,)):
         raise SystemExit(f"{command} ended with {status}: {messages}")
+
+
+@contextmanager
+def quick_posteriors() -> Iterator[None]:
+    """Sample health by short chains, and lives by importance sampling alone."""
+    with short_chains(), patch.object(prognosis_constants, "MIN_CHAIN_PROBABILITY", inf):
+        yield
 
 
 @contextmanager

@@ -54,7 +54,7 @@ def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
     roots = _imports(needed) | {_file(module.split(".")) for module in also}
     for module in sorted(_closure({root for root in roots if root is not None})):
         total.update(module.relative_to(PROJECT).as_posix().encode())
-        total.update(ast.dump(_tree(module)).encode())
+        total.update(_content(module))
     for package in ("lmshealth", "models"):
         for table in sorted((PROJECT / package).rglob("*")):
             if table.suffix in (".toml", ".csv"):
@@ -70,6 +70,11 @@ def _tree(path: Path) -> ast.Module:
         if isinstance(node, _DOCUMENTED) and ast.get_docstring(node):
             del node.body[0]
     return tree
+
+
+@cache
+def _content(path: Path) -> bytes:
+    return ast.dump(_tree(path)).encode()
 
 
 def _reached(tree: ast.Module, names: set[str]) -> list[ast.stmt]:
@@ -102,9 +107,14 @@ def _closure(roots: set[Path]) -> set[Path]:
         found.add(module)
         # Who imports from a package has all of it that it begins with.
         begun = {module.parent / "__init__.py"} - {_GATHERING}
-        left |= {path for path in begun if path.exists()} | _imports(_tree(module).body)
+        left |= {path for path in begun if path.exists()} | _imported(module)
         left -= found
     return found
+
+
+@cache
+def _imported(path: Path) -> set[Path]:
+    return _imports(_tree(path).body)
 
 
 def _imports(statements: Iterable[ast.stmt]) -> set[Path]:

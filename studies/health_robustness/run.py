@@ -102,6 +102,7 @@ FULL = {"kind": 20, "kind_law": 5, "kind_other": 1, "path": 100, "law": 60, "oth
 QUICK = {"kind": 1, "kind_law": 0, "kind_other": 0, "path": 8, "law": 1, "other": 0,
          "demo": 1, "plant_path": 0, "plants": 0, "maps": 0, "chains": 1, "sized": 0,
          "stages": 1, "every_kind": 5, "worlds": 1}  # fmt: skip
+QUICK_ARMS = (BARE, COHERENT)
 
 
 def drawn_lives(study: Study, n: dict[str, int], kept: Path | None) -> Row:
@@ -120,7 +121,7 @@ def drawn_lives(study: Study, n: dict[str, int], kept: Path | None) -> Row:
               for stage in stages for world in list(ARMS)[-n["worlds"] :]]  # fmt: skip
     parts = {
         "lives": each(partial(lives_of, sizes), kinds),
-        "fleets": each(partial(fleet_of, sizes), worlds),
+        "fleets": each(partial(fleet_of, sizes, arms=QUICK_ARMS if study.quick else None), worlds),
         "plants": each(partial(plants_of, sizes), [(n["plant_path"], n["plants"], n["maps"])]),
     }
     answer: Row = {

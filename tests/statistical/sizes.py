@@ -1,7 +1,9 @@
 """What every statistical test draws and claims, and how seldom the suite may fail without fault.
 
 This is the one place to make the suite longer or shorter. The number of claims is the number of
-p values that Holm's rule holds to `LEVEL` together, see `tests.claims`.
+p values that Holm's rule holds to `LEVEL` together, see `tests.claims`. A control has to be seen
+at the strictest level: 150 intervals of half the width, for example, have p < 1e-6 in all but one
+of a million runs.
 """
 
 from __future__ import annotations
@@ -23,13 +25,13 @@ _HEALTH = ("preload", "mount")
 
 TESTS = {
     # Readings of one log.
-    "test_lines_are_called_no_oftener_than_declared": Part(2000, ("false alarms",), control=200),
+    "test_lines_are_called_no_oftener_than_declared": Part(800, ("false alarms",), control=60),
     "test_slopes_over_velocity_cover": Part(80, ("slopes", "said to grow")),
     # Identification.
-    "test_intervals_from_one_record_cover": Part(1000, _both("one record")),
-    "test_intervals_from_short_moves_cover": Part(300, _both("short moves")),
-    "test_intervals_from_means_over_parts_cover": Part(400, _both("parts"), control=220),
-    "test_intervals_of_three_modes_in_three_channels_cover": Part(60, _both("three modes")),
+    "test_intervals_from_one_record_cover": Part(200, _both("one record")),
+    "test_intervals_from_short_moves_cover": Part(150, _both("short moves")),
+    "test_intervals_from_means_over_parts_cover": Part(150, _both("parts"), control=220),
+    "test_intervals_of_three_modes_in_three_channels_cover": Part(50, _both("three modes")),
     "test_intervals_cover_where_floors_share_the_force": Part(150, _both("common floor")),
     "test_intervals_of_joint_sources_cover": Part(300, _both("joint sources")),
     "test_intervals_from_stops_cover": Part(300, _both("stops")),
@@ -40,14 +42,14 @@ TESTS = {
         800, ("ln f", "ln ζ", "drift", "innovations")
     ),
     "test_intervals_of_the_tracker_cover": Part(
-        250,
+        160,
         tuple(
             f"{what}, {how}"
             for what in ("ln f", "ln ζ", "drift")
             for how in ("average of settings", "as published")
         ),
     ),
-    "test_a_second_source_does_no_harm": Part(60, ("drift, two sources",)),
+    "test_a_second_source_does_no_harm": Part(40, ("drift, two sources",)),
     "test_modes_that_cross_are_not_swapped": Part(30, ("swaps, named by order", "swaps, unnamed")),
     "test_healthy_lives_raise_no_alarms": Part(100, ("alarms",), control=10),
     "test_drifts_of_damaged_lives_cover": Part(100, ("drift, damaged lives",)),
@@ -55,7 +57,7 @@ TESTS = {
     "test_health_is_calibrated": Part(300, ("preload, grid", "mount, grid")),
     "test_chains_are_as_calibrated_as_grids": Part(10, ("chains",)),
     "test_ranks_at_epochs_of_tracks_are_uniform": Part(
-        200,
+        100,
         tuple(f"{name}, {stage}" for stage in ("lms-x", "lms-y") for name in _HEALTH),
         control=60,
     ),
@@ -64,7 +66,7 @@ TESTS = {
         36, ("shared preload", "mount of X beside it", "mount of Y beside it")
     ),
     # Laws and the remaining life.
-    "test_losses_by_laws_are_calibrated": Part(250, ("loss by the law", "health now")),
+    "test_losses_by_laws_are_calibrated": Part(150, ("loss by the law", "health now")),
     "test_health_off_its_law_is_calibrated": Part(250, ("health now, off its law",)),
     "test_ranks_of_whole_lives_are_uniform": Part(
         40,
@@ -92,6 +94,6 @@ TESTS = {
         ),
     ),
     "test_the_posterior_has_the_power_that_was_planned": Part(
-        400, ("power, posterior", "false alarms, posterior")
+        200, ("power, posterior", "false alarms, posterior")
     ),
 }
