@@ -494,6 +494,13 @@ def test_cost_of_a_log(root: Path) -> None:
     assert passed["an unchanged machine costs nothing"]
 
 
+def test_cost_of_a_log_of_a_fleet(root: Path) -> None:
+    """Nothing new costs nothing; lives by the prior of the fleet are those from nothing."""
+    passed = json.loads(run_study(root, "cost_of_a_log", "fleet"))["passed"]
+    names = ("nothing new", "some take the prior of the fleet", "lives are those from nothing")
+    assert all(passed[name] for name in names)
+
+
 def test_lifetimes_raw(root: Path) -> None:
     """From raw logs to the remaining life: a life of four logs is told, and not refused."""
     answer = json.loads(run_study(root, "lifetimes_raw"))

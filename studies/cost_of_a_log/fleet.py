@@ -38,13 +38,13 @@ from lmshealth.tracking.track import accepted_estimates
 from studies.cost_of_a_log.life import EPOCHS, apart, assess_and_report, machine_of
 from studies.cost_of_a_log.run import readings
 from studies.harness.claims import Claim, number
-from studies.harness.command_line import no_pictures
+from studies.harness.command_line import no_pictures, quick_posteriors
 from studies.harness.study import Row, Study
 
 STEP = "batch"
 
 KINDS = ("healthy", "both", "temperature-only")
-MACHINES, LOGS, QUICK_MACHINES, QUICK_LOGS = 12, 60, 4, 6
+MACHINES, LOGS, QUICK_MACHINES, QUICK_LOGS = 12, 60, 4, 5
 WORKERS, FLEET = 2, 1000
 # Machines whose lives are fitted from nothing for the comparison.
 COMPARED = 4
@@ -59,8 +59,9 @@ class Nights:
     fleet: Mapping[str, list[LogEstimates]]
     store: Store
     out: Path
-    epochs: int
     stage: Stage
+    epochs: int
+    workers: int
 
     def machine(self, name: str, n: int, stored: int | None = None) -> Machine:
         """Return a machine with its first logs, of which so many (or all) are stored already."""
@@ -80,7 +81,7 @@ class Nights:
 
         start, cpu = time.perf_counter(), _cpu_s()
         jobs = [self.machine(name, counts[name], stored[name]) for name in self.fleet]
-        assess_and_report(jobs, self.store, self.out, WORKERS, progress)
+        assess_and_report(jobs, self.store, self.out, self.workers, progress)
         progress("ended", 0, 0)
         spent = {"wall_s": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu}
         return {name: round(value, 2) for name, value in (spent | seconds).items()}
@@ -109,7 +110,7 @@ def _cpu_s() -> float:
     return sum(os.times()[:4])
 
 
-def nights(n_machines: int, n_logs: int, epochs: int, n_compared: int) -> Row:
+def nights(n_machines: int, n_logs: int, epochs: int, n_compared: int, workers: int) -> Row:
     """Run a fleet as often as the module's docstring has it."""
     fleet = {
         f"AX-{k}": [
@@ -123,7 +124,7 @@ def nights(n_machines: int, n_logs: int, epochs: int, n_compared: int) -> Row:
     with tempfile.TemporaryDirectory() as name:
         out = Path(name)
         with closing(Store(f"sqlite:///{out / 'store.sqlite'}")) as store:
-            own = Nights(fleet, store, out, epochs, load_stage("lms-y"))
+            own = Nights(fleet, store, out, load_stage("lms-y"), epochs, workers)
             names = ("first", "a new log of each", "a new log of one", "nothing new")
             runs = {
                 name: own.run(now, before)
@@ -138,10 +139,10 @@ def main() -> None:
     study = Study(__file__, __doc__)
     also = ("studies.cost_of_a_log.run",)
     if study.quick:
-        with no_pictures():
-            found = study.trials.once(nights, QUICK_MACHINES, QUICK_LOGS, 1, 1, also=also)
+        with quick_posteriors(), no_pictures():
+            found = study.trials.once(nights, QUICK_MACHINES, QUICK_LOGS, 1, 1, 1, also=also)
     else:
-        found = study.trials.once(nights, MACHINES, LOGS, EPOCHS, COMPARED, also=also)
+        found = study.trials.once(nights, MACHINES, LOGS, EPOCHS, COMPARED, WORKERS, also=also)
     runs, compared = found["runs"], found["compared"]
     cpu = {name: row["cpu_s"] for name, row in runs.items()}
     answer = found | {

@@ -113,8 +113,9 @@ def apart(one: Prognosis | None, other: Prognosis | None) -> float:
     for found in (one, other):
         travel = np.minimum(found.remaining[:, -1], found.horizon)
         means.append(travel.mean())
-        errors.append(travel.std() / np.sqrt(found.ess))
-    return float(abs(means[0] - means[1]) / max(np.hypot(*errors), 1e-9 * one.horizon))
+        # What no draw shows may have a probability of one effective draw.
+        errors.append(max(travel.std() / np.sqrt(found.ess), found.horizon / found.ess))
+    return float(abs(means[0] - means[1]) / np.hypot(*errors))
 
 
 if __name__ == "__main__":
