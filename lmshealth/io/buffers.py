@@ -14,8 +14,6 @@ from lmshealth.io.refusal import Unusable
 MINUTE = 1_200_000
 # Samples per block: small enough that temporary arrays stay in the processor's cache.
 BLOCK = 1 << 18
-# A column in memory has room for so many times what it held when it was full.
-_GROWTH = 8
 
 
 class Stored:
@@ -57,7 +55,7 @@ def blocks(
 
 
 class Spool:
-    """Collects the samples of one column in blocks.
+    """Collects the samples of one column in blocks; the number expected saves copies.
 
     The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
     ``send`` is set, in the process that reads for others, blocks go there and are not kept.
@@ -65,8 +63,9 @@ class Spool:
 
     send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
 
-    def __init__(self) -> None:
-        self._memory = np.empty(0)
+    def __init__(self, expected: int = 0) -> None:
+        self.expected = expected
+        self._memory = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
         self._file: IO[bytes] | None = None
         self.size = 0
 
@@ -82,8 +81,7 @@ class Spool:
                 self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
                 return
             if self.size > self._memory.size:
-                # Memory that is never written to costs nothing.
-                grown = np.empty(max(self.size, min(_GROWTH * start, MINUTE)))
+                grown = np.empty(max(self.size, 2 * start))
                 grown[:start] = self._memory[:start]
                 self._memory = grown
             self._memory[start : self.size] = block
@@ -121,7 +119,7 @@ def as_samples(values: np.ndarray) -> Samples:
 
 def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
     """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    spool = Spool()
+    spool = Spool(samples.size)
     for _, values in blocks(samples):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):

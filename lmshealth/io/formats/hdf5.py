@@ -31,7 +31,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
         metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
         check_size(8 * sum(dataset.size for dataset in chosen.values()), path.stat().st_size)
-        taken = {name: Spool() for name in chosen}
+        taken = {name: Spool(dataset.size) for name, dataset in chosen.items()}
         for name, dataset in chosen.items():
             # In parts of whole chunks: each is unpacked only once.
             chunk = dataset.chunks[0] if dataset.chunks else 1

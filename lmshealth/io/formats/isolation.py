@@ -68,6 +68,7 @@ class _Samples(msgspec.Struct, tag=True):
     column: int  # its number
     dtype: str
     size: Annotated[int, msgspec.Meta(ge=0)]
+    expected: int  # of the whole column
 
 
 class _Content(msgspec.Struct, tag=True):
@@ -189,7 +190,9 @@ class _Reader:
             if dtype.kind not in "fiu":
                 raise ValueError(f"samples are of type {dtype}")
             part = np.frombuffer(self._window, dtype, answer.size)
-            spools.setdefault(answer.column, Spool()).append(part)
+            if answer.column not in spools:
+                spools[answer.column] = Spool(answer.expected)
+            spools[answer.column].append(part)
             requests.write(b"\n")
             requests.flush()
 
@@ -279,7 +282,7 @@ def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
         for start in range(0, block.size, place.size):
             part = block[start : start + place.size]
             place[: part.size] = part
-            write(_Samples(number, block.dtype.str, part.size))
+            write(_Samples(number, block.dtype.str, part.size, spool.expected))
             answers.flush()
             sys.stdin.buffer.read(1)
 

@@ -37,7 +37,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         # Up to a minute at once, beyond it in blocks; nulls become NaN.
         size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
         batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
-        taken = {name: Spool() for name in chosen}
+        taken = {name: Spool(n_rows) for name in chosen}
         for batch in batches:
             for name, spool in taken.items():
                 spool.append(batch.column(name).to_numpy(zero_copy_only=False))
