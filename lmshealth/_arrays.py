@@ -1,6 +1,6 @@
 """Types of arrays, and checks of the arrays of frozen results."""
 
-from dataclasses import fields
+from collections.abc import Callable
 from typing import Any, Self
 
 import numpy as np
@@ -22,8 +22,8 @@ def freeze(result: Any, *shapes: tuple[str, *tuple[int, ...]]) -> None:
             found = getattr(result, name).shape
             if found != tuple(shape):
                 raise ValueError(f"{name} has shape {found}, needed {tuple(shape)}")
-    for item in fields(result):
-        value = getattr(result, item.name)
+    for name in result.__dataclass_fields__:
+        value = getattr(result, name)
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
 
@@ -44,9 +44,13 @@ class Rows:
 
     def __getitem__(self, chosen: Any) -> Self:
         """Return some of the rows, by index or mask."""
+        return self.with_each(lambda own: own[chosen])
+
+    def with_each(self, change: Callable[..., Any], *others: Any) -> Self:
+        """Return a function of each field, and of the same field of other objects."""
         own: Any = self
-        some: Self = type(own)(*(getattr(own, item.name)[chosen] for item in fields(own)))
-        return some
+        names, each = own.__dataclass_fields__, (self, *others)
+        return type(self)(*(change(*(getattr(one, name) for one in each)) for name in names))
 
 
 def stack(values: ComplexArray) -> FloatArray:

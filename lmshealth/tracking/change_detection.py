@@ -5,7 +5,7 @@ by their log Bayes factors, as the README of this folder describes; changes that
 only reduce the probability of a false alarm.
 """
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
@@ -40,34 +40,34 @@ def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> F
     The shape is ``(2, n_rows + 2)``: a column per row, one for all ln f, and one for all ln ζ,
     because grease changes all dampings.
     """
-    own = _columns(sums.shape[1] - 2)[rows]
-    return np.asarray(sums + np.array([innovation @ own, own.sum(axis=0)]))
+    both = np.array([innovation, np.ones(rows.size)])
+    return np.asarray(sums + both @ _columns(sums.shape[1] - 2)[rows])
 
 
-def suspect(
-    sums: FloatArray,
-    first: int,
-    loop_changes: list[int],
-    gate: float,
-) -> int | None:
-    """Return the log since which the following error, or else innovations, differ suspiciously.
+def worst_window(sums: FloatArray, first: int) -> tuple[int, float]:
+    """Return the first log of the window with the largest mean innovation, and its size.
 
     `sums` are the running sums before the first log and after every log so far, `first` is the
-    first log of the regime, and `loop_changes` those of `unexplained_loop_changes`, which
-    locate a retuning better than innovations do. Mean innovations are beyond the `gate`.
+    first log of the regime. The size is in standard deviations; 0 where there is no window.
     """
-    k = len(sums) - 2
-    recent = [j for j in loop_changes if first <= j < k]
-    if recent and k - recent[-1] <= constants.LOOP_LOGS:
-        return recent[-1]
-    start = k + 1 - _WINDOWS
+    start = len(sums) - 1 - _WINDOWS
     start = start[start >= first]
-    if start.size == 0:
-        return None
+    if not start.size:
+        return first, 0.0
     windows = sums[-1] - sums[start]
     mean = np.abs(windows[:, 0]) / np.sqrt(np.maximum(windows[:, 1], 1))
-    window, row = np.unravel_index(np.argmax(mean), mean.shape)
-    return int(start[window]) if mean[window, row] > gate else None
+    at = int(mean.argmax())
+    return int(start[at // mean.shape[1]]), float(mean.flat[at])
+
+
+def recent_loop_change(loop_changes: Sequence[int], first: int, now: int) -> int | None:
+    """Return the last log of the regime since which the following error differs, if it is recent.
+
+    `loop_changes` are those of `unexplained_loop_changes`, which locate a retuning better than
+    innovations do; `first` is the first log of the regime.
+    """
+    recent = [j for j in loop_changes if max(first, now - constants.LOOP_LOGS) <= j < now]
+    return recent[-1] if recent else None
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -8,6 +8,7 @@ walk, a changing one has a rate. States are immutable: `predict` and `update` re
 from collections.abc import Collection
 from copy import copy
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
 from math import prod
 from typing import Self
@@ -21,12 +22,14 @@ from lmshealth.tracking.state_space import StateSpace
 
 # Sets with less than this share of their group's best are pruned (a test bounds the error).
 _NEGLIGIBLE = float(np.log(1e-7))
-_ROUNDING = 1e-12
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Hyperparameters(Rows):
-    """Process noise and noise scales, one set per filter: standard deviations of ln f and lives."""
+    """Process noise and noise scales, one set per filter: standard deviations of ln f and lives.
+
+    There are no slots: what follows from them is kept, because it is needed at every log.
+    """
 
     level_walk: FloatArray  # of the random walk of ln f over a life, ``(n,)``
     rate_std: FloatArray  # of the initial rate per life, 0 for a healthy machine, ``(n,)``
@@ -37,16 +40,26 @@ class Hyperparameters(Rows):
     wander: FloatArray  # size of the wander in scaled errors of the first estimates, ``(n,)``
     wander_keep: FloatArray  # its correlation from one log to the next, ``(n,)``
     settling: FloatArray  # of the random walk of ln f that ends after a few logs, ``(n,)``
+    # Index of the combination of scales and wander: of a machine, whatever its regime, ``(n,)``.
+    disturbance: np.ndarray
 
-    @property
+    @cached_property
     def healthy(self) -> BoolArray:
         """Whether each set has no rate, or one that decays (running-in), shape ``(n,)``."""
         return np.asarray((self.rate_std == 0) | (self.rate_decay > 0))
 
-    @property
-    def disturbance(self) -> FloatArray:
-        """Noise scales and wander of each set: of a machine, whatever regime it is in."""
-        return np.column_stack([self.scales, self.wander, self.wander_keep])
+    @cached_property
+    def wander_variance(self) -> FloatArray:
+        """Stationary variance of the wander in errors of the first estimates, shape ``(n,)``."""
+        return np.asarray((self.wander * np.exp(np.log(self.scales).mean(axis=1))) ** 2)
+
+    @cached_property
+    def process_noise(self) -> FloatArray:
+        """Variances of the parts of process noise, in the order of `_process_noise`, ``(n, 7)``."""
+        drive, wander = self.rate_walk**2, (1 - self.wander_keep**2) * self.wander_variance
+        damping = np.full(drive.size, constants.DAMPING_WALK**2)
+        parts = (self.level_walk**2, self.settling**2, drive, drive, drive, wander, damping)
+        return np.column_stack(parts)
 
 
 def hyperparameter_grid(n_sources: int) -> Hyperparameters:
@@ -63,16 +76,18 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
         sizes = constants.SETTLING if r <= constants.SLOW_RATE else ((0.0, 1.0),)
         courses += [(w, r, d, 0.0, size, p * share) for size, p in sizes]
     rows = []
-    for course, scales, wander in product(courses, _scales(n_sources), constants.WANDERS):
+    disturbances = list(enumerate(product(_scales(n_sources), constants.WANDERS)))
+    for course, (number, (scales, wander)) in product(courses, disturbances):
         size, logs, p = wander
         keep = np.exp(-1 / logs) if logs else 0.0
         weight = course[5] * prod(chance for _, chance in scales) * p
-        rows.append((*course[:5], size, keep, weight, *(scale for scale, _ in scales)))
+        rows.append((*course[:5], size, keep, weight, number, *(scale for scale, _ in scales)))
     table = np.array(rows)
     prior = table[:, 7] / table[:, 7].sum()
     walk, rate, drive, decay, settling, size, keep = table[:, :7].T
-    noise = table[:, 8:]
-    return Hyperparameters(walk, rate, drive, noise, np.log(prior), decay, size, keep, settling)
+    index, noise = table[:, 8].astype(int), table[:, 9:]
+    log_prior = np.log(prior)
+    return Hyperparameters(walk, rate, drive, noise, log_prior, decay, size, keep, settling, index)
 
 
 def _scales(n_sources: int) -> list[tuple[tuple[float, float], ...]]:
@@ -94,14 +109,26 @@ class FilterBank(Rows):
 
     hyperparameters: Hyperparameters
     log_weight: FloatArray  # log of prior times evidence so far, ``(n,)``
-    mean: FloatArray  # states, ``(n, size)``
-    cov: FloatArray  # their covariances, ``(n, size, size)``
+    # Covariances of the states, and the states as the last row: products with the columns that a
+    # prediction or a measurement needs are those of both, ``(n, size + 1, size)``.
+    state: FloatArray
+
+    @property
+    def mean(self) -> FloatArray:
+        """States, shape ``(n, size)``."""
+        return self.state[:, -1]
+
+    @property
+    def cov(self) -> FloatArray:
+        """Covariances of the states, shape ``(n, size, size)``."""
+        return self.state[:, :-1]
 
     def padded(self, size: int) -> Self:
         """Return a bank with a longer state, whose new entries are exactly 0."""
-        more = size - self.mean.shape[1]
-        mean = np.pad(self.mean, ((0, 0), (0, more)))
-        return replace(self, mean=mean, cov=np.pad(self.cov, ((0, 0), (0, more), (0, more))))
+        n, _, own = self.state.shape
+        state = np.zeros((n, size + 1, size))
+        state[:, :own, :own], state[:, -1, :own] = self.cov, self.mean
+        return replace(self, state=state)
 
     @property
     def weight(self) -> FloatArray:
@@ -125,10 +152,9 @@ class FilterBank(Rows):
 
     def pruned(self) -> Self:
         """Remove filters with a negligible share of their group; both groups stay."""
-        group = self.hyperparameters.healthy.astype(int)
-        best = np.full(2, -np.inf)
-        np.maximum.at(best, group, self.log_weight)
-        keep = self.log_weight > best[group] + _NEGLIGIBLE
+        healthy, odds = self.hyperparameters.healthy, self.log_weight
+        best = (odds[group].max(initial=-np.inf) for group in (healthy, ~healthy))
+        keep = odds > np.where(healthy, *best) + _NEGLIGIBLE
         return self if keep.all() else self[keep]
 
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -142,9 +168,17 @@ class Innovation:
     """Innovations of one log, by mean and covariance of the mixture."""
 
     rows: np.ndarray  # rows of ``[ln f, ln ζ]`` that the log has, ``(n_rows,)``
+    mean: FloatArray  # ``(n_rows,)``
+    cov: FloatArray  # ``(n_rows, n_rows)``
     standardised: FloatArray  # ``(n_rows,)``
     outlying: FloatArray  # probability that they are outliers, ``(n_rows,)``
-    nis: float  # normalised innovation squared of those that are more probably none
+
+    @property
+    def nis(self) -> float:
+        """Normalised innovation squared of those that are more probably no outliers."""
+        kept = np.flatnonzero(self.outlying <= 0.5)
+        mean, cov = self.mean[kept], self.cov[kept[:, None], kept]
+        return float(mean @ np.linalg.solve(cov, mean))
 
 
 class FilterModel:
@@ -168,6 +202,8 @@ class FilterModel:
         self.extra = np.zeros((len(history.logs), 2 * r))
         for regressor in space.regressed:
             self.extra[:, :r] += regressor.unknown[:, None]
+        self.unknown: BoolArray = np.any(self.extra != 0, axis=1)
+        self.rows = [np.flatnonzero(own) for own in self.there]
         # Covariance of a wander as large as the errors of each mode's first estimate.
         std = np.zeros(space.n_modes)
         for i, mode in enumerate(history.modes):
@@ -176,6 +212,28 @@ class FilterModel:
             std[i] = np.sqrt(first[0]) if first.size else 0.0
         self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
+        self.noise, self.noise_shares = self._process_noise()
+
+    def _process_noise(self) -> tuple[FloatArray, FloatArray]:
+        """Return covariances of the parts of process noise, and their shares in every log.
+
+        They are the random walk of levels, settling, the rates' random walk in levels, between
+        levels and rates, and in rates, wander, and the random walk of damping, of unit variance,
+        ``(7, (5 n_modes)²)``. The shares, ``(n_logs, 7)``, are of variances per life.
+        """
+        space, size = self.space, 5 * self.space.n_modes
+        level, rate, single = space.level, space.rate, np.eye(space.n_modes)
+        parts = np.zeros((7, size, size))
+        parts[0, level, level], parts[6, space.damping, space.damping] = single, single
+        parts[5, space.wander, space.wander] = self.wander_cov
+        for part, row, column in (
+            *((1, level, level), (2, level, level), (4, rate, rate)),
+            *((3, level, rate), (3, rate, level)),
+        ):
+            parts[part, row, column] = self.together
+        tick, one = space.ticks, np.ones(space.ticks.size)
+        shares = [tick, space.settling, tick**3 / 3, tick**2 / 2, tick, one, tick]
+        return parts.reshape(7, -1), np.stack(shares, axis=1)
 
     def with_step(self, step: Step) -> Self:
         """Return the model with one more step."""
@@ -187,74 +245,59 @@ class FilterModel:
 def initial(model: FilterModel, grid: Hyperparameters | None = None) -> FilterBank:
     """Return the bank before the first log, with all hyperparameters or with those given."""
     grid = model.grid if grid is None else grid
-    n = grid.rate_std.size
     mean, cov = model.space.prior()
-    covs = np.tile(cov, (n, 1, 1))
-    _add(covs, model.space.rate, grid.rate_std**2, model.together)
-    covs[:, model.space.wander, model.space.wander] += _wander_cov(model, grid)
-    return FilterBank(grid, grid.log_prior.copy(), np.tile(mean, (n, 1)), covs)
-
-
-def _wander_cov(model: FilterModel, own: Hyperparameters) -> FloatArray:
-    """Return the stationary covariance of the wander, ``(n, n_modes, n_modes)``."""
-    size = own.wander * np.exp(np.log(own.scales).mean(axis=1))
-    return np.asarray(size[:, None, None] ** 2 * model.wander_cov)
+    state = np.tile(np.vstack([cov, mean]), (grid.rate_std.size, 1, 1))
+    _add(state, model.space.rate, grid.rate_std**2, model.together)
+    _add(state, model.space.wander, grid.wander_variance, model.wander_cov)
+    return FilterBank(grid, grid.log_prior.copy(), state)
 
 
 def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
     """Predict all filters from the log before to log k, with the steps between."""
-    space, tick, own = model.space, float(model.space.ticks[k]), bank.hyperparameters
+    space, own, state = model.space, bank.hyperparameters, bank.state.copy()
     level, rate, base, wander = space.level, space.rate, space.base, space.wander
-    mean, cov = bank.mean.copy(), bank.cov.copy()
     if k in model.reopened:
-        _add(cov, rate, own.rate_std**2, model.together)
+        _add(state, rate, own.rate_std**2, model.together)
     if k > 0 and space.seen[k]:
         keep = own.wander_keep[:, None, None]
-        mean[:, wander] *= keep[:, :, 0]
-        cov[:, wander, :] *= keep
-        cov[:, :, wander] *= keep
-        cov[:, wander, wander] += (1 - keep**2) * _wander_cov(model, own)
-    if tick > 0:
-        left = np.exp(-own.rate_decay * tick)[:, None]
-        decay = np.maximum(own.rate_decay, _ROUNDING)[:, None]
-        moved = np.where(own.rate_decay[:, None] > 0, (1 - left) / decay, tick)
-        mean[:, level] += moved * mean[:, rate]
-        mean[:, rate] *= left
-        cov[:, level, :] += moved[:, :, None] * cov[:, rate, :]
-        cov[:, :, level] += moved[:, None, :] * cov[:, :, rate]
-        cov[:, rate, :] *= left[:, :, None]
-        cov[:, :, rate] *= left[:, None, :]
-        _diagonal(cov, level)[:] += own.level_walk[:, None] ** 2 * tick
-        settling = own.settling[:, None, None] ** 2 * space.settling[k]
-        cov[:, level, level] += settling * model.together
-        drive = own.rate_walk[:, None, None] ** 2 * model.together
-        cov[:, level, level] += drive * tick**3 / 3
-        cov[:, level, rate] += drive * tick**2 / 2
-        cov[:, rate, level] += drive * tick**2 / 2
-        cov[:, rate, rate] += drive * tick
-        _diagonal(cov, space.damping)[:] += constants.DAMPING_WALK**2 * tick
+        state[:, wander] *= keep
+        state[:, :, wander] *= keep
+        # A level moves by this part of a life times its rate.
+        moved = np.full(keep.shape, space.ticks[k])
+        decays = own.rate_decay > 0
+        if decays.any():
+            decay = own.rate_decay[:, None, None]
+            left = np.exp(-decay * moved)
+            moved[decays] = ((1 - left) / np.where(decay > 0, decay, 1.0))[decays]
+        state[:, level] += moved * state[:, rate]
+        state[:, :, level] += moved * state[:, :, rate]
+        if decays.any():
+            state[:, rate] *= left
+            state[:, :, rate] *= left
+        noise = (own.process_noise * model.noise_shares[k]) @ model.noise
+        size = wander.stop
+        state[:, :size, :size] += noise.reshape(-1, size, size)
     for j, step in enumerate(space.steps):
         if step.first == k:
-            _begin_step(space, cov, step, j)
+            _begin_step(space, state, step, j)
     if k in space.history.baselines:
-        mean[:, base] = mean[:, level]
-        cov[:, base, :] = cov[:, level, :]
-        cov[:, :, base] = cov[:, :, level]
-    return FilterBank(own, bank.log_weight, mean, cov)
+        state[:, base] = state[:, level]
+        state[:, :, base] = state[:, :, level]
+    return FilterBank(own, bank.log_weight, state)
 
 
-def _begin_step(space: StateSpace, cov: FloatArray, step: Step, j: int) -> None:
-    """Add the variance of the j-th step of a state space to covariances that the caller owns."""
+def _begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
+    """Add the variance of the j-th step of a state space to states that the caller owns."""
     jump = space.jump(j)
     variance = np.repeat(np.square(constants.JUMP_STD[step.kind]), space.n_modes)
     own = np.arange(jump.start, jump.stop)
-    cov[:, own, own] += variance
+    state[:, own, own] += variance
     if step.changes_modes:
         level, damping = space.level, space.damping
         moved = np.r_[level.start : level.stop, damping.start : damping.stop]
-        cov[:, own, moved] += variance
-        cov[:, moved, own] += variance
-        cov[:, moved, moved] += variance
+        state[:, own, moved] += variance
+        state[:, moved, own] += variance
+        state[:, moved, moved] += variance
 
 
 def update(
@@ -265,39 +308,37 @@ def update(
     Where innovations are large, the estimates of a mode or of all modes may be outliers: every
     filter is the mixture of these hypotheses, reduced to its mean and covariance.
     """
-    rows: np.ndarray = np.flatnonzero(model.there[k])
-    space = model.space
+    rows, space = model.rows[k], model.space
+    if not rows.size:
+        return bank, Innovation(rows, np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0))
     matrix, value = space.matrix(k)[rows], model.values[k, rows]
-    if value.size == 0:
-        return bank, Innovation(np.array([], dtype=int), np.array([]), np.array([]), 0.0)
     scales = bank.hyperparameters.scales[:, model.scale_of[rows]]
-    noise = space.history.cov[k][np.ix_(rows, rows)]
-    n, size = bank.mean.shape
-    # One product of all states with the matrix instead of one each.
-    crossed = (bank.cov.reshape(-1, size) @ matrix.T).reshape(n, size, -1)
-    errors = noise * scales[:, :, None] * scales[:, None, :]
-    total = matrix @ crossed + errors
-    _diagonal(total, slice(0, value.size))[:] += model.extra[k, rows]
-    off = value - bank.mean @ matrix.T
-    centre, cov = mixture(bank.weight, off, total)
+    errors = space.history.cov[k][rows[:, None], rows] * (scales[:, :, None] * scales[:, None])
+    # One product of all states with the matrix instead of one each. Its last row is the innovation
+    # with the opposite sign.
+    n, rest, size = bank.state.shape
+    crossed = (bank.state.reshape(-1, size) @ matrix.T).reshape(n, rest, -1)
+    crossed[:, -1] -= value
+    total = matrix @ crossed[:, :-1] + errors
+    if model.unknown[k]:
+        _diagonal(total)[:] += model.extra[k, rows]
+    centre, cov = mixture(bank.weight, -crossed[:, -1], total)
     standardised = centre / np.sqrt(cov.diagonal())
-    found = [_condition(bank, crossed, off, total)]
-    mode, own = model.mode_of[rows], errors.diagonal(axis1=1, axis2=2)
-    wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
-    hypotheses = _outliers(mode, standardised) if outliers else []
-    for outlying, chance, gross in hypotheses:
-        wider = total.copy()
-        more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
-        _diagonal(wider, slice(0, value.size))[:] += np.where(outlying, more, 0.0)
-        other = _condition(bank, crossed, off, wider)
-        found.append(replace(other, log_weight=other.log_weight + np.log(chance)))
-    updated, share = _merged(found)
-    masks = np.array([rows for rows, _, _ in hypotheses], dtype=float).reshape(-1, value.size)
-    outlying = np.minimum(updated.weight @ share[:, 1:] @ masks, 1.0)
-    kept = np.flatnonzero(outlying <= 0.5)
-    inside = cov[np.ix_(kept, kept)]
-    nis = float(centre[kept] @ np.linalg.solve(inside, centre[kept]))
-    return updated, Innovation(rows, standardised, outlying, nis)
+    updated, outlying = _condition(bank, crossed, total), np.zeros(rows.size)
+    if outliers and np.abs(standardised).max() > constants.OUTLIER_GATE:
+        hypotheses, found = _outliers(model.mode_of[rows], standardised), [updated]
+        own = errors.diagonal(axis1=1, axis2=2)
+        wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
+        for mask, chance, gross in hypotheses:
+            wider = total.copy()
+            more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
+            _diagonal(wider)[:] += np.where(mask, more, 0.0)
+            other = _condition(bank, crossed, wider)
+            found.append(replace(other, log_weight=other.log_weight + np.log(chance)))
+        updated, share = _merged(found)
+        masks = np.array([mask for mask, _, _ in hypotheses])
+        outlying = np.minimum(updated.weight @ share[:, 1:] @ masks, 1.0)
+    return updated, Innovation(rows, centre, cov, standardised, outlying)
 
 
 def _outliers(mode: np.ndarray, standardised: FloatArray) -> list[tuple[BoolArray, float, bool]]:
@@ -306,50 +347,42 @@ def _outliers(mode: np.ndarray, standardised: FloatArray) -> list[tuple[BoolArra
     They are nested: the mode with the largest innovation, the two largest, up to the whole log,
     which may be that of another machine.
     """
-    modes = np.unique(mode)
-    worst = np.array([np.abs(standardised[mode == m]).max() for m in modes])
-    order = modes[np.argsort(-worst)]
+    worst = np.zeros(mode.max() + 1)
+    np.maximum.at(worst, mode, np.abs(standardised))
+    rank, chance = np.argsort(np.argsort(-worst)), constants.OUTLIER_PROBABILITY
     found: list[tuple[BoolArray, float, bool]] = []
-    chance = constants.OUTLIER_PROBABILITY
-    for i in range(1, int(np.sum(worst > constants.OUTLIER_GATE)) + 1):
-        rows = np.isin(mode, order[:i])
-        share = chance if i == modes.size else chance**i
+    for i in range(1, np.count_nonzero(worst > constants.OUTLIER_GATE) + 1):
+        rows: BoolArray = rank[mode] < i
+        share = chance if rows.all() else chance**i
         found += [(rows, share, False), (rows, share, True)]
     return found
 
 
-def _condition(
-    bank: FilterBank, crossed: FloatArray, off: FloatArray, total: FloatArray
-) -> FilterBank:
-    """Update filters by innovations of a covariance; `crossed` is that with the state."""
+def _condition(bank: FilterBank, crossed: FloatArray, total: FloatArray) -> FilterBank:
+    """Update filters by innovations of a covariance; `crossed` is that with the state, and they."""
     root = np.linalg.cholesky(total)
-    half = np.linalg.inv(root)
-    white = (half @ off[:, :, None])[:, :, 0]
-    gain = half @ np.swapaxes(crossed, 1, 2)
-    nis = np.square(white).sum(axis=1)
-    log_det = np.log(np.einsum("nii->ni", root)).sum(axis=1)
-    reduction = np.swapaxes(gain, 1, 2) @ gain
-    return FilterBank(
-        bank.hyperparameters,
-        bank.log_weight + (-0.5 * nis - log_det - 0.5 * off.shape[1] * np.log(2 * np.pi)),
-        bank.mean + (white[:, None, :] @ gain)[:, 0, :],
-        np.subtract(bank.cov, reduction, out=reduction),
-    )
+    white = np.linalg.inv(root) @ crossed.swapaxes(1, 2)
+    # Reductions of covariances, and changes of states with the opposite sign.
+    change = white.swapaxes(1, 2) @ white[:, :, :-1]
+    nis = np.square(white[:, :, -1]).sum(axis=1)
+    log_det = np.log(root.diagonal(axis1=1, axis2=2)).sum(axis=1)
+    log_likelihood = -0.5 * (nis + total.shape[1] * np.log(2 * np.pi)) - log_det
+    state = np.subtract(bank.state, change, out=change)
+    return FilterBank(bank.hyperparameters, bank.log_weight + log_likelihood, state)
 
 
 def _merged(found: list[FilterBank]) -> tuple[FilterBank, FloatArray]:
     """Reduce hypotheses to one bank; also their probabilities, ``(n, n_hypotheses)``."""
-    if len(found) == 1:
-        return found[0], np.ones((found[0].log_weight.size, 1))
     logs = np.stack([one.log_weight for one in found], axis=1)
     log_weight = np.logaddexp.reduce(logs, axis=1)
     share = np.exp(logs - log_weight[:, None])
-    mean = sum(share[:, [h]] * one.mean for h, one in enumerate(found))
-    cov = np.zeros_like(found[0].cov)
-    for h, one in enumerate(found):
-        off = one.mean - mean
-        cov += share[:, h, None, None] * (one.cov + off[:, :, None] * off[:, None, :])
-    return FilterBank(found[0].hyperparameters, log_weight, np.asarray(mean), cov), share
+    merged = replace(found[0], log_weight=log_weight, state=np.zeros_like(found[0].state))
+    for own, one in zip(share.T[:, :, None, None], found, strict=True):
+        merged.state[:] += own * one.state
+    for own, one in zip(share.T[:, :, None, None], found, strict=True):
+        off = one.mean - merged.mean
+        merged.cov[:] += own * (off[:, :, None] * off[:, None, :])
+    return merged, share
 
 
 def advance(model: FilterModel, bank: FilterBank, first: int, last: int) -> FilterBank:
@@ -365,30 +398,25 @@ def restart(model: FilterModel, bank: FilterBank, *, anew: bool = False) -> Filt
     Only work on the machine starts it `anew`: parts then run in.
     """
     grid, own = model.grid, bank.hyperparameters
-    kept, place = np.unique(own.disturbance, axis=0, return_inverse=True)
-    match = (grid.disturbance[:, None, :] == kept[None]).all(axis=2)
-    chosen = match.any(axis=1) & (anew | (grid.rate_decay == 0))
-    grid, at = grid[chosen], match[chosen].argmax(axis=1)
-    share = np.bincount(place.ravel(), weights=bank.weight)[at]
+    kept, place = np.unique(own.disturbance, return_inverse=True)
+    chosen: BoolArray = np.isin(grid.disturbance, kept)
+    grid = grid[chosen & (anew | (grid.rate_decay == 0))]
+    at = np.searchsorted(kept, grid.disturbance)
+    share = np.bincount(place, weights=bank.weight)[at]
     of_kept = np.bincount(at, weights=np.exp(grid.log_prior))[at]
-    n = grid.rate_std.size
-    mean, cov = np.empty((n, bank.mean.shape[1])), np.empty((n, *bank.cov.shape[1:]))
-    for d in range(len(kept)):
-        for group in (True, False):
-            members = (place.ravel() == d) & (own.healthy == group)
-            state = bank[members if members.any() else place.ravel() == d].collapse()
-            mean[(at == d) & (grid.healthy == group)], cov[(at == d) & (grid.healthy == group)] = (
-                state
-            )
+    state = np.empty((at.size, *bank.state.shape[1:]))
+    for d, group in product(range(kept.size), (True, False)):
+        members = (place == d) & (own.healthy == group)
+        mean, cov = bank[members if members.any() else place == d].collapse()
+        state[(at == d) & (grid.healthy == group)] = np.vstack([cov, mean])
     # A healthy machine has no rate, whatever its rate was before.
     rates = np.arange(model.space.rate.start, model.space.rate.stop)
-    still = np.flatnonzero(grid.rate_std == 0)
-    mean[np.ix_(still, rates)] = 0.0
-    cov[np.ix_(still, rates)] = 0.0
-    cov[still[:, None], :, rates] = 0.0
-    _add(cov, model.space.rate, grid.rate_std**2, model.together)
+    still = np.flatnonzero(grid.rate_std == 0)[:, None]
+    state[still, rates] = 0.0
+    state[still, :, rates] = 0.0
+    _add(state, model.space.rate, grid.rate_std**2, model.together)
     log_weight = grid.log_prior - np.log(of_kept) + np.log(np.maximum(share, 1e-12))
-    return FilterBank(grid, log_weight, mean, cov)
+    return FilterBank(grid, log_weight, state)
 
 
 def mixture(weight: FloatArray, mean: FloatArray, cov: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -405,13 +433,12 @@ def _correlation(common: float, n: int) -> FloatArray:
     return np.asarray(common + (1 - common) * np.eye(n))
 
 
-def _add(cov: FloatArray, rows: slice, variance: FloatArray, correlation: FloatArray) -> None:
-    """Add correlated variances ``(n,)`` to a diagonal block of covariances."""
-    cov[:, rows, rows] += variance[:, None, None] * correlation
+def _add(state: FloatArray, rows: slice, variance: FloatArray, correlation: FloatArray) -> None:
+    """Add correlated variances ``(n,)`` to a diagonal block of the covariances of states."""
+    state[:, rows, rows] += variance[:, None, None] * correlation
 
 
-def _diagonal(cov: FloatArray, rows: slice) -> FloatArray:
-    """Return the diagonals of a block of matrices as a writeable view, ``(n, n_modes)``."""
-    size = cov.shape[1]
-    # In a flattened matrix the diagonal has a stride of its size plus one.
-    return cov.reshape(-1, size * size)[:, :: size + 1][:, rows]
+def _diagonal(matrices: FloatArray) -> FloatArray:
+    """Return the diagonals of ``(n, size, size)`` matrices as a writeable view."""
+    view: FloatArray = np.einsum("nii->ni", matrices)
+    return view

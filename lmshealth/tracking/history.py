@@ -458,25 +458,18 @@ def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Est
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
     estimates = []
     for reading in ordered:
-        modes = reading.modes
-        named = [
+        modes, n = reading.modes, len(reading.modes.names)
+        names = tuple(
             name or _nearest(float(modes.frequency[i]), stage) for i, name in enumerate(modes.names)
-        ]
-        kept = np.array([i for i, n in enumerate(named) if tracked is None or n in tracked], int)
-        shapes = np.full((kept.size, len(channels)), np.nan)
-        places = [channels.index(channel) for channel in modes.shape_channels]
-        shapes[:, places] = modes.shapes[kept]
-        both = np.concatenate([kept, kept + len(modes.names)])
-        estimates.append(
-            Estimates(
-                names=tuple(named[i] for i in kept),
-                sources=tuple(modes.sources[i] for i in kept),
-                ln_frequency=modes.ln_frequency[kept],
-                ln_damping=modes.ln_damping[kept],
-                cov=modes.cov[both[:, None], both],
-                shapes=shapes,
-            )
         )
+        shapes = modes.shapes
+        if list(modes.shape_channels) != channels:
+            shapes = np.full((n, len(channels)), np.nan)
+            shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
+        columns = (modes.ln_frequency, modes.ln_damping, modes.cov, shapes)
+        one = Estimates(names, modes.sources, *columns)
+        kept = [i for i, name in enumerate(names) if tracked is None or name in tracked]
+        estimates.append(one if len(kept) == n else one.pick(kept))
     return estimates
 
 
@@ -513,14 +506,21 @@ def _line_up(
     for k, i, (mode, source) in assigned:
         if mode is not None and (mode, source) in places:
             pairs[k].append((places[mode, source], i))
+    # Most logs have the same estimates in the same columns: these are put there at once.
+    alike: dict[tuple[Any, ...], list[int]] = {}
+    for k, one in enumerate(estimates):
+        alike.setdefault((len(one.names), *pairs[k]), []).append(k)
     n, r = len(estimates), len(series)
     ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
     cov = np.full((n, 2 * r, 2 * r), np.nan)
-    for k, one in enumerate(estimates):
-        to, of = np.array(pairs[k], dtype=int).reshape(-1, 2).T
-        ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
-        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(one.names)])
-        cov[k, to[:, None], to] = one.cov[of[:, None], of]
+    for (size, *own), logs in alike.items():
+        to, of = np.array(own, dtype=int).reshape(-1, 2).T
+        at, some = np.array(logs)[:, None], [estimates[k] for k in logs]
+        ln_f[at, to] = np.array([one.ln_frequency for one in some])[:, of]
+        ln_zeta[at, to] = np.array([one.ln_damping for one in some])[:, of]
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + size])
+        part = np.array([one.cov for one in some])[:, of[:, None], of]
+        cov[at[:, :, None], to[:, None], to] = part
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 

@@ -62,7 +62,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     for share, (own, _) in zip(weight, runs, strict=True):
         off = own - mean
         cov += share * off[:, :, None] * off[:, None, :]
-    contrast = space.drift()
+    contrast = space.drift
     size = contrast.shape[1]
     drift = mean[:, :size] @ contrast.T
     variance = np.einsum("mi,kij,mj->km", contrast, cov[:, :size, :size], contrast)
@@ -124,11 +124,8 @@ def _inverse(cov: FloatArray) -> FloatArray:
 def _transition(model: FilterModel, own: Hyperparameters, k: int) -> tuple[FloatArray, FloatArray]:
     """Return transition matrix and process noise into log k: `predict` of exactly known states."""
     size = model.space.size
-    unit = FilterBank(
-        own[np.zeros(size + 1, dtype=int)],
-        np.zeros(size + 1),
-        np.vstack([np.eye(size), np.zeros(size)]),
-        np.zeros((size + 1, size, size)),
-    )
+    state = np.zeros((size + 1, size + 1, size))
+    state[:-1, -1] = np.eye(size)
+    unit = FilterBank(own[np.zeros(size + 1, dtype=int)], np.zeros(size + 1), state)
     unit = predict(model, unit, k)
     return unit.mean[:-1].T, unit.cov[-1]

@@ -48,6 +48,9 @@ class StateSpace:
             since[first:] -= since[first]
         left = np.exp(-since)
         self.settling = np.maximum(-np.diff(left, prepend=1.0), 0.0)
+        # Contrast ℓ - ℓ₀ of the first entries of a state, ``(n_modes, 4 n_modes)``.
+        one, none = np.eye(m), np.zeros((m, m))
+        self.drift: FloatArray = np.hstack([one, none, none, -one])
         self._fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
@@ -138,11 +141,3 @@ class StateSpace:
             std[self.regressor(j)] = regressor.prior_std
         std[self.first_bias : self.first_step] = np.tile(constants.BIAS_STD, len(self.biased))
         return mean, np.diag(std**2)
-
-    def drift(self) -> FloatArray:
-        """Return the contrast ℓ - ℓ₀ of a state, shape ``(n_modes, 4 n_modes)``."""
-        m = self.n_modes
-        contrast = np.zeros((m, 4 * m))
-        contrast[:, self.level] = np.eye(m)
-        contrast[:, self.base] = -np.eye(m)
-        return contrast

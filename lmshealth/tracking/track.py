@@ -25,10 +25,11 @@ from lmshealth.tracking.change_detection import (
     Change,
     add_to_sums,
     begun,
-    suspect,
+    recent_loop_change,
     threshold,
     unexplained_loop_changes,
     weigh_changes,
+    worst_window,
 )
 from lmshealth.tracking.filter_bank import (
     FilterBank,
@@ -312,8 +313,9 @@ class TrackStart(ReadOnly):
     widening: FloatArray
 
 
-# Fields of a start with a row per log.
+# Fields of a start that a tracker has, with a row per log, and others.
 _PER_LOG = ("nis", "innovations", "mean", "variance", "drift_cov", "noise_scale")
+_AS_KEPT = ("first", "alarmed", "open", "weighed", "widening")
 
 
 def continue_track(
@@ -365,7 +367,7 @@ class _Tracker:
         size = self.size = 4 * len(self.history.modes)
         # Of each log: NIS and innovations without outliers, rows of outliers, running sums.
         self.nis, self.innovations = np.zeros(n), np.full((n, n_rows), np.nan)
-        self.outlying: dict[int, BoolArray] = {}
+        self.outlying: dict[int, tuple[int, ...]] = {}
         self.sums = np.zeros((n + 1, 2, n_rows + 2))
         # Published: mean, variance, covariance of drifts, noise scales; factor on standard
         # deviations of the first logs, which later ones do not change any more.
@@ -388,9 +390,10 @@ class _Tracker:
         n, kept, length = before.n_logs, before.kept, len(self.history.logs)
         for name in _PER_LOG:
             getattr(self, name)[:n] = getattr(before, name)
-        self.sums[kept : n + 1], self.widening = before.sums, before.widening
-        every = np.arange(self.innovations.shape[1])
-        self.outlying = {k: np.isin(every, rows) for k, rows in before.outlying}
+        for name in _AS_KEPT:
+            setattr(self, name, getattr(before, name))
+        self.sums[kept : n + 1] = before.sums
+        self.outlying, self.alarms = dict(before.outlying), list(before.alarms)
         for step in before.steps:
             own = Step.found(step.kind, step.first, length, step.source)
             self.model = self.model.with_step(own)
@@ -398,8 +401,6 @@ class _Tracker:
         found = range(len(steps) - len(before.steps), len(steps))
         self.changes = dict(zip(found, before.changes, strict=True))
         self.loop_changes = unexplained_loop_changes(self.history.loop_error, steps)
-        self.first, self.open, self.weighed = before.first, before.open, before.weighed
-        self.alarms, self.alarmed = list(before.alarms), before.alarmed
         self.bank = self.checkpoints[kept] = before.bank
         for again in range(kept + 1, n):
             self._filter(again)
@@ -413,18 +414,12 @@ class _Tracker:
             n_logs=len(self.history.logs),
             kept=kept,
             bank=self.checkpoints[kept],
-            first=self.first,
             steps=tuple(step for step in self.model.space.steps if not step.declared),
             changes=tuple(self.changes.values()),
             alarms=tuple(self.alarms),
-            alarmed=self.alarmed,
-            open=self.open,
-            weighed=self.weighed,
-            outlying=tuple(
-                (k, tuple(np.flatnonzero(rows).tolist())) for k, rows in self.outlying.items()
-            ),
+            outlying=tuple(self.outlying.items()),
             sums=self.sums[kept:].copy(),
-            widening=self.widening,
+            **{name: getattr(self, name) for name in _AS_KEPT},
             **{name: getattr(self, name).copy() for name in _PER_LOG},
         )
 
@@ -435,8 +430,10 @@ class _Tracker:
                 self._begin_regime(self.bank, k, anew=True)
                 self.alarmed = False
             self._filter(k)
-            self._detect(k)
-            self._publish(k)
+            window = worst_window(self.sums[: k + 2], self.first)
+            if self._detect(k, *window):
+                window = worst_window(self.sums[: k + 2], self.first)
+            self._publish(k, *window)
         return self._track()
 
     def _begin_regime(self, bank: FilterBank, first: int, *, anew: bool = False) -> None:
@@ -449,27 +446,30 @@ class _Tracker:
 
         What is outlying in three logs in a row has changed, by more than any prior allows for.
         """
-        before = [self.outlying.get(k - j, np.zeros(0, bool)) for j in (1, 2, 3)]
-        stays = all(rows.size for rows in before) and bool(np.logical_and.reduce(before).any())
+        recent = [self.outlying.get(k - j, ()) for j in (1, 2, 3)]
+        stays = bool(set(recent[0]).intersection(*recent[1:]))
         predicted = predict(self.model, self.bank, k)
         bank, found = update(self.model, predicted, k, outliers=not stays)
         most = constants.MOST_INNOVATION
-        self.sums[k + 1] = add_to_sums(
-            self.sums[k], found.rows, np.clip(found.standardised, -most, most)
-        )
+        innovation = found.standardised.clip(-most, most)
+        self.sums[k + 1] = add_to_sums(self.sums[k], found.rows, innovation)
         self.outlying.pop(k, None)
         kept = found.outlying <= 0.5
         if not kept.all():
-            self.outlying[k] = np.isin(np.arange(self.innovations.shape[1]), found.rows[~kept])
+            self.outlying[k] = tuple(found.rows[~kept].tolist())
         self.nis[k], self.innovations[k] = found.nis, np.nan
         self.innovations[k, found.rows[kept]] = found.standardised[kept]
         self.bank = self.checkpoints[k] = bank.pruned()
         self.checkpoints.pop(k - N_CHECKPOINTS, None)
 
-    def _detect(self, k: int) -> None:
-        """Weigh a suspected change, and raise the alarm of a drift."""
-        gate = constants.SUSPICION_GATE
-        suspected = suspect(self.sums[: k + 2], self.first, self.loop_changes, gate)
+    def _detect(self, k: int, window: int, size: float) -> bool:
+        """Weigh a suspected change, and raise the alarm of a drift: whether a change is adopted.
+
+        The mean innovation is largest since the log `window`.
+        """
+        suspected = recent_loop_change(self.loop_changes, self.first, k)
+        if suspected is None and size > constants.SUSPICION_GATE:
+            suspected = window
         if self.open is not None and suspected is not None:
             # A significant change keeps its place until it is settled.
             suspected = self.open.first
@@ -484,7 +484,7 @@ class _Tracker:
                 if not change.settled(k):
                     self.open = change
                 elif self._adopt(change, k):
-                    return
+                    return True
         # A single log that deviates may be an outlier or the first after a step, and an open change
         # need not be damage: later logs decide.
         waiting = self.open is not None and not self.open.settled(k)
@@ -492,6 +492,7 @@ class _Tracker:
         lone = suspected is not None and k - suspected <= 1
         if evidence >= threshold() and not waiting and not lone:
             self._alarm(k, evidence)
+        return False
 
     def _adopt(self, change: Change, k: int) -> bool:
         """Add a change to the model and filter again from the checkpoint before it.
@@ -524,38 +525,34 @@ class _Tracker:
             return
         self.alarmed = True
         mean, cov = self.bank.collapse(self.size)
-        contrast = self.model.space.drift()
+        contrast = self.model.space.drift
         drift = contrast @ mean
         std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
         i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
         mode, size, error = self.history.modes[i], float(drift[i]), float(std[i])
         self.alarms.append(Event("alarm", k, mode, "", size, error, evidence, False, k))
 
-    def _publish(self, k: int) -> None:
+    def _publish(self, k: int, window: int, size: float) -> None:
         """Record the state of log k, and the noise scale of each source."""
         mean, cov = self.bank.collapse(self.size)
+        other, chance = None, 0.5
         if k in self.outlying and k - 1 in self.checkpoints:
             # As likely an outlier as the first log after a step: publish the mixture of both.
             stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
             before = self.checkpoints[k - 1].padded(stepped.space.size)
             other = update(stepped, predict(stepped, before, k), k, outliers=False)[0]
-            mean, cov = self._mixed(other, 0.5)
-        else:
-            first = suspect(self.sums[: k + 2], self.first, [], constants.BEGUN_GATE)
-            if first is not None and first - 1 in self.checkpoints:
-                # No alarm yet, or an older rate: the rate may be another one since then.
-                before = self.checkpoints[first - 1]
-                other, evidence = begun(self.model, self.checkpoints, k, first, before)
-                mean, cov = self._mixed(other, expit(evidence + logit(constants.BEGUN_PROBABILITY)))
-        contrast = self.model.space.drift()
-        self.mean[k], self.variance[k] = mean, np.diag(cov)
+        elif size > constants.BEGUN_GATE and window - 1 in self.checkpoints:
+            # No alarm yet, or an older rate: the rate may be another one since then.
+            before = self.checkpoints[window - 1]
+            other, evidence = begun(self.model, self.checkpoints, k, window, before)
+            chance = float(expit(evidence + logit(constants.BEGUN_PROBABILITY)))
+        if other is not None:
+            means, covs = zip((mean, cov), other.collapse(self.size), strict=True)
+            mean, cov = mixture(np.array([1 - chance, chance]), np.stack(means), np.stack(covs))
+        contrast = self.model.space.drift
+        self.mean[k], self.variance[k] = mean, cov.diagonal()
         self.drift_cov[k] = contrast @ cov @ contrast.T
         self.noise_scale[k] = self.bank.weight @ self.bank.hyperparameters.scales
-
-    def _mixed(self, other: FilterBank, chance: float) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the bank and another one, which has this probability."""
-        means, covs = zip(*(one.collapse(self.size) for one in (self.bank, other)), strict=True)
-        return mixture(np.array([1 - chance, chance]), np.stack(means), np.stack(covs))
 
     def _dof(self) -> FloatArray:
         """Count the innovations of each log; the first estimate of a mode has none."""
@@ -606,9 +603,9 @@ class _Tracker:
             steps=space.steps,
             outliers=tuple(
                 (k, mode)
-                for k, outlying in self.outlying.items()
+                for k, rows in self.outlying.items()
                 for mode in history.modes
-                if outlying[history.columns(mode)].any()
+                if not set(rows).isdisjoint(history.columns(mode))
             ),
             nis=self.nis,
             nis_dof=dof,
@@ -655,7 +652,7 @@ def _drifts(
     space: StateSpace, mean: FloatArray, drift_cov: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
     """Return the drifts of all epochs, ``(n, m)``, and their covariances; NaN before a baseline."""
-    history, drift, drift_cov = space.history, mean @ space.drift().T, drift_cov.copy()
+    history, drift, drift_cov = space.history, mean @ space.drift.T, drift_cov.copy()
     early = np.arange(len(history.logs)) < history.baselines[0]
     drift[early], drift_cov[early] = np.nan, np.nan
     # At a baseline, and at its place on the clock until a step, ℓ and ℓ₀ are equal.

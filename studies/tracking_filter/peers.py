@@ -145,7 +145,7 @@ def one_setting() -> Hyperparameters:
         np.zeros(1),
         np.ones((1, 1)),
         np.zeros(1),
-        *np.zeros((4, 1)),
+        *np.zeros((5, 1)),
     )
 
 

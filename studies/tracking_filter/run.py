@@ -2,24 +2,26 @@
 
 Method
     Lives are drawn from the tracker's own model: 20 to 40 logs of two modes, correlated errors of
-    varying size, a tenth of the estimates and temperatures missing, the setting by the tracker's
-    prior. Squared errors at one log of each life, and all innovations, are summed under the true
-    setting and compared with their 99.9 % band of χ². The setting is not an input of the tracker:
-    the quantiles of its average over settings, and its published mean and standard deviation, are
-    judged by the coverage of 50 and 90 % intervals (99.9 % Clopper-Pearson), one mode at one log of
-    each life. Lives that two sources see with errors correlated by 0.9 are tracked by both and by
-    one alone. Controls that must fail: half the reported covariance; intervals of half the width;
-    common errors of two sources taken for independent. Programs take turns on one long life with
-    one setting and regular logs: largest difference of ln f in standard deviations, and processor
-    time as a multiple of a plain filterpy loop, the median over the turns.
+    varying size, a tenth of the estimates and temperatures missing, wander, no outliers, the
+    setting by the tracker's prior over 2,200 settings. Squared errors at one log of each life, and
+    all innovations, are summed under the true setting and compared with their 99.9 % band of χ².
+    The setting is not an input of the tracker: the quantiles of its average over settings, and its
+    published mean and standard deviation, are judged by the coverage of 50 and 90 % intervals
+    (99.9 % Clopper-Pearson), one mode at one log of each of 600 lives: a coverage that is lower by
+    8 % fails. 150 lives that two sources see with errors correlated by 0.9 are tracked by both and
+    by one alone. Controls that must fail: half the reported covariance; intervals of half the
+    width; common errors of two sources taken for independent. Programs take turns on one long life
+    with one setting and regular logs: largest difference of ln f in standard deviations, and
+    processor time as a multiple of a plain filterpy loop, the median over the turns; that of the
+    tracker includes outliers, and the search for changes and for rates that are new.
 Answer
-    Yes, but for the time. Two sources cover as one does, 51 and 90 beside 50 and 90 %, with
-    intervals a tenth narrower; taken for independent they cover 34 and 71 %. Tracking over all 138
-    settings with the search for events takes 4.2 times the filterpy loop of one setting, 2.2 s
-    where 2 s were asked for.
+    Yes, but for the time. Two sources cover as one does, with intervals a tenth narrower; taken for
+    independent they cover a third less than 50 % and a fifth less than 90 %. Tracking over all
+    2,200 settings, of which a few are left after some hundred logs, takes five to six times the
+    filterpy loop of one setting, where 2 s were asked for 10,000 logs.
 Run time
-    Two minutes on one processor. simdkalman and statsmodels come with the extra ``peers``; without
-    them their rows are missing.
+    Ten minutes on one processor, most of them for lives of two sources. simdkalman and statsmodels
+    come with the extra ``peers``; without them their rows are missing.
 """
 
 from __future__ import annotations
@@ -45,7 +47,12 @@ SEED = 20260401
 SAME, SAME_AS_PEERS = 1e-9, 1e-6
 SECONDS = 2.0
 IN_TIME = f"10,000 epochs of five modes take under {SECONDS:g} s"
-NOT_MET = {IN_TIME: "a tenth more; see the multiple of the filterpy loop"}
+NOT_MET = {
+    IN_TIME: (
+        "twice as long, a third of it for states that allow for a rate that is new; see the "
+        "multiple of the filterpy loop"
+    )
+}
 
 
 def main() -> None:
@@ -58,8 +65,8 @@ def main() -> None:
         "speed": speed(400 if quick else 10_000, 5, 1 if quick else 5),
         "deviation": deviation(one, 3 if quick else 100, machine),
         "known_setting": known_setting(two, 30 if quick else 2000, machine),
-        "averaged": averaged(three, 6 if quick else 1000, 2 if quick else 300, machine),
-        "two_sources": two_sources(four, 4 if quick else 300, machine),
+        "averaged": averaged(three, 6 if quick else 600, 2 if quick else 150, machine),
+        "two_sources": two_sources(four, 4 if quick else 150, machine),
     }
     answer["passed"] = verdicts(answer, quick=quick)
     study.conclude(answer, not_met=NOT_MET)

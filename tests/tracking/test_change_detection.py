@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
 
@@ -17,9 +18,10 @@ from lmshealth.tracking.change_detection import (
     Change,
     add_to_sums,
     loop_evidence,
-    suspect,
+    recent_loop_change,
     threshold,
     unexplained_loop_changes,
+    worst_window,
 )
 from lmshealth.tracking.filter_bank import FilterModel, hyperparameter_grid, restart
 from lmshealth.tracking.history import History, Step
@@ -29,8 +31,6 @@ from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, 
 from tests.tracking.test_filter_bank import SETTINGS, one, run
 
 N_LOGS, PLACE = 40, 22
-
-GATE = 4.0
 
 
 @pytest.fixture(scope="module")
@@ -176,6 +176,13 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
     assert alarm.size == pytest.approx(found.drift[alarm.epoch, i])
 
 
+def suspect(sums: FloatArray, first: int, loop_changes: Sequence[int] = ()) -> int | None:
+    """Return the log since which the following error, or else innovations, differ."""
+    start, size = worst_window(sums, first)
+    by_loop = recent_loop_change(loop_changes, first, len(sums) - 2)
+    return (start if size > constants.SUSPICION_GATE else None) if by_loop is None else by_loop
+
+
 def sums_of(innovations: FloatArray) -> FloatArray:
     """Sum innovations ``(n_logs, n_rows)`` log by log."""
     sums = [np.zeros((2, innovations.shape[1] + 2))]
@@ -188,9 +195,9 @@ def test_windows_of_large_mean_innovations_are_suspected() -> None:
     """The suspected log is the first of the window with the largest mean."""
     innovations = 0.5 * np.array([1.0, -1.0]) * (-1.0) ** np.arange(20)[:, None]
     sums = sums_of(np.vstack([innovations, np.tile([0.0, 2.5], (4, 1))]))
-    assert [suspect(sums[: k + 2], 1, [], GATE) for k in range(20)] == [None] * 20
-    assert suspect(sums, 1, [], GATE) == 20
-    assert suspect(sums_of(np.vstack([innovations, np.zeros((4, 2))])), 1, [], GATE) is None
+    assert [suspect(sums[: k + 2], 1) for k in range(20)] == [None] * 20
+    assert suspect(sums, 1) == 20
+    assert suspect(sums_of(np.vstack([innovations, np.zeros((4, 2))])), 1) is None
 
 
 def test_leaps_of_the_loop_are_suspected() -> None:
@@ -204,8 +211,8 @@ def test_leaps_of_the_loop_are_suspected() -> None:
     lone[15] *= 1.5
     error[20:] *= 1.5
     leaps, sums = unexplained_loop_changes(error, ()), np.zeros((31, 2, 4))
-    assert suspect(sums[:22], 1, leaps, GATE) is None
-    assert suspect(sums[:23], 1, leaps, GATE) == 20
+    assert suspect(sums[:22], 1, leaps) is None
+    assert suspect(sums[:23], 1, leaps) == 20
     assert 15 not in unexplained_loop_changes(lone, ())
     assert 20 not in unexplained_loop_changes(error, (since("servo", 20, 30),))
 
@@ -213,9 +220,9 @@ def test_leaps_of_the_loop_are_suspected() -> None:
 def test_windows_do_not_reach_before_the_segment() -> None:
     """A step explains the innovations before it."""
     sums = sums_of(np.tile([4.0, 0.0], (6, 1)))
-    assert suspect(sums, 1, [], GATE) == 2
-    assert suspect(sums, 4, [], GATE) == 4
-    assert suspect(sums, 5, [], GATE) is None
+    assert suspect(sums, 1) == 2
+    assert suspect(sums, 4) == 4
+    assert suspect(sums, 5) is None
 
 
 def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
@@ -223,7 +230,7 @@ def test_a_change_of_all_dampings_is_suspected_before_each_of_them() -> None:
     for moved, suspected in (((0, 0, 1, 1), 10), ((0, 0, 1, 0), None)):
         innovations = np.zeros((12, 4))
         innovations[10:] = 2.2 * np.array(moved)
-        assert suspect(sums_of(innovations), 1, [], GATE) == suspected
+        assert suspect(sums_of(innovations), 1) == suspected
 
 
 def student_bayes_factor(before: FloatArray, after: FloatArray) -> float:
@@ -289,7 +296,7 @@ def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) 
         rest = np.setdiff1d(np.arange(space.size), np.arange(space.rate.start, space.rate.stop))
         for own in np.flatnonzero(group):
             disturbance = new.hyperparameters.disturbance[own]
-            same = (old.hyperparameters.disturbance == disturbance).all(axis=1)
+            same = old.hyperparameters.disturbance == disturbance
             also = same & (old.hyperparameters.healthy == still)
             mean, cov = old[also if also.any() else same].collapse()
             np.testing.assert_allclose(new.mean[own, rest], mean[rest])

@@ -69,6 +69,7 @@ def one(wander: Wander, sources: tuple[str, ...]) -> Hyperparameters:
         np.array([wander.size]),
         np.array([wander.keep]),
         np.array([wander.settling]),
+        np.zeros(1, dtype=int),
     )
 
 

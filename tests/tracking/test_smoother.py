@@ -57,7 +57,7 @@ def test_one_setting_is_the_joint_gaussian_given_all_logs(
         assert np.abs((mean[:, at] - book.mean[:, part]) / std[:, part]).max() < close
         scale = std[:, part, :, None] * std[:, part, None]
         assert (np.abs(cov[:, at, at] - book.cov[:, part, :, part]) / scale).max() < close
-    contrast = space.drift()
+    contrast = space.drift
     judged = np.arange(len(history.logs)) >= history.baselines[0]
     drift = mean[:, : contrast.shape[1]] @ contrast.T
     assert np.abs((drift - book.mean[:, 2]) / std[:, 2])[judged].max() < close

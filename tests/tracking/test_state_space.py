@@ -204,4 +204,4 @@ def test_the_drift_is_the_level_less_its_copy(history: History, stage: Stage) ->
     """The contrast is ℓ - ℓ₀ of each mode."""
     space = StateSpace(history, stage)
     state = np.arange(8.0)
-    np.testing.assert_array_equal(space.drift() @ state, state[space.level] - state[space.base])
+    np.testing.assert_array_equal(space.drift @ state, state[space.level] - state[space.base])

@@ -13,7 +13,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
@@ -50,8 +50,24 @@ class Estimates:
             raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
         if self.shapes.ndim != 2:
             raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
-        shapes = "shapes", n, self.shapes.shape[1]
-        freeze(self, ("ln_frequency ln_damping", n), ("cov", 2 * n, 2 * n), shapes)
+        for name, shape in (("ln_frequency", (n,)), ("ln_damping", (n,)), ("cov", (2 * n, 2 * n))):
+            if (found := getattr(self, name).shape) != shape:
+                raise ValueError(f"{name} has shape {found}, needed {shape}")
+        if len(self.shapes) != n:
+            raise ValueError(f"shapes has {len(self.shapes)} rows, needed {n}")
+
+    def pick(self, chosen: Sequence[int]) -> Self:
+        """Return some of the estimates."""
+        at, n = np.array(chosen, dtype=int), len(self.names)
+        both = np.concatenate([at, at + n])
+        return type(self)(
+            tuple(self.names[i] for i in chosen),
+            tuple(self.sources[i] for i in chosen),
+            self.ln_frequency[at],
+            self.ln_damping[at],
+            self.cov[both[:, None], both],
+            self.shapes[at],
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -250,9 +266,15 @@ def _repeats(state: State, log: Log) -> bool:
         mac = np.where(np.isnan(product), 0.0, product).sum(axis=1) ** 2
         if (mac < constants.LEAST_MAC).any():
             return False
-    names, gap = np.array(log.names), np.abs(new.ln_f[:, None] - new.ln_f)
-    near = gap < constants.REPEAT_SEPARATION + reach.max()
-    return not (near & (names[:, None] != names)).any()
+    near = np.abs(new.ln_f[:, None] - new.ln_f) < constants.REPEAT_SEPARATION + reach.max()
+    return not (near & _different(log.names)).any()
+
+
+@lru_cache(maxsize=256)
+def _different(names: tuple[str, ...]) -> BoolArray:
+    """Return which pairs of estimates have different names, ``(n, n)``."""
+    own = np.array(names)
+    return np.asarray(own[:, None] != own)
 
 
 @lru_cache(maxsize=256)

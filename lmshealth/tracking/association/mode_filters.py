@@ -8,7 +8,7 @@ covariance does not include), so that no single estimate has unlimited weight.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
@@ -73,7 +73,7 @@ class ModeFilters(Rows):
 
     def keep(self, modes: IntArray) -> Self:
         """Return copies of some modes, in any order."""
-        return type(self)(*(getattr(self, item.name)[:, modes] for item in fields(self)))
+        return self.with_each(lambda own: own[:, modes])
 
     def join(self, other: ModeFilters) -> Self:
         """Append the modes of other filters that have one hypothesis."""
@@ -81,8 +81,7 @@ class ModeFilters(Rows):
 
     def append(self, other: ModeFilters, *, axis: int) -> Self:
         """Append the hypotheses (axis 0) or the modes (axis 1) of other filters."""
-        pairs = ((getattr(self, i.name), getattr(other, i.name)) for i in fields(self))
-        return type(self)(*(np.concatenate(pair, axis) for pair in pairs))
+        return self.with_each(lambda *both: np.concatenate(both, axis), other)
 
     def start(
         self, first: Measurements, row: FloatArray, prior_std: FloatArray, life: float
