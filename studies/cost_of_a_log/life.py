@@ -113,8 +113,9 @@ def apart(one: Prognosis | None, other: Prognosis | None) -> float:
     for found in (one, other):
         travel = np.minimum(found.remaining[:, -1], found.horizon)
         means.append(travel.mean())
+        n = min(found.ess, travel.size)  # without wear the size of the sample has no bound
         # What no draw shows may have a probability of one effective draw.
-        errors.append(max(travel.std() / np.sqrt(found.ess), found.horizon / found.ess))
+        errors.append(max(travel.std() / np.sqrt(n), found.horizon / n))
     return float(abs(means[0] - means[1]) / np.hypot(*errors))
 
 
