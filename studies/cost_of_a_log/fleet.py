@@ -10,9 +10,12 @@ Method
     with that of lives fitted from nothing under the same prior, as in `run`. Control, which must
     fail: the remaining travel by the description alone.
 Answer
-    To be recorded.
+    A quarter of the first run, 2.9 s of two processors for each machine; a new log of one machine
+    costs a new page, and lives, of few others. Lives by the prior of the fleet are those fitted
+    from nothing. Fitted so after every new log, as they were before this study, each took 4 to 15 s
+    more, in fleets of young or healthy machines twice the cost of all else.
 Run time
-    Ten minutes on two processors.
+    Four minutes on two processors.
 """
 
 from __future__ import annotations
@@ -168,7 +171,9 @@ def claims(record: Row) -> Iterator[Claim]:
     first = record["runs"]["first"]
     for name, row in record["runs"].items():
         yield Claim(
-            f"{FLEET:,} machines of {record['logs']} logs, {name}, on {WORKERS} processors",
+            f"{FLEET:,} machines of {record['logs']} logs, {name}"
+            + (f" in {record['machines']}" if name == "a new log of one" else "")
+            + f", on {WORKERS} processors",
             f"{number(times * row['wall_s'])} h",
             "",
             f"reckoned from {record['machines']} machines; {number(row['cpu_s'] / first['cpu_s'])} "
