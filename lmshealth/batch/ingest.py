@@ -1,6 +1,7 @@
 """Ingest of an archive: every log is hashed, and identified once in the life of a store."""
 
 import logging
+import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -277,7 +278,10 @@ def _tasks(
 
 
 def _file_key(path: Path, folder: Path) -> tuple[str, bool]:
-    """Return a key of a file by its name, size and times, and whether these are old enough."""
+    """Return a key of a file by its name, size and times, and whether these prove its content.
+
+    They do not just after a change, nor on Windows, which has no time of the last change.
+    """
     name = name_of(path, folder)
     try:
         found = path.stat()
@@ -285,7 +289,7 @@ def _file_key(path: Path, folder: Path) -> tuple[str, bool]:
         return fingerprint(name), False
     age = time.time() - max(found.st_mtime, found.st_ctime)
     key = fingerprint(name, found.st_size, found.st_mtime_ns, found.st_ctime_ns)
-    return key, age > constants.SETTLED_S
+    return key, age > constants.SETTLED_S and os.name != "nt"
 
 
 def _all_digests(

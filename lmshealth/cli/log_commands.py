@@ -223,9 +223,10 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         if rows and stage is None and band is None:
             terminal.print_text(_NO_BAND)
 
+    _print(ctx, content, refused, found, lost, show)
     if given["save"] and found:
         _save(given["save"], found[0])
-    _publish(ctx, content, refused, found, lost, show)
+    _exit(ctx, found, lost)
 
 
 def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
@@ -297,7 +298,8 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _publish(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
+    _print(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
+    _exit(ctx, found, lost)
 
 
 @options.command(
@@ -329,7 +331,8 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _publish(ctx, content, refused, found, lost, show)
+    _print(ctx, content, refused, found, lost, show)
+    _exit(ctx, found, lost)
 
 
 @options.command(
@@ -417,7 +420,8 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
     show = partial(views.print_frf, content["fit"], content["frf"], rows)
-    _publish(ctx, content, refused, found, lost, show)
+    _print(ctx, content, refused, found, lost, show)
+    _exit(ctx, found, lost)
 
 
 def _responses(
@@ -441,7 +445,7 @@ def _responses(
     )
 
 
-def _publish(
+def _print(
     ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
@@ -449,7 +453,7 @@ def _publish(
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
 ) -> None:
-    """Print results as csv (the first table of the content), json, or tables, and exit.
+    """Print results as csv (the first table of the content), json, or tables.
 
     Tables list refused parts of logs, but not lost logs.
     """
@@ -461,7 +465,6 @@ def _publish(
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     elif found:
         show(tables.refused_rows(refused))
-    _exit(ctx, found, lost)
 
 
 def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:

@@ -49,7 +49,7 @@ NOT_MET = {
         "figures drawn with 300 points each, and their rows written"
     ),
     "memory": (
-        "250 MB are imported libraries, of which 40 MB are pyarrow, that pandas imports where it is "
+        "250 MB are imported libraries, of which 40 MB are pyarrow: pandas imports it where it is "
         "installed (321 MB without it for 60 logs); the tracker's settings take 60 MB"
     ),
 }

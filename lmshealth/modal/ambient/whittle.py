@@ -169,9 +169,9 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
 
 # Newton decrement, a square in standard deviations, below which the search ends, and most steps.
 _ARRIVED, _MOST_STEPS = 1e-5, 100
-# First radius of the trust region, and shares of the expected gain: steps count above the first,
-# the radius shrinks below the second and grows above the third.
-_FIRST_RADIUS, _ACCEPTED, _POOR, _GOOD = 0.3, 0.15, 0.25, 0.75
+# First and least radius of the trust region, and shares of the expected gain: steps count above
+# the first share, the radius shrinks below the second and grows above the third.
+_FIRST_RADIUS, _LEAST_RADIUS, _ACCEPTED, _POOR, _GOOD = 0.3, 1e-9, 0.15, 0.25, 0.75
 # Slopes of E that are computed at a time: more channels would not fit into the processor's cache.
 _CACHED = 1 << 14
 
@@ -279,9 +279,13 @@ class Likelihood:
 
     def minimise(self, start: FloatArray) -> FloatArray:
         """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""
-        p, value, (slope, curvature) = start, self.value(start), self.derivatives(start)
-        radius = _FIRST_RADIUS
+        p, radius, found = start, _FIRST_RADIUS, self._finite_derivatives(start)
+        if found is None:
+            return start
+        value, (slope, curvature) = self.value(start), found
         for _ in range(_MOST_STEPS):
+            if radius < _LEAST_RADIUS:  # what is gained is below the rounding of the value
+                break
             newton = _newton_step(slope, curvature)
             if newton is not None and -float(slope @ newton) < _ARRIVED:
                 break
@@ -326,7 +330,7 @@ def _step_to(radius: float, slope: FloatArray, curvature: FloatArray) -> FloatAr
 
     step = -along / (values + least)
     if excess(least) > 0:
-        most = least + float(np.linalg.norm(slope)) / radius
+        most = 2 * (least + float(np.linalg.norm(slope)) / radius)
         step = -along / (values + brentq(excess, least, most, rtol=1e-6))
     else:  # no slope along the lowest curvature
         step[0] += np.sqrt(radius**2 - step @ step)

@@ -13,6 +13,7 @@ from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 from lmshealth.modal.ambient.whittle import (
     SECOND,
     Likelihood,
+    _step_to,
     floors,
     lay_out,
     marginalise,
@@ -526,3 +527,22 @@ def test_evidence_is_the_integral_over_a_height() -> None:
     # Of a normal that is as narrow, the integral is one.
     integral = max(logs) + np.log(grid / (0.2 * np.sqrt(2 * np.pi)))
     assert found.log_evidence == pytest.approx(integral, abs=0.1)
+
+
+def test_a_step_has_the_length_of_its_radius() -> None:
+    """Identity, nearly: also where the radius is far below the rounding of the curvature."""
+    rng = np.random.default_rng(1)
+    for radius in 0.3 / 4.0 ** np.arange(0, 50, 7):
+        for _ in range(20):
+            half = rng.standard_normal((6, 6))
+            curvature, slope = half + half.T, 1e-3 * rng.standard_normal(6)
+            step = _step_to(radius, slope, curvature)
+            assert np.linalg.norm(step) == pytest.approx(radius, rel=0.05)
+            assert slope @ step + 0.5 * step @ curvature @ step < 0
+
+
+def test_a_start_whose_derivatives_overflow_is_returned() -> None:
+    """Refusal: its value is infinite, and it is no mode."""
+    target = noisy(1, 2, 7.0)
+    start = target.start + 1000.0
+    assert target.minimise(start) is start
