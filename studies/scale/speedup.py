@@ -10,10 +10,11 @@ Method
     serial time; t is the time of a log with one worker, c what n bare processes do over one, and s
     the processor time of main process and scheduler, which share the processors with the workers.
 Answer
-    See the claims. Two runs identify each log once. The present record is of 64 logs in one turn on
-    a machine with ten times as much other work as processors: its gains and model show that only.
+    Two workers, or two runs that share a store, identify twice as many logs as one, as two bare
+    processes do; four and eight on two processors a little more. The main process takes 0.4 ms a
+    log for processes and 1.1 ms for Dask. Two runs identify each log once.
 Run time
-    Seven minutes of two processors; many times that where others use them.
+    Twelve minutes of two processors.
 """
 
 from __future__ import annotations
@@ -29,14 +30,22 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth import Settings, identify, load_stage, read_log, run
-from studies.harness.claims import Claim, Older
+from studies.harness.claims import Claim
 from studies.harness.command_line import no_pictures
 from studies.harness.servers import dask_cluster, postgres
 from studies.harness.study import Row, Study, spawn_pool
 from studies.scale.archive import make_archive
 
 STEP = "batch"
-OLDER = {"speedup": Older("e08457e0a9e3", "the processors were free of other programs")}
+_OVERLAP = (
+    "the bound by bare processes differed by a quarter between the turns, on a shared machine"
+)
+NOT_MET = {
+    "dask: at most 1 ms per log": "a tenth more, most of it the client's work on each task",
+    "local: model of 4": _OVERLAP,
+    "local: model of 8": _OVERLAP,
+    "dask: model of 4": _OVERLAP,
+}
 
 N_LOGS, QUICK_LOGS, TURNS = 160, 4, 2
 WORKERS, QUICK_WORKERS = (1, 2, 4, 8), (1, 2)
@@ -176,7 +185,7 @@ def main() -> None:
         "no log is identified twice": all(t.get("identified", n_logs) == n_logs for t in turns)
     }
     # Of a small archive the start of the second worker is most of the time.
-    study.conclude(answer, quick_may_fail=True)
+    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
 
 def _range(values: list[float]) -> list[float]:
