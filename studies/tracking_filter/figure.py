@@ -25,7 +25,7 @@ def draw_sums(ax: Axes, known: Row) -> None:
     name_lines(ax, list(known["as reported"]))
     ax.set_xlabel("mean square in units of what the filter says")
     ax.set_title(f"True setting, {known['lives']:,} lives", fontsize=10)
-    ax.legend(fontsize=7, loc="lower right")
+    ax.legend(fontsize=7, loc="center", bbox_to_anchor=(0.45, 0.5))
 
 
 def draw_coverage(ax: Axes, rows: dict[str, list[Row]], title: str) -> None:
