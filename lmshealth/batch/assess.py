@@ -434,7 +434,7 @@ def apply_fleet_priors(
     if left:
         resources.progress("fleet priors", 0, len(left))
     work: Work[_Update, _UpdateJob] = Work(lambda one: one[1], job, fetch)
-    mapper = lambda jobs: resources.pool.map_unordered(_update, jobs, lambda _, why: why)  # noqa: E731
+    mapper = partial(resources.pool.map_unordered, _update, on_crash=lambda _, why: why)
     for k, (one, made) in enumerate(work.divided(left, store, mapper), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(one.machine, one.key, made)
@@ -496,10 +496,8 @@ def _update(job: _UpdateJob) -> PackedAssessment | str | None:
                 return None
             calibration = calibrate(found.prognosis, job.ended)
             return pack_assessment(replace(found, calibration=calibration))
-        history, stage = (
-            accepted_estimates(found.history, found.track),
-            job.prior.apply_to(found.stage),
-        )
+        history = accepted_estimates(found.history, found.track)
+        stage = job.prior.apply_to(found.stage)
         seed = seed_of(found.seed, history.stage, stage.digest)
         before = unpack_or_none(job.life, LifeStart)
         prognosis, _ = prognose_with_posterior(history, stage, seed, before=before)

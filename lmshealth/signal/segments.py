@@ -72,10 +72,10 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
                     last_move, settled = at + b - 1, b
                 else:
                     settled = min(max(last_move + settling + 1 - at, a), b)
-                for low, high, own in ((a, settled, kind), (settled, b, 3)):
-                    if low < high:
-                        mean = float(np.mean(block[low:high]))
-                        _join(found, Segment(at + low, at + high, mean, _KINDS[own]))
+                for begin, end, own in ((a, settled, kind), (settled, b, 3)):
+                    if begin < end:
+                        mean = float(np.mean(block[begin:end]))
+                        _join(found, Segment(at + begin, at + end, mean, _KINDS[own]))
         phases += found
     return tuple(phases)
 

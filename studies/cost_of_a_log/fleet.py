@@ -4,7 +4,7 @@ Method
     A fleet of stages Y from estimates as identified, two of three healthy, in one store, by two
     worker processes. Four runs of what `run` does after identification: all logs but the last two,
     one more log of every machine, one more of a single machine, and nothing new. The evidence of
-    every machine moves the prior of those whose own logs say little about their wear (healthy and
+    every machine moves the prior of those whose own logs constrain their wear little (healthy and
     young ones), whose lives are then sampled again. Time and processor time are of all processes,
     and are reckoned for 1,000 machines. The remaining travel by the prior of the fleet is compared
     with that of lives fitted from nothing under the same prior, as in `run`. Control, which must
@@ -43,6 +43,7 @@ from studies.cost_of_a_log.run import readings
 from studies.harness.claims import Claim, number
 from studies.harness.command_line import no_pictures, quick_posteriors
 from studies.harness.study import Row, Study
+from studies.scale.archive import Steps
 
 STEP = "batch"
 
@@ -73,35 +74,24 @@ class Nights:
 
     def run(self, counts: Mapping[str, int], stored: Mapping[str, int]) -> Row:
         """Assess the fleet with some logs of each machine, of which some are stored; the costs."""
-        seconds: dict[str, float] = {}
-        step, since = "assessing", time.perf_counter()
-
-        def progress(name: str, done: int, total: int) -> None:
-            nonlocal step, since
-            now = time.perf_counter()
-            seconds[step] = seconds.get(step, 0.0) + now - since
-            step, since = name, now
-
-        start, cpu = time.perf_counter(), _cpu_s()
+        steps, cpu = Steps(time.perf_counter), _cpu_s()
         jobs = [self.machine(name, counts[name], stored[name]) for name in self.fleet]
-        assess_and_report(jobs, self.store, self.out, self.workers, progress)
-        progress("ended", 0, 0)
-        spent = {"wall_s": time.perf_counter() - start, "cpu_s": _cpu_s() - cpu}
-        return {name: round(value, 2) for name, value in (spent | seconds).items()}
+        assess_and_report(jobs, self.store, self.out, self.workers, steps)
+        steps("ended", 0, 0)
+        spent = {"wall_s": sum(steps.seconds.values()), "cpu_s": _cpu_s() - cpu}
+        return {name: round(value, 2) for name, value in (spent | steps.seconds).items()}
 
-    def compared(self, keys: Mapping[str, str], n: int) -> list[Row]:
+    def compared(self, counts: Mapping[str, int], n: int) -> list[Row]:
         """Compare some lives by the prior of the fleet with those fitted from nothing under it."""
-        rows = []
+        rows: list[Row] = []
         for one in self.store.published():
             own = unpack_or_none(self.store.assessment(one.machine, one.key), Assessment)
-            by_description = self.store.assessment(one.machine, keys[one.machine])
-            alone = unpack_or_none(by_description, Assessment)
             if own.fleet is None or len(rows) == n:
                 continue
-            history, stage = (
-                accepted_estimates(own.history, own.track),
-                own.fleet.apply_to(own.stage),
-            )
+            key = self.machine(one.machine, counts[one.machine]).key
+            alone = unpack_or_none(self.store.assessment(one.machine, key), Assessment)
+            history = accepted_estimates(own.history, own.track)
+            stage = own.fleet.apply_to(own.stage)
             fresh = prognose(history, stage, seed_of(own.seed + 1, history.stage, stage.digest))
             off, control = apart(own.prognosis, fresh), apart(own.prognosis, alone.prognosis)
             rows.append({"machine": one.machine, "apart": off, "control_apart": control})
@@ -133,8 +123,7 @@ def nights(n_machines: int, n_logs: int, epochs: int, n_compared: int, workers: 
                 name: own.run(now, before)
                 for name, (before, now) in zip(names, pairwise(counts), strict=True)
             }
-            keys = {name: own.machine(name, counts[-1][name]).key for name in fleet}
-            return {"runs": runs, "compared": own.compared(keys, n_compared)}
+            return {"runs": runs, "compared": own.compared(counts[-1], n_compared)}
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -37,17 +38,17 @@ def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
 
 
 class Steps:
-    """Divides processor time among the steps of a run, by its reports of progress."""
+    """Divides the time of a clock among the steps of a run, by its reports of progress."""
 
-    def __init__(self) -> None:
-        self._step, self._since = "starting", time.process_time()
+    def __init__(self, clock: Callable[[], float] = time.process_time) -> None:
+        self._clock, self._step, self._since = clock, "starting", clock()
         self.seconds: dict[str, float] = {}
 
     def __call__(self, what: str, done: int, total: int) -> None:
         """Add the time since the last report to the step that it named."""
-        now = time.process_time()
+        now = self._clock()
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + now - self._since
-        self._step, self._since = what, time.process_time()
+        self._step, self._since = what, self._clock()
 
 
 def size_mb(folder: Path, pattern: str) -> float:
