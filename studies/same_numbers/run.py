@@ -24,10 +24,10 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from studies.harness.checkout import checkout
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
@@ -47,7 +47,7 @@ def main() -> None:
     chosen = study.options
     with tempfile.TemporaryDirectory() as temporary:
         folder = Path(chosen.keep or temporary).resolve()
-        with _checkout(chosen.before, folder / "code") as old:
+        with checkout(chosen.before, folder / "code") as old:
             if not (folder / "before").exists():
                 make_inputs(folder / "inputs", old, quick=study.quick)
                 answer_all(folder / "before", folder / "inputs", old)
@@ -60,23 +60,6 @@ def main() -> None:
             "passed": {"all numbers equal to 1e-9": not found["different"]},
         }
     )
-
-
-@contextmanager
-def _checkout(revision: str, folder: Path) -> Iterator[Path]:
-    """Make a worktree of a revision while a block runs, unless the folder has it already."""
-
-    def git(*words: object) -> None:
-        subprocess.run(["git", "worktree", *words], cwd=ROOT, check=True, capture_output=True)
-
-    if folder.exists():
-        yield folder
-        return
-    git("add", "--detach", "-f", folder, revision)
-    try:
-        yield folder
-    finally:
-        git("remove", "--force", folder)
 
 
 def call(code: Path, *arguments: str | Path, out: Path | None = None) -> None:
