@@ -63,7 +63,7 @@ def _settings(given: dict[str, Any]) -> Settings:
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
     names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
-    head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
+    head = {"schema": constants.JSON_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 
