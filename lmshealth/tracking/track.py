@@ -21,7 +21,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import (
     N_CHECKPOINTS,
-    Change,
+    ChangeHypothesis,
     add_to_sums,
     begun,
     recent_loop_change,
@@ -316,11 +316,11 @@ class _Tracker:
         self.widening = np.empty(0)
         self.loop_changes = unexplained_loop_changes(self.history.loop_error, model.space.steps)
         # Detected changes by the number of their step, with the log that detected them.
-        self.changes: dict[int, tuple[Change, int]] = {}
+        self.changes: dict[int, tuple[ChangeHypothesis, int]] = {}
         self.alarms: list[Event] = []
         self.alarmed = False
         # A significant change whose kind is not settled, and the last suspicion that was weighed.
-        self.open: Change | None = None
+        self.open: ChangeHypothesis | None = None
         self.weighed = (-1, -1)
 
     def run(self) -> Track:
@@ -394,7 +394,7 @@ class _Tracker:
             self._alarm(k, evidence)
         return False
 
-    def _adopt(self, change: Change, k: int) -> bool:
+    def _adopt(self, change: ChangeHypothesis, k: int) -> bool:
         """Add a change to the model and filter again from the checkpoint before it.
 
         A drift that is no damage, or follows an alarm, is not adopted.
