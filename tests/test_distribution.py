@@ -14,7 +14,7 @@ from packaging.requirements import Requirement
 
 ROOT = Path(__file__).parents[1]
 # Extras that people install to use the package; `peers` and `dev` stay with who develops it.
-EXTRAS = ("models", "formats", "pdf", "interactive", "postgres", "notify", "distributed")
+EXTRAS = ("models", "formats", "pdf", "postgres", "notify", "distributed")
 PERMISSIVE = re.compile(
     r"0BSD|Apache|BSD|CC0|HPND|ISC|MIT|PSF|Python[- ](2|Software)|Unlicense|Zlib|MPL|Mozilla"
 )

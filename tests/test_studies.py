@@ -519,7 +519,7 @@ def test_blind_lives(root: Path) -> None:
     told = answer["verdicts"]["all"]
     # The third is of a drawn machine, from estimates.
     assert (told["right"]["n"], answer["drawn"], answer["front_page"]["n"]) == (3, 1, 2)
-    found = told["told_of_true"]
+    found = told["reported_of_true"]
     assert [found[word][word] for word in ("healthy", "not-enough-data")] == [1, 1]
 
 

@@ -77,7 +77,7 @@ def publish(fleet: Fleet, alerts: Alerts, out: Path) -> dict[str, str]:
             | {"page": str(out.absolute() / by_stage[change.stage].page)}
             for change in changes
         ]
-        content = {"schema": constants.STATUS_SCHEMA, "changes": rows}
+        content = {"schema": constants.JSON_SCHEMA, "changes": rows}
         if why := run_command(alerts.channels()[name], msgspec.json.encode(content)):
             failed[name] = f"{why}; {len(changes)} changes are sent again by the next run"
     left = {name: fleet.pending[name] for name in failed}

@@ -44,12 +44,7 @@ from lmshealth.tracking.history import (
     sort_by_time,
 )
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
-from lmshealth.tracking.track import (
-    TrackStart,
-    accepted_estimates,
-    continue_track,
-    outlier_refusals,
-)
+from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 
 # Keys of the parts of an assessment with the rows of its logs, and a fingerprint of these logs.
 _ROWS, _ROWS_OF = fingerprint(VERSION, "rows"), fingerprint(VERSION, "rows of")
@@ -153,11 +148,7 @@ def _with_results(
     history, stage = made.history, made.stage
     seed = seed_of(made.seed, history.stage, stage.digest)
     try:
-        track_key = fingerprint(VERSION, "track", stage.digest)
-        start = unpack_or_none(parts.known.get(track_key), TrackStart)
-        tracked, start = continue_track(history, stage, start)
-        if start is not None:
-            parts.used[track_key] = pack(start)
+        tracked = track(history, stage)
         doubt = doubt_of_names(stage, history, tracked, readings)
         refused = (*made.refused, *outlier_refusals(history, tracked))
         made = replace(made, track=tracked, refused=refused, doubt=doubt)

@@ -62,8 +62,9 @@ SHORTEST_SECRET = 4
 """Least length of a value of a URL's options that is masked in messages. Shorter values are
 numbers and switches, which occur everywhere in a message."""
 
-STATUS_SCHEMA = 1
-"""Version of the keys of ``status.json`` and of the JSON that alerts get."""
+JSON_SCHEMA = 2
+"""Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,
+and what alerts get. It changes when a key or a value changes its meaning or is removed."""
 
 FAILURE_PROBABILITY = 0.5
 """Probability that a limit is reached now, from which a machine has the state ``FAILURE``: it is

@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
 import msgspec
-from sqlalchemy import URL
 
 from lmshealth._files import write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
@@ -26,7 +25,7 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
-from lmshealth.report.assessment import Assessment, Summary
+from lmshealth.report.assessment import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
@@ -231,28 +230,6 @@ def report(
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
     )
-
-
-def write_interactive(url: str | URL, result: RunResult) -> tuple[Path, ...]:
-    """Write an interactive page of each machine of a run or report, from its store.
-
-    They are in the folder ``interactive`` beside the static pages, under the same names.
-    `InteractiveError` if Bokeh is missing.
-    """
-    from lmshealth.report.interactive import interactive_page  # late: it needs Bokeh
-
-    folder, written = result.index.with_name("interactive"), list[Path]()
-    with closing(Store(url, create=False)) as store:
-        keys = {one.machine: one.key for one in store.published()}
-        for row in result.rows:
-            content = store.assessment(row.identity, keys[row.identity])
-            found: Assessment | None = unpack_or_none(content, Assessment)
-            if found is not None:
-                page = interactive_page(found, f"../{row.file}")
-                folder.mkdir(exist_ok=True)
-                write_text(folder / row.file, page)
-                written.append(folder / row.file)
-    return tuple(written)
 
 
 def _prepare(out: Path) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, date, datetime, time, timedelta
+from datetime import date, datetime, timedelta
 from typing import Any, Literal
 
 import msgspec
@@ -14,7 +14,6 @@ from lmshealth.health.verdict import NO_HEALTH, degraded_words, undeclared_event
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import Row, prognosis_rows
-from lmshealth.report.text import spell
 from lmshealth.stage.constants import INFORMED
 
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
@@ -38,7 +37,7 @@ class Change(msgspec.Struct, frozen=True):
 class Status(msgspec.Struct, frozen=True, kw_only=True):
     """Status of a machine after a run: one ``<stage>.status.json``."""
 
-    schema: int = constants.STATUS_SCHEMA
+    schema: int = constants.JSON_SCHEMA
     stage: str
     page: str  # file in the same folder
     description: str  # name of the stage description
@@ -60,8 +59,6 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     service: str  # service, service_by, inspect_by: as in prognosis.csv
     service_by: date | None
     inspect_by: date | None
-    # Activities and when they become necessary: MaintenancePrognosisType of OPC 40501-1.
-    prognoses: tuple[dict[str, Any], ...] = msgspec.field(name="Prognoses")
 
 
 class Fleet(msgspec.Struct, frozen=True):
@@ -69,7 +66,7 @@ class Fleet(msgspec.Struct, frozen=True):
 
     machines: tuple[Status, ...] = ()
     pending: dict[str, tuple[Change, ...]] = {}
-    schema: int = constants.STATUS_SCHEMA
+    schema: int = constants.JSON_SCHEMA
 
 
 def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
@@ -148,23 +145,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         service=service.kind,
         service_by=service.by,
         inspect_by=service.inspect_by,
-        prognoses=tuple(_prognoses(summary)),
     )
-
-
-def _prognoses(summary: Summary) -> Iterator[dict[str, Any]]:
-    """Yield what has to be done and when (UTC), as far as that is before the horizon.
-
-    The probability to reach a limit before that time is no part of OPC 40501-1.
-    """
-    service, zone = summary.service, summary.recorded_at.tzinfo
-    limits = summary.life.limits[:-1] if summary.life else ()
-    found = [("Service", service.by, service.risk), ("Record a log", service.inspect_by, np.nan)]
-    found += [(f"Restore {spell(one.parameter)}", one.dates[3], 0.5) for one in limits]  # medians
-    for activity, day, risk in found:
-        if day is not None:
-            moment = datetime.combine(day, time(), zone).astimezone(UTC)
-            yield {"Activity": activity, "PredictedTime": moment, "Probability": _or_none(risk)}
 
 
 def _or_none(value: float) -> float | None:
@@ -185,7 +166,10 @@ def compare(
         silent = moment - now.recorded_at > timedelta(days=silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
     announced = tuple(dict.fromkeys((*known, *now.alarms)))
-    now = msgspec.structs.replace(now, silent=silent, announced=announced)
+    # A status of an earlier schema is written again in this one.
+    now = msgspec.structs.replace(
+        now, schema=constants.JSON_SCHEMA, silent=silent, announced=announced
+    )
     found = conditions(now, moment.date())
     state: DeviceHealth = next(iter(found.values()), "NORMAL")
     now = msgspec.structs.replace(now, conditions=found, device_health=state)

@@ -9,14 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import click
-from sqlalchemy import URL
 
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.run import RunResult, Settings, write_interactive
+from lmshealth.batch.run import RunResult, Settings
 from lmshealth.batch.run import report as write_pages
 from lmshealth.batch.run import run as run_pipeline
-from lmshealth.batch.store import Store, default_url
+from lmshealth.batch.store import Store
 from lmshealth.batch.watch import watch as watch_folder
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import LmshealthError
@@ -48,7 +47,6 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         options.SEED,
         options.alert_options,
         options.PDF,
-        options.INTERACTIVE,
         options.format_option("table", "json"),
     )
     for option in reversed(added):
@@ -65,16 +63,8 @@ def _settings(given: dict[str, Any]) -> Settings:
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
     names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
-    head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
+    head = {"schema": constants.JSON_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
-
-
-def _write_others(result: RunResult, store: str | URL, *, pdf: bool, interactive: bool) -> None:
-    """Write what is asked for beside the pages."""
-    if interactive:
-        write_interactive(store, result)
-    if pdf:
-        write_pdfs(result.pages)
 
 
 def _errors(result: RunResult) -> list[str]:
@@ -94,7 +84,7 @@ def run(
     ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
-    pdf, interactive, style = (given.pop(name) for name in ("pdf", "interactive", "style"))
+    pdf, style = given.pop("pdf"), given.pop("style")
     with terminal.progress_bars() as progress:
         result = run_pipeline(logs, stages, out, _settings(given), progress)
     if style == "json":
@@ -112,7 +102,8 @@ def run(
             click.echo(f"{rest} more changes; changes.csv lists all.")
         click.echo(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
-    _write_others(result, given["store"] or default_url(out), pdf=pdf, interactive=interactive)
+    if pdf:
+        write_pdfs(result.pages)
     some = result.n_refused or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
 
@@ -134,7 +125,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 
     Prints one line for each run, change and failure; with --format json one document a line.
     """
-    pdf, interactive, style = (given.pop(name) for name in ("pdf", "interactive", "style"))
+    pdf, style = given.pop("pdf"), given.pop("style")
     # Like an interrupt: workers end, and the next run continues.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):
@@ -150,8 +141,8 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             for change in result.changes:
                 click.echo(f"{now}{plain(str(change))}")
         terminal.print_errors(now + error for error in _errors(result))
-        url = given["store"] or default_url(out)
-        _write_others(result, url, pdf=pdf, interactive=interactive)
+        if pdf:
+            write_pdfs(result.pages)
 
 
 @options.command(
@@ -162,11 +153,8 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 @options.out_option(type=options.FOLDER, help="Folder of the pages.")
 @options.WORKERS
 @options.PDF
-@options.INTERACTIVE
 @click.pass_context
-def report(
-    ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool, interactive: bool
-) -> None:
+def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool) -> None:
     """Write the pages of all machines in a store, without their logs.
 
     The pages are those that `run` wrote last for each machine, byte for byte.
@@ -175,5 +163,6 @@ def report(
         result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")
     terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
-    _write_others(result, store, pdf=pdf, interactive=interactive)
+    if pdf:
+        write_pdfs(result.pages)
     ctx.exit(options.SOME_REFUSED if result.failed else 0)

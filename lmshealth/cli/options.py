@@ -184,11 +184,6 @@ _NOTIFY = click.option(
     help=f"Send the changes to the addresses of apprise in {NOTIFY}.",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
-INTERACTIVE = click.option(
-    "--interactive",
-    is_flag=True,
-    help="Also write a page of each stage with zoom and cursor, in the folder interactive.",
-)
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:

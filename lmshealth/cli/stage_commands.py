@@ -4,6 +4,7 @@ from typing import Any
 
 import click
 
+from lmshealth.batch.constants import JSON_SCHEMA
 from lmshealth.cli import options, terminal, views
 from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
@@ -26,7 +27,7 @@ def stage(described: Stage, style: str) -> None:
     checked = check_stage(described)
     content = stage_rows(checked, diagnose(checked))
     if style == "json":
-        terminal.print_json(content)
+        terminal.print_json({"schema": JSON_SCHEMA, **content})
     else:
         views.print_stage(content)
 

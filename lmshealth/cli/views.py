@@ -50,12 +50,6 @@ _FLAGS = {
     "cluster": "one estimate for two modes that the data do not separate.",
     "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }
-_VERDICTS = {
-    "told": "identifiable",
-    "longer-logs": "longer logs",
-    "together": "together",
-    "not-told": "not identifiable",
-}
 
 # Columns of the tables, as `cells` reads them.
 _MODES = (
@@ -353,7 +347,7 @@ def print_stage(content: dict[str, list[Row]]) -> None:
     parameters = []
     for row in content["parameters"]:
         outside = row["prior_below_map"] + row["prior_above_map"]
-        parameters.append(row | {"outside": outside, "answer": _VERDICTS[row["verdict"]]})
+        parameters.append(row | {"outside": outside, "answer": row["verdict"].replace("-", " ")})
     if parameters:
         print_table("Health parameters", cells(_COVERAGE, parameters))
         print_table("Standard deviation of the parameters", cells(_IDENTIFIABILITY, parameters))

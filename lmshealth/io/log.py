@@ -2,14 +2,12 @@
 
 from dataclasses import dataclass, field
 from datetime import datetime
-from itertools import pairwise
 from typing import Any, Literal
 
 import numpy as np
 
 from lmshealth._arrays import freeze
 from lmshealth._result import Result
-from lmshealth.errors import BadLog
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
@@ -121,19 +119,3 @@ class Log(Result):
         names = [one.name for one in self.channels]
         kinds = [one.kind for one in self.channels]
         return {"channel": names, "kind": kinds, "unit": [SI_UNITS[kind] for kind in kinds]}
-
-    def to_sep005(self) -> list[dict[str, object]]:
-        """Return the channels as SEP005 dictionaries: SI units, NaN where a sample is missing.
-
-        `BadLog` (``time``) for a record that is interrupted: SEP005 has one rate and start.
-        """
-        if any(end == start for (_, end), (start, _) in pairwise(self.pieces)):
-            detail = "the record is interrupted, which SEP005 cannot state; export its parts"
-            raise BadLog(self.name, "time", detail)
-        stated: dict[str, object] = {"fs": self.sample_rate}
-        if (moment := self.metadata.recorded_at) is not None:
-            stated["start_timestamp"] = moment.isoformat(sep=" ")
-        return [
-            {"data": c.values[:].copy(), "name": c.name, "unit_str": SI_UNITS[c.kind], **stated}
-            for c in self.channels
-        ]

@@ -4,21 +4,18 @@ import hashlib
 import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, as_samples, in_unit
+from lmshealth.io.buffers import Samples, in_unit
 from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
-from lmshealth.io.formats.unit_channels import Described, choose
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
@@ -91,97 +88,6 @@ def read_log(
         return _to_log(content, used, overrides or {}, name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
-
-
-def read_sep005(
-    channels: Sequence[Mapping[str, Any]],
-    *,
-    columns: ColumnMap | None = None,
-    overrides: Mapping[str, str] | None = None,
-    name: str = "SEP005",
-) -> Log:
-    """Read a log from SEP005 dictionaries, as `Log.to_sep005` returns them.
-
-    Parameters
-    ----------
-    channels : sequence of mapping
-        Each with ``data``, shape (n_samples,), ``name``, ``unit_str``, ``fs`` in Hz or ``time`` in
-        s, shape (n_samples,), and optionally ``start_timestamp`` (ISO 8601, UTC without a zone).
-    columns, overrides
-        As of `read_log`; channels whose unit is an acceleration need no column map.
-    name : str, optional
-        Name of the log in results.
-
-    Returns
-    -------
-    Log
-        In SI units; channels of another rate or start than most are in ``refused``.
-
-    Raises
-    ------
-    BadLog
-        With reason ``format`` for what is no SEP005, else as `read_log`.
-
-    References
-    ----------
-    SDyPy enhancement proposal 5, https://github.com/sdypy/sdypy/blob/main/docs/seps/sep-0005.rst
-    """
-    used = ColumnMap() if columns is None else columns
-    try:
-        given = [_sep005(one, k) for k, one in enumerate(channels)]
-        chosen, content = choose([one.channel for one in given], used)
-        read = [given[k] for k in chosen.values()]
-        samples = {key: as_samples(given[k].data) for key, k in chosen.items()}
-        times = [one.time for one in read if one.time is not None]
-        if any(not np.array_equal(times[0], time) for time in times):
-            raise Unusable("time", "channels have different times; needed the same of all")
-        if times:
-            samples["time_s"] = as_samples(times[0])
-        starts = sorted({one.start for one in read} - {""})
-        if len(starts) > 1:
-            raise Unusable("time", f"start_timestamp differs: {listed(starts)}; needed the same")
-        metadata = content.metadata | {"recorded_at": "".join(starts)}
-        content = replace(content, columns=samples, metadata=metadata)
-        digest = hashlib.sha256(repr([(one.channel, one.start) for one in given]).encode())
-        for one in given:
-            digest.update(one.data.tobytes())
-            digest.update(b"" if one.time is None else one.time.tobytes())
-        return _to_log(content, used, overrides or {}, name=name, digest=digest.hexdigest())
-    except Unusable as error:
-        raise BadLog(name, error.reason, error.detail) from error
-
-
-class _Sep005(NamedTuple):
-    """A SEP005 dictionary: channel, samples, their times in s ``(n_samples,)``, and their start."""
-
-    channel: Described
-    data: FloatArray
-    time: FloatArray | None
-    start: str
-
-
-def _sep005(channel: Mapping[str, Any], k: int) -> _Sep005:
-    """Check and read a SEP005 dictionary."""
-    try:
-        data, time, rate = channel["data"], channel.get("time"), channel.get("fs")
-        if not isinstance(data, np.ndarray) or data.ndim != 1 or data.dtype.kind not in "fiu":
-            raise TypeError("data is no array of numbers of one dimension")
-        if not isinstance(channel["name"], str) or not isinstance(channel["unit_str"], str):
-            raise TypeError(f"name {channel['name']!r} and unit_str must be text")
-        if time is not None and np.shape(time) != data.shape:
-            raise ValueError(f"time has {np.size(time)} values, data {data.size}")
-        if (time is None or rate is not None) and not 0 < float(rate or 0) < np.inf:
-            raise ValueError(f"fs is {rate}, needed a positive number")
-        start = str(channel.get("start_timestamp") or "")
-        if start and (moment := datetime.fromisoformat(start)).tzinfo is None:
-            start = moment.replace(tzinfo=UTC).isoformat()
-        described = Described(channel["name"], channel["unit_str"], rate and float(rate))
-        stamps = None if time is None else np.asarray(time, dtype=np.float64)
-        return _Sep005(described, data.astype(np.float64), stamps, start)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        what = f"no {error}" if isinstance(error, KeyError) else str(error)
-        needed = "needed a dictionary with data, name, unit_str, and fs or time"
-        raise Unusable("format", f"channel {k} is no SEP005: {what}; {needed}") from error
 
 
 def content_digest(path: str | Path, *, name: str | None = None) -> str:

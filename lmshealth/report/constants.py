@@ -35,8 +35,6 @@ REFUSED_SHOWN, REFUSED_UNFOLDED = 50, 12
 LIFE_EDGES = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
 # Weeks by which a service may be late, of which the page has the risk.
 POSTPONED_WEEKS = (0, 1, 2, 4, 8)
-# Draws of a posterior, at most, on an interactive page.
-DRAWS_SHOWN = 1500
 # Epochs, at most, in a small picture of health over travel.
 COURSE_POINTS = 24
 # Months of the calendar of services.

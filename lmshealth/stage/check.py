@@ -17,7 +17,7 @@ from lmshealth.stage.identifiability import Identifiability, identifiability_of
 from lmshealth.stage.modal_map import ModalMap
 
 # Values of the column `verdict` of `lmshealth stage`.
-Verdict = Literal["told", "longer-logs", "together", "not-told"]
+Verdict = Literal["identifiable", "longer-logs", "together", "not-identifiable"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,8 +55,8 @@ class ParameterCheck(ReadOnly):
     quantiles: tuple[float, ...]
     below: float
     above: float
-    # Identified by typical logs (``told``), by ``longer-logs`` only, ``together`` with other
-    # parameters as one combination, or ``not-told``.
+    # Identified by typical logs (``identifiable``), by ``longer-logs`` only, ``together`` with
+    # other parameters as one combination, or ``not-identifiable``.
     verdict: Verdict
     # prior_std, usual_std, endless_std: in the prior, after typical logs, and after unlimited
     # ones.
@@ -182,7 +182,7 @@ def _check_parameters(
             quantiles=tuple(spec.prior.quantile(np.array([0.005, 0.05, 0.95, 0.995])).tolist()),
             below=below,
             above=1 - upto,
-            verdict="not-told",
+            verdict="not-identifiable",
             prior_std=float(np.sqrt(information.prior[j])),
             usual_std=float(usual[j]),
             endless_std=float(endless[j]),
@@ -192,12 +192,12 @@ def _check_parameters(
             exponents=unlimited[j] / unlimited[j, j],
         )
         stds: dict[Verdict, float] = {
-            "told": found.usual_std,
+            "identifiable": found.usual_std,
             "longer-logs": found.endless_std,
             "together": found.known_std,
         }
         passed = (v for v, std in stds.items() if found.variance_removed(std) >= constants.INFORMED)
-        yield replace(found, verdict=next(passed, "not-told"))
+        yield replace(found, verdict=next(passed, "not-identifiable"))
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,7 +239,7 @@ def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
             f"standard deviation of {_share(parameter.known_std)}, {name} by itself"
         )
         step = " Track a mode that depends on the parameters in another proportion."
-    elif parameter.verdict == "not-told":
+    elif parameter.verdict == "not-identifiable":
         what = "is not identifiable"
         step = " The modes hardly depend on it: track a mode that depends on it more."
         if parameter.variance_removed(parameter.exact_map_std) >= constants.INFORMED:
@@ -254,7 +254,7 @@ def _identified(checked: StageCheck, parameter: ParameterCheck) -> Diagnostic:
         f"{_share(parameter.endless_std)} after unlimited logs and {_share(parameter.prior_std)} "
         f"in the prior.{step}"
     )
-    return Diagnostic("parameters", parameter.verdict == "told", text)
+    return Diagnostic("parameters", parameter.verdict == "identifiable", text)
 
 
 def _combination(checked: StageCheck, parameter: ParameterCheck) -> str:
@@ -267,7 +267,9 @@ def _combination(checked: StageCheck, parameter: ParameterCheck) -> str:
 
 
 def _correlated(checked: StageCheck) -> Iterator[Diagnostic]:
-    identified = [(k, p.name) for k, p in enumerate(checked.parameters) if p.verdict == "told"]
+    identified = [
+        (k, p.name) for k, p in enumerate(checked.parameters) if p.verdict == "identifiable"
+    ]
     for (i, first), (j, second) in combinations(identified, 2):
         value = checked.correlation[i, j]
         text = f"{first} and {second} are identifiable separately; their errors have a correlation"

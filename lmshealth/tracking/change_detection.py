@@ -71,7 +71,7 @@ def recent_loop_change(loop_changes: Sequence[int], first: int, now: int) -> int
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Change:
+class ChangeHypothesis:
     """The most likely change about a suspected log."""
 
     kind: ChangeKind  # of the step, or ``drift`` where a rate begins
@@ -105,7 +105,7 @@ def threshold(routes: int = constants.ALARM_ROUTES) -> float:
 
 def weigh_changes(
     model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
-) -> Change | None:
+) -> ChangeHypothesis | None:
     """Weigh all kinds of change about a suspected log by their evidence.
 
     `checkpoints` are the banks after each of the last logs, `now` is the present log. Returned is
@@ -127,7 +127,7 @@ def weigh_changes(
     # A step and a drift that begins there are both damage.
     if best in ("step", "drift"):
         others = [0.0] + [g for key, g in gains.items() if key[0] not in ("step", "drift")]
-    return Change(best, source, first, gain, gain - float(np.logaddexp.reduce(others)))
+    return ChangeHypothesis(best, source, first, gain, gain - float(np.logaddexp.reduce(others)))
 
 
 def _gains(

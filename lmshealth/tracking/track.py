@@ -13,16 +13,15 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
+from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth._result import Result
-from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import (
     N_CHECKPOINTS,
-    Change,
+    ChangeHypothesis,
     add_to_sums,
     begun,
     recent_loop_change,
@@ -281,72 +280,12 @@ def track(history: History, stage: Stage | None = None) -> Track:
     >>> [(event.kind, f"{track.recorded_at[event.epoch]:%d %B}") for event in track.events]
     [('alarm', '05 April')]
     """
-    return continue_track(history, stage)[0]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class TrackStart(ReadOnly):
-    """State after some logs, from which a track goes on when others follow: as in `_Tracker`.
-
-    Arrays have a row for each of these logs, unless stated otherwise.
-    """
-
-    key: str  # fingerprint of all that the state depends on
-    n_logs: int
-    kept: int  # log of the bank: the first checkpoint
-    bank: FilterBank
-    first: int
-    steps: tuple[Step, ...]  # detected ones
-    changes: tuple[tuple[Change, int], ...]  # theirs
-    alarms: tuple[Event, ...]
-    alarmed: bool
-    open: Change | None
-    weighed: tuple[int, int]
-    outlying: tuple[tuple[int, tuple[int, ...]], ...]  # logs and their rows
-    sums: FloatArray  # before log `kept`, and after each from it on
-    nis: FloatArray
-    innovations: FloatArray
-    mean: FloatArray
-    variance: FloatArray
-    drift_cov: FloatArray
-    noise_scale: FloatArray
-    widening: FloatArray
-
-
-# Fields of a start that a tracker has, with a row per log, and others.
-_PER_LOG = ("nis", "innovations", "mean", "variance", "drift_cov", "noise_scale")
-_AS_KEPT = ("first", "alarmed", "open", "weighed", "widening")
-
-
-def continue_track(
-    history: History, stage: Stage | None, before: TrackStart | None = None
-) -> tuple[Track, TrackStart | None]:
-    """Track a history from the state after its first logs, as `track` does from nothing.
-
-    The result is the same, bit for bit: a state of other logs, or of another model, is not used.
-    Returned is the state after all logs, too; a short history is tracked faster than it is stored.
-    """
     if not np.isfinite(history.ln_frequency).any():
         raise NotEnoughData(
             f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
             "a mode without a name is known once three logs show it"
         )
-    space = StateSpace(history, stage, history.steps)
-    tracker = _Tracker(FilterModel(space))
-    if before is not None and before.key == _inputs(space, before.n_logs):
-        tracker.resume(before)
-    found, n = tracker.run(), len(history.logs)
-    return found, tracker.start(_inputs(space, n)) if n >= 2 * N_CHECKPOINTS else None
-
-
-def _inputs(space: StateSpace, n: int) -> str:
-    """Return the fingerprint of all that the first n logs of a track depend on."""
-    if not space.history.baselines[0] < n <= len(space.history.logs):
-        return ""
-    columns = [
-        (one.name, one.prior_std, one.values[:n], one.unknown[:n]) for one in space.regressed
-    ]
-    return fingerprint(VERSION, space.history.first_logs(n), space.size, columns)
+    return _Tracker(FilterModel(StateSpace(history, stage, history.steps))).run()
 
 
 class _Tracker:
@@ -377,55 +316,16 @@ class _Tracker:
         self.widening = np.empty(0)
         self.loop_changes = unexplained_loop_changes(self.history.loop_error, model.space.steps)
         # Detected changes by the number of their step, with the log that detected them.
-        self.changes: dict[int, tuple[Change, int]] = {}
+        self.changes: dict[int, tuple[ChangeHypothesis, int]] = {}
         self.alarms: list[Event] = []
         self.alarmed = False
         # A significant change whose kind is not settled, and the last suspicion that was weighed.
-        self.open: Change | None = None
+        self.open: ChangeHypothesis | None = None
         self.weighed = (-1, -1)
-        self.next = 0  # log that is filtered next
-
-    def resume(self, before: TrackStart) -> None:
-        """Take over a state; the logs after its first checkpoint are filtered again."""
-        n, kept, length = before.n_logs, before.kept, len(self.history.logs)
-        for name in _PER_LOG:
-            getattr(self, name)[:n] = getattr(before, name)
-        for name in _AS_KEPT:
-            setattr(self, name, getattr(before, name))
-        self.sums[kept : n + 1] = before.sums
-        self.outlying, self.alarms = dict(before.outlying), list(before.alarms)
-        for step in before.steps:
-            own = Step.found(step.kind, step.first, length, step.source)
-            self.model = self.model.with_step(own)
-        steps = self.model.space.steps
-        found = range(len(steps) - len(before.steps), len(steps))
-        self.changes = dict(zip(found, before.changes, strict=True))
-        self.loop_changes = unexplained_loop_changes(self.history.loop_error, steps)
-        self.bank = self.checkpoints[kept] = before.bank
-        for again in range(kept + 1, n):
-            self._filter(again)
-        self.next = n
-
-    def start(self, key: str) -> TrackStart:
-        """Return the state after all logs."""
-        kept = min(self.checkpoints)
-        return TrackStart(
-            key=key,
-            n_logs=len(self.history.logs),
-            kept=kept,
-            bank=self.checkpoints[kept],
-            steps=tuple(step for step in self.model.space.steps if not step.declared),
-            changes=tuple(self.changes.values()),
-            alarms=tuple(self.alarms),
-            outlying=tuple(self.outlying.items()),
-            sums=self.sums[kept:].copy(),
-            **{name: getattr(self, name) for name in _AS_KEPT},
-            **{name: getattr(self, name).copy() for name in _PER_LOG},
-        )
 
     def run(self) -> Track:
-        """Filter all logs that are left."""
-        for k in range(self.next, len(self.history.logs)):
+        """Filter all logs."""
+        for k in range(len(self.history.logs)):
             if k in self.resets and k:
                 self._begin_regime(self.bank, k, anew=True)
                 self.alarmed = False
@@ -494,7 +394,7 @@ class _Tracker:
             self._alarm(k, evidence)
         return False
 
-    def _adopt(self, change: Change, k: int) -> bool:
+    def _adopt(self, change: ChangeHypothesis, k: int) -> bool:
         """Add a change to the model and filter again from the checkpoint before it.
 
         A drift that is no damage, or follows an alarm, is not adopted.

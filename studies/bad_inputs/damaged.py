@@ -182,7 +182,8 @@ def judge(
         "wrong": other[:50],
         "controls": caught,
         "confusion": [
-            {"kind": kind, "told": told, "logs": count} for (kind, told), count in counts.items()
+            {"kind": kind, "reported": told, "logs": count}
+            for (kind, told), count in counts.items()
         ],
         "passed": {
             "every log is told right": not other,

@@ -238,7 +238,7 @@ def addresses(folder: Path, forms: Sequence[str]) -> Row:
             done = lmshealth(*more, cwd=folder)
             status.append(done.returncode)
             if PASSWORD in done.stdout + done.stderr or "Traceback" in done.stderr:
-                shown.append({"address": form, "command": more[0], "said": done.stderr[-600:]})
+                shown.append({"address": form, "command": more[0], "message": done.stderr[-600:]})
     return {"tried": len(status), "exit_status": sorted(set(status)), "shown": shown}
 
 

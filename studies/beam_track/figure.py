@@ -35,7 +35,7 @@ def draw_figure(figure: Figure, result: Row) -> None:
     left.set_ylim(-30, 60)
     left.set_title("estimates alone")
     left.set_ylabel("drift of ln f since the first dwell in %, ± 2σ")
-    draw(right, result["repeats"], "told")
+    draw(right, result["repeats"], "informed")
     right.set_title("roller position as covariate")
     right.legend(loc="upper right")
     figure.suptitle("Tracked beam through ramp and return; circles: back at the first position")

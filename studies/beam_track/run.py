@@ -6,7 +6,7 @@ Method
     free decay of every dwell of the roller (study `decays`); every dwell is one log. The track is
     computed without information on the roller ("blind": the drift model of slow wear does not
     hold, and the consistency test should fail) and with its measured position as a quadratic
-    covariate ("told"). The drift of the last log at the first position is compared with its
+    covariate ("informed"). The drift of the last log at the first position is compared with its
     standard deviation.
 Answer
     Yes, in all three repeats. With the covariate the drift after the return is -0.07 to 0.02 %,
@@ -71,7 +71,7 @@ def one_repeat(folder: Path, repeat: int, some: slice) -> Row:
         "f_std_hz": [row["f_std_hz"] for row in rows],
         "refused": [refusal.reason for refusal in refused],
         "blind": follow(history, blind, rows),
-        "told": follow(history, informed, rows),
+        "informed": follow(history, informed, rows),
     }
 
 
@@ -123,7 +123,7 @@ def judge(repeats: list[Row]) -> dict[str, bool]:
             abs(r["blind"]["off_in_std"]) < 2 for r in repeats
         ),
         "the state returns within two standard deviations, told": all(
-            abs(r["told"]["off_in_std"]) < 2 for r in repeats
+            abs(r["informed"]["off_in_std"]) < 2 for r in repeats
         ),
         "it went away in between: blind drift over 30 % at the stiffest dwell": all(
             max(r["blind"]["drift"]) > 0.3 or len(r["f_hz"]) < 10 for r in repeats
@@ -135,7 +135,7 @@ def judge(repeats: list[Row]) -> dict[str, bool]:
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim the excursion of the beam, and its return."""
     repeats, passed = answer["repeats"], answer["passed"]
-    ways = [(row, way) for row in repeats for way in ("blind", "told")]
+    ways = [(row, way) for row in repeats for way in ("blind", "informed")]
     off = [abs(row[way]["off_in_std"]) for row, way in ways]
     far = [max(row["blind"]["drift"]) for row in repeats]
     yield Claim(
@@ -145,7 +145,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"2 required; excursion {span(far)} in ln f",
         all(fine for name, fine in passed.items() if name != DISAGREES),
     )
-    scatter = span(row["told"]["scatter_over_std"] for row in repeats)
+    scatter = span(row["informed"]["scatter_over_std"] for row in repeats)
     yield Claim(
         "scatter of its estimates about the track over what is stated, roller position known",
         scatter,

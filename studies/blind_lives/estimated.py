@@ -75,7 +75,7 @@ def blind_life(number: int) -> Row:
         "drawn": plan.plant_seed is not None,
         "logs": plan.logs,
         "truth": truth_of(plan, pd.DataFrame(table)),
-        "told": {"verdict": judged.verdict, "probability": _number(judged.probability),
+        "reported": {"verdict": judged.verdict, "probability": _number(judged.probability),
                  "shown": None, "refused": {}, "events": _events(made)} | _intervals(made),
     }  # fmt: skip
 

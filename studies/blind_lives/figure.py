@@ -20,7 +20,7 @@ _HORIZON_KM = 20_000.0
 def draw_figure(figure: Figure, record: Row) -> None:
     """Draw the table of verdicts, and a panel per quantity with a row per machine."""
     axes = figure.subplots(1, 4, width_ratios=(1.25, 1, 1, 1))
-    _confusion(axes[0], record["verdicts"]["all"]["told_of_true"])
+    _confusion(axes[0], record["verdicts"]["all"]["reported_of_true"])
     for ax, panel in zip(axes[1:], PANELS, strict=True):
         _intervals(ax, record["rows"], *panel)
     legend_above(figure, axes[1], ncols=2, fontsize=8)
@@ -46,8 +46,8 @@ def _intervals(ax: Axes, rows: list[Row], what: str, name: str, label: str) -> N
     scale, top = (1e-3, _HORIZON_KM) if what == "left" else (1.0, np.inf)
     found = []
     for row in rows:
-        if name in row["told"][what] and name in row["truth"][what]:
-            own = row["told"][what][name]
+        if name in row["reported"][what] and name in row["truth"][what]:
+            own = row["reported"][what][name]
             values = (row["truth"][what][name], own["q50"], own["q05"], own["q95"])
             found.append([scale * (top if v is None else v) for v in values])
     if found:

@@ -84,7 +84,7 @@ _SHORT = -3.09
 
 def confusion(rows: Iterable[Row]) -> dict[str, dict[str, int]]:
     """Count reported by true verdicts, each in the order of `WORDS`."""
-    seen = Counter((row["truth"]["verdict"], row["told"]["verdict"]) for row in rows)
+    seen = Counter((row["truth"]["verdict"], row["reported"]["verdict"]) for row in rows)
     return {true: {reported: seen[true, reported] for reported in WORDS} for true in WORDS}
 
 
@@ -115,9 +115,9 @@ def sureness(rows: Iterable[Row]) -> Row:
     those of a constant probability.
     """
     pairs = [
-        (row["told"]["probability"], row["told"]["verdict"] == row["truth"]["verdict"])
+        (row["reported"]["probability"], row["reported"]["verdict"] == row["truth"]["verdict"])
         for row in rows
-        if row["told"]["probability"] is not None
+        if row["reported"]["probability"] is not None
     ]
     if not pairs:
         return {"n": 0}
@@ -139,7 +139,11 @@ def sureness(rows: Iterable[Row]) -> Row:
             for p in (reported, base)
         ],
         "bins": [
-            {"from": _BINS[k], "to": _BINS[k + 1], "told": round(float(reported[own].mean()), 4)}
+            {
+                "from": _BINS[k],
+                "to": _BINS[k + 1],
+                "reported": round(float(reported[own].mean()), 4),
+            }
             | share(map(bool, right[own]))
             | {"holds": _as_often(reported[own], int(right[own].sum()))}
             for k in range(len(_BINS) - 1)
@@ -162,8 +166,8 @@ def coverages(rows: Iterable[Row], what: str, names: Iterable[str]) -> dict[str,
     found = list(rows)
     reported: dict[str, dict[str, Row]] = {}
     for name in names:
-        pairs = [(row["told"][what][name], row["truth"][what][name]) for row in found
-                 if name in row["told"][what] and name in row["truth"][what]]  # fmt: skip
+        pairs = [(row["reported"][what][name], row["truth"][what][name]) for row in found
+                 if name in row["reported"][what] and name in row["truth"][what]]  # fmt: skip
         reported[name] = {
             f"{100 * level:.0f}{way}": _at_least(
                 level, [_holds(*pair, ends, times) for pair in pairs]

@@ -109,7 +109,7 @@ def archive_of(plans: Sequence[BlindPlan], *, quick: bool = False) -> list[Row]:
                 "kind": plan.life,
                 "logs": plan.logs,
                 "truth": truth_of(plan, pd.read_csv(truths / f"{plan.identity}.csv")),
-                "told": reported.get(plan.identity, SILENT),
+                "reported": reported.get(plan.identity, SILENT),
             }
             for plan in plans
         ]
@@ -123,14 +123,14 @@ def judged(rows: Sequence[Row]) -> Row:
     ending = [row for row in rows if row["truth"]["left"]["any"] is not None]
     refused: Counter[str] = Counter()
     for row in rows:
-        refused.update(row["told"]["refused"])
+        refused.update(row["reported"]["refused"])
     return {
         "seed": SEED,
         "lives": len(rows),
         "verdicts": {
-            name: {"right": lives.share(row["told"]["verdict"] == row["truth"]["verdict"]
+            name: {"right": lives.share(row["reported"]["verdict"] == row["truth"]["verdict"]
                                         for row in own),
-                   "told_of_true": lives.confusion(own)}
+                   "reported_of_true": lives.confusion(own)}
             for name, own in (("all", rows), ("clear of borders", clear), (OTHERS, others))
         },
         "sureness": {"all": lives.sureness(rows), OTHERS: lives.sureness(others)},
@@ -143,15 +143,15 @@ def judged(rows: Sequence[Row]) -> Row:
         },
         "sound_kinds": {
             "called worn or stepped": lives.share(
-                row["told"]["verdict"] not in ("healthy", "not-enough-data") for row in sound
+                row["reported"]["verdict"] not in ("healthy", "not-enough-data") for row in sound
             ),
-            "alarms": lives.share("alarm" in row["told"]["events"] for row in sound),
+            "alarms": lives.share("alarm" in row["reported"]["events"] for row in sound),
         },
         "steps_to_come": sum(row["truth"]["to_come"] for row in rows),
         "ends_beyond_horizon": _beyond(rows),
         "refused": {"logs": sum(row["logs"] for row in rows)} | dict(sorted(refused.items())),
         "front_page": lives.share(
-            agrees(row["told"]) for row in rows if row["told"]["shown"] is not None
+            agrees(row["reported"]) for row in rows if row["reported"]["shown"] is not None
         ),
         "drawn": sum(row.get("drawn", False) for row in rows),
     }  # fmt: skip
@@ -159,8 +159,8 @@ def judged(rows: Sequence[Row]) -> Row:
 
 def _beyond(rows: Iterable[Row]) -> dict[str, Row]:
     """Count machines, with and without a limit reached, whose median end is past the horizon."""
-    pairs = [(row["truth"]["left"]["any"], row["told"]["left"]["any"]) for row in rows
-             if "any" in row["told"]["left"]]  # fmt: skip
+    pairs = [(row["truth"]["left"]["any"], row["reported"]["left"]["any"]) for row in rows
+             if "any" in row["reported"]["left"]]  # fmt: skip
     return {
         name: lives.share(
             reported["q50"] is None for true, reported in pairs if (true is None) is never
@@ -238,7 +238,7 @@ def _verdicts(answer: Row) -> Iterator[Claim]:
         yield share(
             f"verdicts with a probability of {one['from']:g} to {one['to']:g} that are right",
             one,
-            f"{100 * one['told']:.1f} % expected",
+            f"{100 * one['reported']:.1f} % expected",
             met=one.get("holds", True),
         )
     own, base = sure["brier"]

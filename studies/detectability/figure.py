@@ -116,7 +116,7 @@ def draw_figure(figure: Figure, result: Row) -> None:
     left, right = bottom.subplots(1, 2, width_ratios=(1, 1.3))
     draw_law(left, result)
     draw_checks(right, result)
-    figure.supxlabel("\n".join(wrap(f"Not drawn, {result['unseen']['said']}", 170)), fontsize=7)
+    figure.supxlabel("\n".join(wrap(f"Not drawn, {result['unseen']['message']}", 170)), fontsize=7)
 
 
 if __name__ == "__main__":

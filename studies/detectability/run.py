@@ -110,7 +110,7 @@ def refused(name: str, parameter: str) -> Row:
         plan(load_stage(name), parameter, 0.05)
     except BadQuestion as error:
         said = str(error)
-    return {"stage": name, "parameter": parameter, "said": said}
+    return {"stage": name, "parameter": parameter, "message": said}
 
 
 def checks(name: str, parameter: str, trials: int) -> list[Row]:
@@ -212,7 +212,7 @@ def verdicts(answer: Row) -> dict[str, bool]:
     steps = [np.diff(table, axis=axis) for table in tables for axis in (0, 1)]
     return {
         "more and longer logs see less": all((own[np.isfinite(own)] < 0).all() for own in steps),
-        "the mount of X is not shown": answer["unseen"]["said"] is not None,
+        "the mount of X is not shown": answer["unseen"]["message"] is not None,
         "the power is the planned one": all(row["power"]["holds"] for row in arms["as planned"]),
         "false alarms are the planned ones": all(
             row["false_alarms"]["holds"] for row in arms["as planned"]

@@ -99,8 +99,8 @@ def summary(batches: list[Row], n: int) -> Row:
         "how": dict(Counter(kill["how"] for kill in kills)),
         "when": dict(Counter(kill["when"] for kill in kills)),
         "interrupts": {
-            "told_in_one_line": sum(kill["told"] for kill in interrupts),
-            "others": [kill for kill in interrupts if not kill["told"]],
+            "reported_in_one_line": sum(kill["in_one_line"] for kill in interrupts),
+            "others": [kill for kill in interrupts if not kill["in_one_line"]],
         },
         "slowest_end_s": max(kill["gone_s"] for kill in kills),
     }
@@ -140,7 +140,7 @@ def killed(
                 status, messages = run.status(), run.messages()
             if how == "SIGINT":
                 kills[-1] |= {
-                    "told": one_line(messages),
+                    "in_one_line": one_line(messages),
                     "lines": len(messages),
                     "last": messages[-1:],
                 }

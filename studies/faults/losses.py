@@ -140,7 +140,7 @@ def failures(ends: Ends) -> Row:
         if status != SOME_REFUSED and not (status == 1 and one_line(messages))
     ]
     reported = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
-    return {"failed": len(failed), "said": sorted(reported), "other_ends": other}
+    return {"failed": len(failed), "messages": sorted(reported), "other_ends": other}
 
 
 def claims(answer: Row) -> Iterator[Claim]:

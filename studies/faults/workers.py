@@ -63,7 +63,7 @@ def main() -> None:
         "the comparison sees what is wrong": all(answer["control"].values()),
     }
     if lost := answer["scheduler lost"]:
-        reported = lost["status"] == 1 and driving.one_line(lost["said"])
+        reported = lost["status"] == 1 and driving.one_line(lost["messages"])
         answer["passed"] |= {
             "as uninterrupted, scheduler lost": not lost["differences"],
             "told in one line, scheduler lost": reported,
@@ -111,7 +111,7 @@ def scheduler_lost(reference: Reference) -> Row:
             status, messages = run.status(), run.messages()
         with dask_cluster() as cluster:
             driving.completed(reference.command(out, store, "--scheduler", cluster.address))
-        return {"status": status, "said": messages, "differences": reference.judge(out, store)}
+        return {"status": status, "messages": messages, "differences": reference.judge(out, store)}
 
 
 def claims(answer: Row) -> Iterator[Claim]:

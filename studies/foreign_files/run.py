@@ -1,10 +1,10 @@
 """Are files of other programs read right, or refused with what to set?
 
 Method
-    Each of 15 formats, frequency responses of SINUMERIK and SEP005 dictionaries are written by
-    two or three independent writers (`writers.py`: the layout by hand; and the library of the
-    format, or another way to write the layout), and read; every sample and the rate are
-    compared in SI units. Then files whose content has two readings or is no log: each must be
+    Each of 15 formats and frequency responses of SINUMERIK are written by two or three
+    independent writers (`writers.py`: the layout by hand; and the library of the format, or
+    another way to write the layout), and read; every sample and the rate are compared in SI
+    units. Then files whose content has two readings or is no log: each must be
     refused with what is there and what to set. Then 2,000 files of text in a dialect that is
     drawn (`dialects.py`: delimiter, decimal mark, encoding, names and units, lines before them,
     blanks, groups of other rates, numbers, times, line ends). What no reader can decide is not
@@ -13,7 +13,7 @@ Method
     included; refused; or wrong. Control: a reader that takes commas for marks between
     thousands, on files with decimal commas: the same comparison must find its values wrong.
 Answer
-    456 files of 17 formats are read right. Of 2,000 dialects none is read with other values,
+    432 files of 16 formats are read right. Of 2,000 dialects none is read with other values,
     1,771 are read, 47 have marks between thousands and 182 are refused otherwise: units behind
     names between blanks, moments between colons.
 Run time
@@ -32,7 +32,7 @@ import numpy as np
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.reading import read_log, read_sep005
+from lmshealth.io.reading import read_log
 from lmshealth.modal.frf.measured import read_responses
 from studies.foreign_files import dialects, writers
 from studies.foreign_files.writers import WRITERS, Held
@@ -174,33 +174,7 @@ def by_base64(folder: Path, seed: int) -> str:
     return _response(writers.words_by_base64, folder, seed)
 
 
-def sep005_by_hand(folder: Path, seed: int) -> str:
-    """Make dictionaries with a rate."""
-    t = writers.table(seed)
-    made = [
-        {"data": v, "name": n, "unit_str": "g", "fs": t.rate} for n, v in (("a", t.a), ("b", t.b))
-    ]
-    return _sep005(made, {"acc_a": 9.80665 * t.a, "acc_b": 9.80665 * t.b}, t.rate)
-
-
-def sep005_by_time(folder: Path, seed: int) -> str:
-    """Make dictionaries with times, and pass them out and in again."""
-    t = writers.table(seed)
-    made = [{"data": v, "name": n, "unit_str": "m/s²", "time": t.time, "start_timestamp":
-             "2026-01-05 08:00:00"} for n, v in (("a", t.a), ("b", t.b))]  # fmt: skip
-    again = read_sep005(made).to_sep005()
-    return _sep005(again, {"acc_a": t.a, "acc_b": t.b}, t.rate)
-
-
-def _sep005(made: list[dict[str, object]], held: Held, rate: float) -> str:
-    log = read_sep005(made)
-    return compare({c.name: c.values[:] for c in log.channels}, held, log.sample_rate, rate, set())
-
-
-OTHERS = {
-    "SINUMERIK responses": (by_hand, by_base64),
-    "SEP005 dictionaries": (sep005_by_hand, sep005_by_time),
-}
+OTHERS = {"SINUMERIK responses": (by_hand, by_base64)}
 
 
 def judge_refusals() -> dict[str, bool]:

@@ -49,8 +49,8 @@ from studies.health_robustness.trials import Answer, Arm, Case, Followed, follow
 
 STEP = "health, on machines outside the model"
 OLDER = {
-    "result": Older("62df3d765a0b", "laws were weighed"),
-    "control": Older("0c702f1698ba", "laws were weighed"),
+    "result": Older("b91ff6c91a8b", "laws were weighed"),
+    "control": Older("981ac180e721", "laws were weighed"),
 }
 AXES = {"lms-y": "Y", "lms-x": "X"}
 STAGES = tuple(AXES)
@@ -187,7 +187,7 @@ def rows(found: dict[str, list[list[Answer]]], stage: str, head: Row) -> list[Ro
     """Summarise per question and parameter."""
     told = trials.told(stage)
     return [
-        {"stage": stage, **head, "what": what, "parameter": name, "told": told[name]}
+        {"stage": stage, **head, "what": what, "parameter": name, "identifiable": told[name]}
         | trials.summed([answers[j] for answers in own])
         for what, own in found.items()
         if own
@@ -354,7 +354,7 @@ def verdicts(answer: Row) -> dict[str, bool]:
         return bool(own) and all(row["90"]["high"] < 0.9 for row in own if row["what"] != "left")
 
     # Of what no log tells, the truth of a fixed schedule lies where it will in the prior.
-    shown = [row for row in answer["lives"] if row["told"]]
+    shown = [row for row in answer["lives"] if row["identifiable"]]
     epochs = [row for row in shown if row["what"] in ("epoch", "last")]
     laws = [row for row in shown if row["what"] in ("now", "left")]
     bare = fleet(WRONG, "no error term")
@@ -385,7 +385,7 @@ def claims_raw(answer: Row) -> Iterator[Claim]:
         for stage, name in AXES.items():
             own = [
                 row["90"] for row in rows if row["stage"] == stage and row["what"] in asked
-                and (row["told"] or how == "of the remaining life")
+                and (row["identifiable"] or how == "of the remaining life")
             ]  # fmt: skip
             yield counted(
                 f"90 % intervals {how} hold the truth ({name}, raw lives of ten kinds)",
@@ -396,7 +396,7 @@ def claims_raw(answer: Row) -> Iterator[Claim]:
             )
     jumped = [
         row["error"] for row in rows
-        if row["kind"] in JUMPING and row["what"] == "now" and row["told"]
+        if row["kind"] in JUMPING and row["what"] == "now" and row["identifiable"]
     ]  # fmt: skip
     worst = max(jumped, key=lambda row: abs(row["mean"]))
     yield Claim(
@@ -408,7 +408,9 @@ def claims_raw(answer: Row) -> Iterator[Claim]:
 
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim what intervals of drawn lives hold, with maps that are right and wrong."""
-    shown = [row for row in answer["lives"] if row["told"] and row["what"] in ("epoch", "last")]
+    shown = [
+        row for row in answer["lives"] if row["identifiable"] and row["what"] in ("epoch", "last")
+    ]
     hits, n = (sum(row["90"][key] for row in shown) for key in ("hits", "n"))
     yield counted(
         "90 % intervals at epochs hold the truth (drawn lives of ten kinds)",

@@ -23,7 +23,7 @@ def rows_of(answer: Row) -> list[tuple[str, Row]]:
 def draw_widths(ax: Axes, rows: list[tuple[str, Row]]) -> None:
     """Draw the median width of the 90 % interval of ln parameter, hatched where it is no claim."""
     for y, (_, own) in enumerate(rows):
-        claimed, width = own["told"] > 0.5, 100 * own["median_width"]
+        claimed, width = own["published"] > 0.5, 100 * own["median_width"]
         style = {"color": BLUE} if claimed else {"color": "white", "hatch": "///"}
         ax.barh(y, width, height=0.6, edgecolor=BLACK, lw=0.8, **style)
         text = f"{width:.1f} %" + ("" if claimed else ", not claimed")

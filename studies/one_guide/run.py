@@ -38,7 +38,7 @@ from studies.harness.study import Row, Study, judge_places
 STEP = "infer"
 
 OLDER = {
-    "result": Older("bc0037068c58", "a map could be wrong by more than it declares"),
+    "result": Older("8e796b4da30a", "a map could be wrong by more than it declares"),
 }
 
 Array = NDArray[np.float64]
@@ -97,7 +97,7 @@ def told(health: Health, truth: tuple[float, ...]) -> Row:
             "level": float(np.mean(draws < truth[j])),
             "half_level": float(np.mean(half < np.log(truth[j]))),
             "width": float(np.ptp(np.log(np.quantile(draws, [0.05, 0.95])))),
-            "told": bool(health.publishable_parameters()[j]),
+            "published": bool(health.publishable_parameters()[j]),
         }
     return rows
 
@@ -110,8 +110,11 @@ def judged(rows: list[Row], level_name: str = "level") -> list[Row]:
 
 def summary(rows: list[Row]) -> Row:
     """Summarise one parameter over all trials."""
-    width, told = np.median([row["width"] for row in rows]), np.mean([row["told"] for row in rows])
-    return {"coverage": judged(rows), "median_width": float(width), "told": float(told)}
+    width, told = (
+        np.median([row["width"] for row in rows]),
+        np.mean([row["published"] for row in rows]),
+    )
+    return {"coverage": judged(rows), "median_width": float(width), "published": float(told)}
 
 
 def main() -> None:
@@ -150,8 +153,8 @@ def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     gain = answer["preload_narrower_than_y_alone"]
     checks = {
         "all intervals cover": all(row["holds"] for row in rows),
-        "the mount of X is never claimed": all(own["told"] == 0 for own in mounts),
-        "preload and the mount of Y are told": all(own["told"] == 1 for own in known),
+        "the mount of X is never claimed": all(own["published"] == 0 for own in mounts),
+        "preload and the mount of Y are told": all(own["published"] == 1 for own in known),
         "together the preload is known better than from Y": gain > 1,
     }
     if not quick:
@@ -183,7 +186,7 @@ def claims(answer: Row) -> Iterator[Claim]:
             + percents(row["share"] for row in controls),
         )
     mounts = [ways["X alone"]["mount_stiffness"], ways["together"]["lms-x:mount_stiffness"]]
-    told = [own["told"] for own in mounts]
+    told = [own["published"] for own in mounts]
     yield Claim("how often the mount of X is claimed", percents(told), "", "", not any(told))
 
 

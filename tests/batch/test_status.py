@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from lmshealth._serialize import pack, unpack
+from lmshealth.batch import constants
 from lmshealth.batch.status import (
     Status,
     coming_states,
@@ -47,7 +48,6 @@ SOUND: dict[str, Any] = {
     "service": "by",
     "service_by": date(2027, 6, 1),
     "inspect_by": date(2026, 12, 24),
-    "prognoses": (),
 }
 ALARM = {"roll": LAST}
 OPEN = {"verdict": "not-enough-data", "service_by": None, "inspect_by": None}
@@ -157,6 +157,19 @@ def test_changes_since_the_last_run(
     assert all((one.stage, one.recorded_at) == ("M7-Y", LAST) for one in found)
 
 
+def test_a_status_of_an_earlier_schema_is_read_and_written_in_this_one() -> None:
+    """What schema 1 had more is left out, and the machine has no change."""
+    earlier = msgspec.to_builtins(status()) | {
+        "schema": 1,
+        "Prognoses": [{"Activity": "Service", "PredictedTime": "2027-06-01T00:00:00Z"}],
+    }
+    before = msgspec.json.decode(msgspec.json.encode(earlier), type=Status)
+    found, changes = compare(before, before, LAST + timedelta(days=5), None)
+    assert before.schema == 1 and changes == []
+    assert found.schema == constants.JSON_SCHEMA == 2
+    assert "Prognoses" not in msgspec.to_builtins(found)
+
+
 def test_a_silence_is_reported_once_and_lasts_until_the_next_log() -> None:
     """Also through a run that does not ask for silences; the limit itself is none yet."""
     found, changes = compare(status(), status(), LAST + timedelta(days=7), 7.0)
@@ -194,14 +207,7 @@ def test_a_status_has_the_numbers_of_the_tables(make: Maker) -> None:
     assert found["verdict"] == "both" and found["service"] == service.kind == "by"
     assert service.by is not None and service.inspect_by is not None
     assert found["service_by"] == service.by.isoformat()
-    first, log, *limits = found["Prognoses"]
-    assert first["PredictedTime"] == f"{service.by.isoformat()}T00:00:00Z"
-    assert (first["Activity"], first["Probability"]) == ("Service", service.risk)
-    assert log["PredictedTime"] == f"{service.inspect_by.isoformat()}T00:00:00Z"
-    assert [one["Activity"] for one in limits] == [
-        "Restore guide preload",
-        "Restore mount stiffness",
-    ]
+    assert found["inspect_by"] == service.inspect_by.isoformat()
     assert summary.life is not None
     last = found["remaining_life"][-1]
     assert (last["parameter"], last["service"]) == ("any", "by")
@@ -215,7 +221,7 @@ def test_a_status_has_the_numbers_of_the_tables(make: Maker) -> None:
 def test_what_is_not_known_is_null_or_left_out(make: Maker) -> None:
     """Without results there is no probability, date or life; an undetermined value is left out."""
     found = document(nothing(make()))
-    assert (found["probability"], found["service_by"], found["Prognoses"]) == (None, None, [])
+    assert (found["probability"], found["service_by"]) == (None, None)
     assert (found["service"], found["probability_limit_reached"]) == ("unknown", None)
     assert [own["parameter"] for own in document(blind(make()))["health"]] == ["guide_preload"]
 

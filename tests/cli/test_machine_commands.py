@@ -288,8 +288,8 @@ def test_as_json_it_has_numbers_and_null(tmp_path: Path, parameters: tuple[str, 
         2 * n,
         n * (n - 1) / 2,
     ]
-    assert {row["verdict"] for row in content["parameters"]} <= {"told", "not-told"}
-    assert (content["stage"][0]["model_std"] is None) == (n == 0)
+    assert {row["verdict"] for row in content["parameters"]} <= {"identifiable", "not-identifiable"}
+    assert content["schema"] == 2 and (content["stage"][0]["model_std"] is None) == (n == 0)
     assert content["findings"][0]["topic"] == "parameters"
 
 

@@ -159,6 +159,18 @@ def seen_rows(page: Any) -> list[str]:
 
 
 @pytest.mark.slow
+def test_the_check_of_requests_can_fail(browser: Any, tmp_path: Path) -> None:
+    """A page that loads a script from elsewhere is noticed, even where its policy stops it."""
+    path = write_index(tmp_path, make_rows(2), ())
+    text = path.read_text(encoding="utf-8")
+    path.write_text(
+        text.replace("</main>", '<script src="https://x.invalid/a.js"></script></main>')
+    )
+    _, seen = watch(browser, path)
+    assert any("x.invalid" in one for one in seen)
+
+
+@pytest.mark.slow
 def test_a_stage_is_found_by_its_name(browser: Any, fleet: Path) -> None:
     """Parts of name and verdict match in any order and without accents; the count is announced."""
     page, seen = watch(browser, fleet)

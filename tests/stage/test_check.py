@@ -98,7 +98,7 @@ def test_one_parameter_and_one_mode_are_the_closed_form(tmp_path: Path) -> None:
 
 def test_two_modes_identify_two_parameters(two: StageCheck) -> None:
     """Both are identified, less well than were the other known; errors are correlated."""
-    assert verdicts(two) == dict.fromkeys(NAMES, "told")
+    assert verdicts(two) == dict.fromkeys(NAMES, "identifiable")
     assert all(check.known_std < check.endless_std for check in two.parameters)
     assert two.correlation[0, 1] < -0.5
     np.testing.assert_allclose(two.correlation, two.correlation.T)
@@ -126,7 +126,7 @@ def test_noise_that_only_more_logs_average(tmp_path: Path) -> None:
 def test_a_parameter_without_effect_is_not_identified(tmp_path: Path) -> None:
     """Of three parameters the two that move modes are identified, the third keeps its prior."""
     checked = check_stage(make_stage(tmp_path, (PRELOAD, MOUNT, FOOT), n_modes=3))
-    assert verdicts(checked) == dict.fromkeys(NAMES, "told") | {"foot": "not-told"}
+    assert verdicts(checked) == dict.fromkeys(NAMES, "identifiable") | {"foot": "not-identifiable"}
     foot = checked.parameters[2]
     assert foot.endless_std == pytest.approx(foot.prior_std)
     assert checked.correlation.shape == (3, 3)
@@ -198,9 +198,9 @@ def test_more_logs_in_the_baseline_reduce_the_deviation(stage: Stage, two: Stage
 def test_the_mount_shows_in_y_and_not_in_x() -> None:
     """The shipped descriptions: what `plan` refuses is not identified here."""
     assert verdicts(check_stage(load_stage("lms-x"))) == {
-        "guide_preload": "told", "mount_stiffness": "not-told",
+        "guide_preload": "identifiable", "mount_stiffness": "not-identifiable",
     }  # fmt: skip
-    assert verdicts(check_stage(load_stage("lms-y"))) == dict.fromkeys(NAMES, "told")
+    assert verdicts(check_stage(load_stage("lms-y"))) == dict.fromkeys(NAMES, "identifiable")
 
 
 @pytest.fixture(scope="module")

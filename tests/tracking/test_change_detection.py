@@ -15,7 +15,7 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking import filter_bank as bank
 from lmshealth.tracking.change_detection import (
-    Change,
+    ChangeHypothesis,
     add_to_sums,
     loop_evidence,
     recent_loop_change,
@@ -330,9 +330,9 @@ def test_changes_are_significant_at_the_declared_probability() -> None:
     """The bound of an event is 1 in 100; an alarm divides it among its three routes."""
     assert threshold(1) == pytest.approx(np.log(100))
     assert threshold() == pytest.approx(np.log(300))
-    likely = Change("step", "", 3, np.log(200), 10.0)
+    likely = ChangeHypothesis("step", "", 3, np.log(200), 10.0)
     assert likely.significant and not likely.damage
-    assert Change("step", "", 3, 10.0, 10.0).damage
-    assert not Change("step", "", 3, 10.0, 1.0).damage
-    assert not Change("servo", "", 3, 10.0, 10.0).damage
+    assert ChangeHypothesis("step", "", 3, 10.0, 10.0).damage
+    assert not ChangeHypothesis("step", "", 3, 10.0, 1.0).damage
+    assert not ChangeHypothesis("servo", "", 3, 10.0, 10.0).damage
     assert constants.FALSE_ALARM_PROBABILITY == 0.01

@@ -13,24 +13,14 @@ import pytest
 from scipy import stats
 
 from lmshealth._arrays import FloatArray
-from lmshealth._serialize import pack, unpack
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage, Usage
 from lmshealth.tracking import constants
 from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking import track as tracking
-from lmshealth.tracking.change_detection import N_CHECKPOINTS, loop_evidence
+from lmshealth.tracking.change_detection import loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
-from lmshealth.tracking.filter_bank import FilterBank, FilterModel
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import (
-    Event,
-    Track,
-    TrackStart,
-    consistency,
-    continue_track,
-    track,
-)
+from lmshealth.tracking.track import Event, Track, consistency, track
 from studies.off_model.run import of_world
 from tests.lives import (
     DAMPING,
@@ -323,50 +313,6 @@ def test_no_epoch_knows_of_later_logs(stage: Stage) -> None:
                 (e.kind, e.epoch, e.mode, e.source, e.found_at) for e in all_found if e.found_at < n
             ]
             assert known == later
-
-
-def long_life(seed: int) -> History:
-    """Make a life of 180 logs with a step, outliers, errors that are too small and a retuning."""
-    rng, n = np.random.default_rng(seed), 180
-    ln_f, ln_zeta = still(rng, n)
-    ln_f += 1e-3 * rng.standard_normal((n, 2)) - 2e-5 * np.arange(n)[:, None]
-    ln_f[130:] -= 0.03
-    ln_f[[50, 140], 0] += 0.05
-    history = make_history(ln_f, ln_damping=ln_zeta, std=5e-4)
-    retuned = replace(since("servo", 60, n), name="b")
-    return replace(history, steps=(retuned,))
-
-
-@pytest.mark.usefixtures("few")
-@pytest.mark.parametrize("n", [150, 179])
-def test_a_track_goes_on_as_from_nothing(
-    stage: Stage, monkeypatch: pytest.MonkeyPatch, n: int
-) -> None:
-    """A track from a stored state equals one from nothing, but only 68 logs are filtered again.
-
-    Negative control: a state of a history that has one other estimate is not used.
-    """
-    history = long_life(1)
-    whole = track(history, stage)
-    start = continue_track(history.first_logs(n), stage)[1]
-    before = unpack(pack(start), TrackStart)
-    assert before.steps and any(not step.declared for step in whole.steps)
-    filtered: list[int] = []
-    predict = tracking.predict
-
-    def counted(model: FilterModel, own: FilterBank, k: int) -> FilterBank:
-        filtered.append(k)
-        return predict(model, own, k)
-
-    monkeypatch.setattr(tracking, "predict", counted)
-    found, after = continue_track(history, stage, before)
-    assert min(filtered) > n - N_CHECKPOINTS
-    assert pack(found) == pack(whole)
-    assert after is not None and after.n_logs == 180
-    ln_f = history.ln_frequency.copy()
-    ln_f[5, 0] += 1e-4
-    continue_track(replace(history, ln_frequency=ln_f), stage, before)
-    assert min(filtered) == 0
 
 
 def test_neither_horizon_nor_unit_of_the_clock_count(tmp_path: Path) -> None:

@@ -60,7 +60,7 @@ class Ordinates(ReadOnly):
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Order:
+class ModelOrder:
     """Order of a model, with start values of its modes."""
 
     theta: FloatArray  # [ln f, ln ζ] of the modes, (2 n_modes,)
@@ -105,7 +105,7 @@ class Solution:
     parts: FloatArray  # sum of the powers of the parts of H, (n_lines,)
 
 
-def _poles(ordinates: Ordinates, order: Order) -> tuple[ComplexArray, ComplexArray]:
+def _poles(ordinates: Ordinates, order: ModelOrder) -> tuple[ComplexArray, ComplexArray]:
     """Return jω, shape ``(n_lines,)``, and poles, ``(n_modes,)``, over the band's centre."""
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     f, zeta = order.modes
@@ -118,7 +118,7 @@ def _modal(s: ComplexArray, pole: ComplexArray) -> ComplexArray:
     return np.hstack([upper + lower, 1j * (upper - lower)])
 
 
-def solve(ordinates: Ordinates, order: Order, variance: FloatArray) -> Solution:
+def solve(ordinates: Ordinates, order: ModelOrder, variance: FloatArray) -> Solution:
     """Solve for the linear unknowns at given poles and variances of shape ``(n_lines,)``."""
     m = order.n_modes
     s, pole = _poles(ordinates, order)
@@ -150,7 +150,7 @@ def _residues(weights: FloatArray, n_modes: int) -> ComplexArray:
 
 
 def slopes(
-    ordinates: Ordinates, order: Order, variance: FloatArray, solution: Solution
+    ordinates: Ordinates, order: ModelOrder, variance: FloatArray, solution: Solution
 ) -> FloatArray:
     """Differentiate the whitened error by ``[ln f, ln ζ]``, shape ``(2 n_lines, 2 n_modes)``.
 
@@ -169,14 +169,14 @@ def slopes(
     return np.asarray(slope - solution.basis @ (solution.basis.T @ slope))
 
 
-def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
+def refine(ordinates: Ordinates, order: ModelOrder, variance: FloatArray) -> ModelOrder:
     """Maximise the likelihood over the poles by a trust-region method."""
     if (m := order.n_modes) == 0:
         return order
     whiten = np.sqrt(2 / variance)
 
     @lru_cache(maxsize=1)
-    def solved_at(theta: bytes) -> tuple[Order, Solution]:
+    def solved_at(theta: bytes) -> tuple[ModelOrder, Solution]:
         tried = replace(order, theta=np.frombuffer(theta))
         return tried, solve(ordinates, tried, variance)
 
@@ -198,7 +198,7 @@ def refine(ordinates: Ordinates, order: Order, variance: FloatArray) -> Order:
     return replace(order, theta=solved.x)
 
 
-def vector_fit(ordinates: Ordinates, order: Order, n_modes: int) -> Order:
+def vector_fit(ordinates: Ordinates, order: ModelOrder, n_modes: int) -> ModelOrder:
     """Return an order with start values of modes from the response alone [Gustavsen1999].
 
     With σ = 1 + Σ c/(s - p), the equation σ H = Σ r/(s - p) + Σ a_k s^k is linear in c, r and a;
@@ -243,7 +243,7 @@ def best_place(
         for first in range(0, grid.size, _BLOCK):
             f = grid[first : first + _BLOCK]
             damping = np.clip(ordinates.spacing / f, zeta, _MOST_DAMPING)
-            at = Order(np.log(np.concatenate([f, damping])), 1, 0)
+            at = ModelOrder(np.log(np.concatenate([f, damping])), 1, 0)
             columns = _modal(*_poles(ordinates, at)) * (ordinates.given * whiten)[:, None]
             gain = _explained(stack(columns), error, solution.basis)
             k = int(np.argmax(gain))

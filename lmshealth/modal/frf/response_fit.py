@@ -8,7 +8,7 @@ from scipy.optimize import minimize_scalar
 from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
 from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import (
-    Order,
+    ModelOrder,
     Ordinates,
     Solution,
     best_place,
@@ -74,7 +74,7 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     Order, noise, distortion and covariance are those of the section Model in the README of the
     folder [Pintelon2012].
     """
-    start = Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
+    start = ModelOrder(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
     state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
@@ -111,7 +111,7 @@ class _State:
     """An order at its maximum of likelihood, with the variance of its error."""
 
     ordinates: Ordinates
-    order: Order
+    order: ModelOrder
     variance: FloatArray
     distortion: float
     solution: Solution
@@ -156,7 +156,9 @@ def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> floa
     return (smaller.cost - larger.cost) / dependent_lines - larger.penalty + smaller.penalty
 
 
-def _settle(ordinates: Ordinates, order: Order, variance: FloatArray, rounds: int = 2) -> _State:
+def _settle(
+    ordinates: Ordinates, order: ModelOrder, variance: FloatArray, rounds: int = 2
+) -> _State:
     """Maximise the likelihood over poles and variance alternately."""
     for _ in range(rounds):
         order = refine(ordinates, order, variance)
@@ -170,7 +172,7 @@ def _settle(ordinates: Ordinates, order: Order, variance: FloatArray, rounds: in
 
 
 def _error_variance(
-    ordinates: Ordinates, order: Order, solution: Solution
+    ordinates: Ordinates, order: ModelOrder, solution: Solution
 ) -> tuple[FloatArray, float]:
     """Return the variance of the error of each line, and the distortion as a share of H."""
     n = solution.error.size
@@ -261,7 +263,7 @@ def _without_outliers(larger: _State, smaller: _State) -> _State:
     return without
 
 
-def _larger(state: _State) -> list[Order]:
+def _larger(state: _State) -> list[ModelOrder]:
     """Return models with a further mode or two further powers that may be worth a fit."""
     ordinates, order = state.ordinates, state.order
     larger = []

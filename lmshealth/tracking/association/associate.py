@@ -103,8 +103,8 @@ class Association:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Log:
-    """One log, as `associate_log` takes it."""
+class LogMeasurements:
+    """Measurements of one log with what their prediction depends on: input of `associate_log`."""
 
     epoch: int  # index of the log
     clock: float
@@ -132,12 +132,12 @@ class State:
     first: tuple[float, ...] = ()  # their first ln f
     # Last place of each named mode and source, before the last log.
     places: dict[tuple[str, str], Place] | None = None
-    last: Log | None = None
+    last: LogMeasurements | None = None
     labels: tuple[Label, ...] = ()  # of the last log
     # Whether one hypothesis is left without candidates, and all names of the last log are right.
     repeatable: bool = False
     # Logs that repeat the one before and that the filters have not processed yet.
-    pending: tuple[Log, ...] = ()
+    pending: tuple[LogMeasurements, ...] = ()
     clock: float | None = None  # to which the filters are predicted
 
     @classmethod
@@ -173,10 +173,10 @@ def associate(
     scales = learn_scales(stated, sources, offsets, prior_std)
     labels: list[tuple[Label, ...]] = []
 
-    def log_at(j: int, names: tuple[str, ...], now: int) -> Log:
+    def log_at(j: int, names: tuple[str, ...], now: int) -> LogMeasurements:
         new = scaled(stated[j], sources[j], scales[now])
         opened = j in declared
-        return Log(j, places[j], lives[j], offsets[j], opened, names, sources[j], new)
+        return LogMeasurements(j, places[j], lives[j], offsets[j], opened, names, sources[j], new)
 
     for k, own in enumerate(epochs):
         if k and scales[k] is not scales[k - 1]:
@@ -193,7 +193,7 @@ def associate(
     return Association(tuple(state.names[i] for i in order), tuple(labels))
 
 
-def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
+def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Label, ...]]:
     """Associate the estimates of one log: the next state, and a label per estimate.
 
     A log that repeats the one before has its labels; the filters catch up with it later. Otherwise
@@ -238,7 +238,7 @@ def associate_log(state: State, log: Log) -> tuple[State, tuple[Label, ...]]:
     return replace(state, repeatable=bool(certain and right and rising.all())), state.labels
 
 
-def _repeats(state: State, log: Log) -> bool:
+def _repeats(state: State, log: LogMeasurements) -> bool:
     """Return whether a log repeats the one before: names, places, dampings and shapes.
 
     The labels are then the names, without any filter: a test holds them equal to those of the full
@@ -288,12 +288,12 @@ def _groups(
     return [(rows, meant[rows]) for rows in each]
 
 
-def _row(log: Log) -> FloatArray:
+def _row(log: LogMeasurements) -> FloatArray:
     """Return the observation row ``[1, 0, covariates]`` of a log."""
     return np.concatenate([(1.0, 0.0), log.offsets])
 
 
-def _places(log: Log) -> dict[tuple[str, str], Place]:
+def _places(log: LogMeasurements) -> dict[tuple[str, str], Place]:
     """Return the place of every named mode and source of a log."""
     new = log.measurements
     return {
@@ -305,7 +305,9 @@ def _places(log: Log) -> dict[tuple[str, str], Place]:
     }
 
 
-def _is_common_jump(places: dict[tuple[str, str], Place], log: Log, prior_std: FloatArray) -> bool:
+def _is_common_jump(
+    places: dict[tuple[str, str], Place], log: LogMeasurements, prior_std: FloatArray
+) -> bool:
     """Return whether several named modes are off at once, at places where no mode was before.
 
     A crash moves all modes: names are then more reliable than places. At places of other modes the
@@ -326,7 +328,7 @@ def _is_common_jump(places: dict[tuple[str, str], Place], log: Log, prior_std: F
     return len(moved) > 1
 
 
-def _predict(state: State, log: Log) -> State:
+def _predict(state: State, log: LogMeasurements) -> State:
     """Predict all filters to a log."""
     step = 0.0 if state.clock is None else log.clock - state.clock
     hypotheses, candidates = state.hypotheses, state.candidates
@@ -376,7 +378,7 @@ def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
 
 
 def _resolve(
-    state: State, scan: Scan, log: Log, confirmed: set[int]
+    state: State, scan: Scan, log: LogMeasurements, confirmed: set[int]
 ) -> tuple[State, list[int], list[Label]]:
     """Associate a scan by hypotheses; add the candidates that become modes to `confirmed`.
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth.modal.frf.rational import (
-    Order,
+    ModelOrder,
     Ordinates,
     best_place,
     refine,
@@ -19,7 +19,7 @@ from lmshealth.modal.frf.rational import (
 )
 
 F, ZETA = np.array([62.0, 90.0]), np.array([0.015, 0.02])
-ORDER = Order(np.log(np.concatenate([F, ZETA])), -2, 2)
+ORDER = ModelOrder(np.log(np.concatenate([F, ZETA])), -2, 2)
 
 
 def make(*, periodic: bool = True, noise: float = 1e-6, seed: int = 1) -> Ordinates:

@@ -19,7 +19,7 @@ from lmshealth.tracking.association import associate as module
 from lmshealth.tracking.association.associate import (
     Association,
     Estimates,
-    Log,
+    LogMeasurements,
     State,
     associate,
     associate_log,
@@ -357,11 +357,11 @@ def test_repeated_logs_have_the_labels_of_the_full_step(
     ]
 
 
-def logs_of(rows: Sequence[Estimates], life: float = 50.0) -> list[Log]:
+def logs_of(rows: Sequence[Estimates], life: float = 50.0) -> list[LogMeasurements]:
     """Make logs at even places of the clock."""
     none = np.zeros(0)
     return [
-        Log(k, float(k), life if k else 0.0, none, False, one.names, one.sources, own)
+        LogMeasurements(k, float(k), life if k else 0.0, none, False, one.names, one.sources, own)
         for k, (one, own) in enumerate(zip(rows, measurements_of(rows), strict=True))
     ]
 
