@@ -1,6 +1,7 @@
 """Decode TOML into structs, of which errors name every wrong key; write values of TOML."""
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Iterator
@@ -46,10 +47,31 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
         raise ValueError(f"no TOML: {error}") from error
     except RecursionError as error:
         raise ValueError("no TOML that can be read: it is nested too deeply") from error
+    if path := next(_not_finite(table), ""):
+        raise ValueError(f"{_short(path.lstrip('.'))}: needed a finite number")
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
         raise ValueError(_described(kind, table)) from error
+
+
+def within(low: float, high: float, *examples: Any) -> msgspec.Meta:
+    """Return the annotation of a number by its range, with examples for messages."""
+    return msgspec.Meta(ge=low, le=high, examples=list(examples) or None)
+
+
+def _not_finite(value: Any, path: str = "") -> Iterator[str]:
+    """Yield the places of numbers that are infinite, NaN, or integers beyond 64 bits."""
+    if isinstance(value, float | int):
+        # No key means such integers, which few libraries can store.
+        if not abs(value) < (math.inf if isinstance(value, float) else 1 << 63):
+            yield path
+    elif isinstance(value, dict):
+        for key, one in value.items():
+            yield from _not_finite(one, f"{path}.{key}")
+    elif isinstance(value, list):
+        for k, one in enumerate(value):
+            yield from _not_finite(one, f"{path}[{k}]")
 
 
 def quoted(text: str) -> str:
@@ -164,9 +186,22 @@ def _wrong(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
             path, error = path.removesuffix(_ANY_VALUE), f"one of its values: {error}"
         if "matching regex" in error:
             error = "needed printable text"
+        if bounds := _bounds(kind) if isinstance(value, float | int) else None:
+            error = "needed a number from {:g} to {:g}".format(*bounds)
         if "got" not in error and not isinstance(value, dict | list):
             error = f"{error}, got {_short(repr(value))}"
         yield path, error.replace("object", "table")
+
+
+def _bounds(kind: Any) -> tuple[float, float] | None:
+    """Return the range that an annotation, or an alternative of it, states by `within`."""
+    if get_origin(kind) is Annotated:
+        notes = (one for one in get_args(kind)[1:] if isinstance(one, msgspec.Meta))
+        own = next(((m.ge, m.le) for m in notes if m.ge is not None and m.le is not None), None)
+        return own or _bounds(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return next(filter(None, map(_bounds, get_args(kind))), None)
+    return None
 
 
 def _branches(kind: Any) -> Iterator[Any]:

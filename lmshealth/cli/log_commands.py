@@ -69,6 +69,7 @@ _PLOT = click.option(
 )
 @_OVERWRITE
 @options.MOST_MEMORY
+@options.ALLOW_FUTURE
 @click.pass_context
 def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any) -> None:
     """Propose map.toml, manifest.csv and my-stage.toml from logs.
@@ -484,7 +485,7 @@ def _each(
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}
-    reading = {name: ctx.params[name] for name in ("columns", "max_memory")}
+    reading = {name: ctx.params[name] for name in ("columns", "max_memory", "latest")}
     named = ctx.params["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
     paths = [path for path in named if path.name not in NOT_LOGS] or named

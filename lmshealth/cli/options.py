@@ -18,7 +18,7 @@ from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import load_columns
-from lmshealth.io.constants import MAX_MEMORY
+from lmshealth.io.constants import LAST_MOMENT, MAX_MEMORY
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
 
@@ -137,6 +137,13 @@ MOST_MEMORY = click.option(
     callback=lambda ctx, option, gigabytes: 1e9 * gigabytes,
     help="Refuse a log that needs more memory than this to be read (MAT, UFF58, TDMS).",
 )
+ALLOW_FUTURE = click.option(
+    "--allow-future",
+    "latest",
+    is_flag=True,
+    callback=lambda ctx, option, given: LAST_MOMENT if given else None,
+    help="Accept logs and maintenance that are dated after tomorrow.",
+)
 PART = click.option(
     "--part",
     type=click.Choice(PARTS),
@@ -192,8 +199,8 @@ INTERACTIVE = click.option(
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options by which logs are read: --columns and --max-memory (bytes)."""
-    return _COLUMNS(MOST_MEMORY(command))
+    """Add the options by which logs are read: --columns, --max-memory (bytes), --allow-future."""
+    return _COLUMNS(MOST_MEMORY(ALLOW_FUTURE(command)))
 
 
 def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:

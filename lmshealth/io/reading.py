@@ -19,7 +19,7 @@ from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
 from lmshealth.io.formats.unit_channels import Described, choose
-from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
@@ -38,6 +38,7 @@ def read_log(
     overrides: Mapping[str, str] | None = None,
     name: str | None = None,
     max_memory: float = constants.MAX_MEMORY,
+    latest: datetime | None = None,
 ) -> Log:
     """Read a log.
 
@@ -54,6 +55,9 @@ def read_log(
     max_memory : float, optional
         Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS)
         may take; a log that needs more is refused with reason ``too-large``.
+    latest : datetime, optional
+        Latest moment of recording; a later one is refused with reason ``future``. By default a day
+        from now.
 
     Returns
     -------
@@ -88,7 +92,8 @@ def read_log(
     used = ColumnMap() if columns is None else columns
     try:
         content = load(Path(path), used, max_memory)
-        return _to_log(content, used, overrides or {}, name=label, digest=digest)
+        metadata = parse_metadata(_stated(content, used, overrides), latest)
+        return _to_log(content, used, metadata, name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 
@@ -99,6 +104,7 @@ def read_sep005(
     columns: ColumnMap | None = None,
     overrides: Mapping[str, str] | None = None,
     name: str = "SEP005",
+    latest: datetime | None = None,
 ) -> Log:
     """Read a log from SEP005 dictionaries, as `Log.to_sep005` returns them.
 
@@ -107,7 +113,7 @@ def read_sep005(
     channels : sequence of mapping
         Each with ``data``, shape (n_samples,), ``name``, ``unit_str``, ``fs`` in Hz or ``time`` in
         s, shape (n_samples,), and optionally ``start_timestamp`` (ISO 8601, UTC without a zone).
-    columns, overrides
+    columns, overrides, latest
         As of `read_log`; channels whose unit is an acceleration need no column map.
     name : str, optional
         Name of the log in results.
@@ -146,7 +152,8 @@ def read_sep005(
         for one in given:
             digest.update(one.data.tobytes())
             digest.update(b"" if one.time is None else one.time.tobytes())
-        return _to_log(content, used, overrides or {}, name=name, digest=digest.hexdigest())
+        own = parse_metadata(_stated(content, used, overrides), latest)
+        return _to_log(content, used, own, name=name, digest=digest.hexdigest())
     except Unusable as error:
         raise BadLog(name, error.reason, error.detail) from error
 
@@ -221,12 +228,24 @@ class _Series(NamedTuple):
     values: Samples
 
 
+def _stated(
+    content: Content, layout: ColumnMap, overrides: Mapping[str, str] | None
+) -> dict[str, str]:
+    """Merge the metadata of a file, of the column map and of a manifest."""
+    filled = {key: value for key, value in (overrides or {}).items() if value.strip()}
+    return content.metadata | layout.constants() | filled
+
+
 def _to_log(
-    content: Content, layout: ColumnMap, overrides: Mapping[str, str], *, name: str, digest: str
+    content: Content,
+    layout: ColumnMap,
+    parsed: tuple[Metadata, float | None],
+    *,
+    name: str,
+    digest: str,
 ) -> Log:
-    """Apply the log contract to the content of a file."""
-    filled = {key: value for key, value in overrides.items() if value.strip()}
-    metadata, rate = parse_metadata(content.metadata | layout.constants() | filled)
+    """Apply the log contract to the content of a file, with its metadata and sample rate."""
+    metadata, rate = parsed
     series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)
