@@ -47,8 +47,9 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
         raise ValueError(f"no TOML: {error}") from error
     except RecursionError as error:
         raise ValueError("no TOML that can be read: it is nested too deeply") from error
-    if path := next(_not_finite(table), ""):
-        raise ValueError(f"{_short(path.lstrip('.'))}: needed a finite number")
+    for path, value in _not_finite(table):
+        got = f"needed a finite number, got {_short(repr(value))}"
+        raise ValueError(f"{_short(path.lstrip('.'))}: {got}")
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
@@ -60,12 +61,12 @@ def within(low: float, high: float, *examples: Any) -> msgspec.Meta:
     return msgspec.Meta(ge=low, le=high, examples=list(examples) or None)
 
 
-def _not_finite(value: Any, path: str = "") -> Iterator[str]:
-    """Yield the places of numbers that are infinite, NaN, or integers beyond 64 bits."""
+def _not_finite(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield place and value of numbers that are infinite, NaN, or integers beyond 64 bits."""
     if isinstance(value, float | int):
         # No key means such integers, which few libraries can store.
         if not abs(value) < (math.inf if isinstance(value, float) else 1 << 63):
-            yield path
+            yield path, value
     elif isinstance(value, dict):
         for key, one in value.items():
             yield from _not_finite(one, f"{path}.{key}")

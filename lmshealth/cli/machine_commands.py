@@ -28,6 +28,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
 from lmshealth.report.tables import Row
+from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision, load_stage
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
@@ -237,10 +238,12 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
     metavar="YYYY-MM-DD",
     help="Also give the probability that a limit is reached before this day.",
 )
-@click.option("--max-risk", type=options.SHARE, help="Service on the last day within this risk.")
+@click.option(
+    "--max-risk", type=options.Finite(*RISK), help="Service on the last day within this risk."
+)
 @click.option(
     "--cost-ratio",
-    type=options.Finite(1, min_open=True),
+    type=options.Finite(1, MOST_COST_RATIO, min_open=True),
     help="Service at least cost, for this cost of a failure over that of a planned service.",
 )
 @options.SEED

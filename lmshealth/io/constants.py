@@ -94,6 +94,8 @@ RANGES = {
 them: an odometer of ten strokes a second counts 10¹⁰ in 30 years, 10⁷ mm/s leaves the atmosphere,
 no axis is 100 km long, an oscilloscope samples at 10¹¹ Hz. Placeholders of missing values do
 (-9999 °C, 1e300)."""
+SCALES = 1e-18, 1e12
+"""Magnitudes of the SI value of one count: an attometre, and `LARGEST_MAGNITUDE`."""
 LARGEST_NUMBER = 1e100
 """Magnitude of any other number of a table: its square and cube are finite."""
 

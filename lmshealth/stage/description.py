@@ -71,7 +71,8 @@ class ModeSpec(_Part, frozen=True):
 
 def _expect_length(name: str, components: Iterable[float]) -> None:
     if max(map(abs, components)) < constants.LEAST_COMPONENT:
-        raise ValueError(f"{name} has no component above {constants.LEAST_COMPONENT:g}")
+        needed = f"needed a component of at least {constants.LEAST_COMPONENT:g}"
+        raise ValueError(f"{name} has no length; {needed}")
 
 
 def _expect_ascending(name: str, low: float, high: float) -> None:
