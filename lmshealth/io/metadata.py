@@ -4,7 +4,7 @@ import math
 import re
 import unicodedata
 from collections.abc import Mapping
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 
@@ -115,6 +115,14 @@ def _number(given: Mapping[str, str], key: str) -> float | None:
     except ValueError as error:
         raise _bad(given, key, possible(key)) from error
     return value
+
+
+def moment_after(epoch: datetime, count: float, unit: timedelta = timedelta(seconds=1)) -> str:
+    """Write a moment after an epoch; `parse_moment` refuses what is out of the calendar."""
+    try:
+        return (epoch + count * unit).isoformat()
+    except OverflowError:
+        return f"{count:g} times {unit.total_seconds():g} s after {epoch.date()}"
 
 
 def as_text(value: object) -> str:

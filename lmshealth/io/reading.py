@@ -185,7 +185,7 @@ def _sep005(channel: Mapping[str, Any], k: int) -> _Sep005:
         described = Described(channel["name"], channel["unit_str"], rate and float(rate))
         stamps = None if time is None else np.asarray(time, dtype=np.float64)
         return _Sep005(described, data.astype(np.float64), stamps, start)
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
         what = f"no {error}" if isinstance(error, KeyError) else str(error)
         needed = "needed a dictionary with data, name, unit_str, and fs or time"
         raise Unusable("format", f"channel {k} is no SEP005: {what}; {needed}") from error

@@ -170,7 +170,7 @@ INITIATION_ODDS, CONFIRMATION_PROBABILITY, DELETION_ODDS = 1e-3, 0.95, 1e-5
 LEAST_LOGS_NEW, LEAST_LOGS_NAMED = 3, 2
 
 # --- Notes and tables ----------------------------------------------------------------------------
-# Dates of few logs at one end that are wrong, as of a clock without a battery: beyond a gap of a year
+# Dates of few logs at one end are wrong, as of a clock without a battery: beyond a gap of a year
 # (one log), or of ten years (a tenth of the logs), in which the odometer gains less than this share
 # of what the other logs gain in that time. A machine that was idle so long loses one log, until a
 # second one confirms its date. Rates need so many logs.
