@@ -24,8 +24,6 @@ _LONGEST_PLACE, _LONGEST_MESSAGE, _MOST_MISTAKES = 80, 400, 12
 Kind = TypeVar("Kind")
 
 _PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
-# msgspec does not name the wrong value of a table with free keys.
-_ANY_VALUE = "[...]"
 
 
 def decode(content: bytes, kind: type[Kind]) -> Kind:
@@ -152,6 +150,9 @@ def _faults(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, list) and (item := _item(kind)):
         for k, one in enumerate(value):
             inner += _faults(item, one, f"{path}[{k}]")
+    elif isinstance(value, dict) and (item := _free(kind)):
+        for key, one in value.items():
+            inner += _faults(item, one, f"{path}.{key}")
     elif isinstance(value, dict) and (parts := _structs(kind)):
         part, tag = _selected(parts, value)
         if part is None:
@@ -183,8 +184,6 @@ def _wrong(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
         error = str(caught)
         if found := _PLACE.search(error):
             error, path = error[: found.start()], path + found["path"]
-        if path.endswith(_ANY_VALUE):
-            path, error = path.removesuffix(_ANY_VALUE), f"one of its values: {error}"
         if "matching regex" in error:
             error = "needed printable text"
         if bounds := _bounds(kind) if isinstance(value, float | int) else None:
@@ -224,12 +223,18 @@ def _structs(kind: Any) -> list[Any]:
 
 
 def _item(kind: Any) -> Any:
-    """Return the annotation of the items of an array of any length; None if it is none."""
+    """Return the annotation of the items of an array, all alike; None if it is none."""
     for one in _branches(kind):
         inner = get_args(one)
-        if get_origin(one) is list or (get_origin(one) is tuple and inner[-1] is ...):
+        if get_origin(one) is list or (get_origin(one) is tuple and len({*inner} - {...}) == 1):
             return inner[0]
     return None
+
+
+def _free(kind: Any) -> Any:
+    """Return the annotation of the values of a table with free keys; None if it is none."""
+    tables = (get_args(one)[1] for one in _branches(kind) if get_origin(one) is dict)
+    return next(tables, None)
 
 
 def _selected(parts: list[Any], value: dict[str, Any]) -> tuple[Any, str | None]:

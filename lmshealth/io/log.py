@@ -39,9 +39,10 @@ def low_high(key: str) -> tuple[float, float]:
 
 def expect_moment(moment: datetime) -> None:
     """Require a moment with a time zone in the range of `constants`, or raise `ValueError`."""
-    zoned = moment.tzinfo is not None
+    zoned = isinstance(moment, datetime) and moment.tzinfo is not None
     if not zoned or not constants.FIRST_MOMENT <= moment < constants.LAST_MOMENT:
-        raise ValueError(f"recorded_at is {moment}, needed a moment with a time zone, {MOMENTS}")
+        found = f"{moment}, a {type(moment).__name__}"
+        raise ValueError(f"recorded_at is {found}; needed a moment with a time zone, {MOMENTS}")
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from lmshealth._serialize import fingerprint
 from lmshealth.errors import BadTable
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates
-from lmshealth.tracking.read_tables import read_drifts, read_estimates
+from lmshealth.tracking.history import LogEstimates, build_history
+from lmshealth.tracking.read_tables import read_drifts, read_estimates, read_machines
 from tests.lives import FADING, make_stage, make_track
 
 HEAD = "stage,log,recorded_at,travel_km,temperature_c,mode,source,frequency_hz,frequency_std_hz,"
@@ -67,6 +71,44 @@ def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(reading.modes.frequency_std, [0.1, 0.2])
     np.testing.assert_allclose(reading.modes.damping_ratio_std, [0.001, 0.001])
     np.testing.assert_allclose(reading.modes.correlation, [0.5, 0.0])
+
+
+def test_dates_of_one_offset_are_plain_datetimes(tmp_path: Path) -> None:
+    """Pandas makes Timestamps of a column of dates: a history of them could not be packed."""
+    text = HEAD + "".join(row(log=f"{k}", day=k + 1) for k in range(3))
+    readings = read(tmp_path, text)
+    assert {type(one.metadata.recorded_at) for one in readings} == {datetime}
+    history, _ = build_history(readings)
+    stamped = replace(history, recorded_at=tuple(map(pd.Timestamp, history.recorded_at)))
+    assert {type(moment) for moment in stamped.recorded_at} == {datetime}
+    assert fingerprint(stamped) == fingerprint(history)
+    terms = tmp_path / "none.csv"
+    terms.write_text("recorded_at,mode_a,mode_b,cov_drift\n")
+    (tmp_path / "track.csv").write_text(DRIFT_HEAD + drift_row())
+    (drifts,), _ = read_drifts(tmp_path / "track.csv", cross_terms=terms)
+    assert {type(moment) for moment in drifts.recorded_at} == {datetime}
+    fingerprint(drifts)
+
+
+def test_logs_of_the_future_are_refused_unless_allowed(tmp_path: Path) -> None:
+    """The moment up to which dates are accepted holds for estimates, drifts and maintenance."""
+    path, late = tmp_path / "modes.csv", "2062-03-01T06:00:00+00:00"
+    path.write_text(HEAD + row().replace("2026-", "2062-"))
+    with pytest.raises(BadTable, match=r"modes.csv, line 2: recorded_at is '2062-.*allow-future"):
+        read_machines(path)
+    work = tmp_path / "maintenance.csv"
+    work.write_text(f"stage,recorded_at,action\nAX-1,{late},servo\n")
+    now = tmp_path / "now.csv"
+    now.write_text(HEAD + row())
+    with pytest.raises(BadTable, match=r"maintenance.csv, line 2: recorded_at is '2062-"):
+        read_machines(now, maintenance=work)
+    ((history, _),), _ = read_machines(path, latest=LAST_MOMENT, maintenance=work)
+    assert history.recorded_at[0].year == 2062
+    drifts = tmp_path / "track.csv"
+    drifts.write_text(DRIFT_HEAD + drift_row().replace("2026-", "2062-"))
+    with pytest.raises(BadTable, match=r"track.csv, line 2: recorded_at is '2062-"):
+        read_drifts(drifts)
+    assert read_drifts(drifts, latest=LAST_MOMENT)[0][0].recorded_at[0].year == 2062
 
 
 def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
