@@ -424,11 +424,12 @@ def _without_lone_dates(
 
     Of a wrong date in between the odometer is contradictory, or the order of the logs is unharmed.
     """
-    if any(reading.metadata.travel is None for reading in ordered):
+    moments = [reading.metadata.recorded_at for reading in ordered]
+    if None in moments or any(reading.metadata.travel is None for reading in ordered):
         return ordered, []
     refused: list[Refusal] = []
     travel = np.array([reading.metadata.travel for reading in ordered], dtype=float)
-    seconds = np.array([(r.metadata.recorded_at or _NO_MOMENT).timestamp() for r in ordered])
+    seconds = np.array([moment.timestamp() for moment in moments if moment])
     while (n := len(ordered)) > constants.DATED_LOGS:
         first = int(np.argmax(np.diff(seconds))) + 1  # log after the longest gap
         gap, gained = (float(own[first] - own[first - 1]) for own in (seconds, travel))
@@ -447,9 +448,10 @@ def _without_lone_dates(
             "a clock that was not set; correct it in manifest.csv (if it is right, further logs of "
             "that time confirm it)"
         )
-        for reading in ordered[few]:
-            moment = (reading.metadata.recorded_at or _NO_MOMENT).isoformat()
-            refused.append(Refusal(reading.log, "date", f"recorded_at {moment} {detail}"))
+        refused += [
+            Refusal(reading.log, "date", f"recorded_at {reading.metadata.recorded_at} {detail}")
+            for reading in ordered[few]
+        ]
         ordered, seconds, travel = ordered[rest], seconds[rest], travel[rest]
     return ordered, refused
 
