@@ -120,7 +120,8 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Return the health, 0 from s_w on."""
         life, n = theta[:, :1], theta[:, 1:]
-        left = 1 - (np.maximum(travel, 0) / life) ** n
+        with np.errstate(over="ignore"):
+            left = 1 - (np.maximum(travel, 0) / life) ** n
         return np.asarray(np.maximum(left, 0) ** self.outer)
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:

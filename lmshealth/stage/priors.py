@@ -182,7 +182,9 @@ class JointPrior:
         columns = []
         for j, prior in enumerate(self.priors):
             below, mass = self._mass(prior, self.low[j], self.high[j])
-            columns.append(np.log(prior.quantile(below + mass * level[:, j])))
+            value = prior.quantile(below + mass * level[:, j])
+            # A narrow prior has no probability below the box: its ends are 0 or infinite.
+            columns.append(np.log(np.clip(value, *np.exp([self.low[j], self.high[j]]))))
         # Rounding of quantiles must not leave the box.
         return np.asarray(np.clip(np.column_stack(columns), self.low, self.high))
 
