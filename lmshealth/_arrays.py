@@ -1,6 +1,7 @@
-"""Types of arrays, and checks of the arrays of frozen results."""
+"""Types of arrays, and checks of the arrays and dates of frozen results."""
 
 from collections.abc import Callable
+from datetime import datetime
 from typing import Any, Self
 
 import numpy as np
@@ -15,7 +16,7 @@ def freeze(result: Any, *shapes: tuple[str, *tuple[int, ...]]) -> None:
     """Make every array field of a frozen dataclass read-only, and require the shapes of some.
 
     These are names separated by blanks, then the lengths of the axes. `ValueError` names the field,
-    its shape and the one needed.
+    its shape and the one needed. Fields of moments, or of tuples of them, become `plain_moment`.
     """
     for names, *shape in shapes:
         for name in names.split():
@@ -26,6 +27,19 @@ def freeze(result: Any, *shapes: tuple[str, *tuple[int, ...]]) -> None:
         value = getattr(result, name)
         if isinstance(value, np.ndarray):
             value.setflags(write=False)
+        elif isinstance(value, datetime):
+            object.__setattr__(result, name, plain_moment(value))
+        elif isinstance(value, tuple) and value and isinstance(value[0], datetime):
+            object.__setattr__(result, name, tuple(map(plain_moment, value)))
+
+
+def plain_moment(moment: datetime) -> datetime:
+    """Return a moment of a subclass, such as a Timestamp of pandas, as the datetime that it is.
+
+    Arithmetic with a Timestamp has other limits and errors, and it cannot be packed. `ValueError`
+    for NaT.
+    """
+    return moment if type(moment) is datetime else datetime.fromisoformat(moment.isoformat())
 
 
 class ReadOnly:

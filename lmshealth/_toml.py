@@ -1,6 +1,7 @@
 """Decode TOML into structs, of which errors name every wrong key; write values of TOML."""
 
 import json
+import math
 import re
 import tomllib
 from collections.abc import Iterator
@@ -23,8 +24,6 @@ _LONGEST_PLACE, _LONGEST_MESSAGE, _MOST_MISTAKES = 80, 400, 12
 Kind = TypeVar("Kind")
 
 _PLACE = re.compile(r" - at `\$(?P<path>.*)`$")
-# msgspec does not name the wrong value of a table with free keys.
-_ANY_VALUE = "[...]"
 
 
 def decode(content: bytes, kind: type[Kind]) -> Kind:
@@ -46,10 +45,32 @@ def decode(content: bytes, kind: type[Kind]) -> Kind:
         raise ValueError(f"no TOML: {error}") from error
     except RecursionError as error:
         raise ValueError("no TOML that can be read: it is nested too deeply") from error
+    for path, value in _not_finite(table):
+        got = f"needed a finite number, got {_short(repr(value))}"
+        raise ValueError(f"{_short(path.lstrip('.'))}: {got}")
     try:
         return msgspec.convert(table, kind)
     except msgspec.ValidationError as error:
         raise ValueError(_described(kind, table)) from error
+
+
+def within(low: float, high: float, *examples: Any) -> msgspec.Meta:
+    """Return the annotation of a number by its range, with examples for messages."""
+    return msgspec.Meta(ge=low, le=high, examples=list(examples) or None)
+
+
+def _not_finite(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield place and value of numbers that are infinite, NaN, or integers beyond 64 bits."""
+    if isinstance(value, float | int):
+        # No key means such integers, which few libraries can store.
+        if not abs(value) < (math.inf if isinstance(value, float) else 1 << 63):
+            yield path, value
+    elif isinstance(value, dict):
+        for key, one in value.items():
+            yield from _not_finite(one, f"{path}.{key}")
+    elif isinstance(value, list):
+        for k, one in enumerate(value):
+            yield from _not_finite(one, f"{path}[{k}]")
 
 
 def quoted(text: str) -> str:
@@ -129,6 +150,9 @@ def _faults(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
     if isinstance(value, list) and (item := _item(kind)):
         for k, one in enumerate(value):
             inner += _faults(item, one, f"{path}[{k}]")
+    elif isinstance(value, dict) and (item := _free(kind)):
+        for key, one in value.items():
+            inner += _faults(item, one, f"{path}.{key}")
     elif isinstance(value, dict) and (parts := _structs(kind)):
         part, tag = _selected(parts, value)
         if part is None:
@@ -160,13 +184,24 @@ def _wrong(kind: Any, value: Any, path: str) -> Iterator[tuple[str, str]]:
         error = str(caught)
         if found := _PLACE.search(error):
             error, path = error[: found.start()], path + found["path"]
-        if path.endswith(_ANY_VALUE):
-            path, error = path.removesuffix(_ANY_VALUE), f"one of its values: {error}"
         if "matching regex" in error:
             error = "needed printable text"
+        if bounds := _bounds(kind) if isinstance(value, float | int) else None:
+            error = "needed a number from {:g} to {:g}".format(*bounds)
         if "got" not in error and not isinstance(value, dict | list):
             error = f"{error}, got {_short(repr(value))}"
         yield path, error.replace("object", "table")
+
+
+def _bounds(kind: Any) -> tuple[float, float] | None:
+    """Return the range that an annotation, or an alternative of it, states by `within`."""
+    if get_origin(kind) is Annotated:
+        notes = (one for one in get_args(kind)[1:] if isinstance(one, msgspec.Meta))
+        own = next(((m.ge, m.le) for m in notes if m.ge is not None and m.le is not None), None)
+        return own or _bounds(get_args(kind)[0])
+    if get_origin(kind) in (Union, UnionType):
+        return next(filter(None, map(_bounds, get_args(kind))), None)
+    return None
 
 
 def _branches(kind: Any) -> Iterator[Any]:
@@ -188,12 +223,18 @@ def _structs(kind: Any) -> list[Any]:
 
 
 def _item(kind: Any) -> Any:
-    """Return the annotation of the items of an array of any length; None if it is none."""
+    """Return the annotation of the items of an array, all alike; None if it is none."""
     for one in _branches(kind):
         inner = get_args(one)
-        if get_origin(one) is list or (get_origin(one) is tuple and inner[-1] is ...):
+        if get_origin(one) is list or (get_origin(one) is tuple and len({*inner} - {...}) == 1):
             return inner[0]
     return None
+
+
+def _free(kind: Any) -> Any:
+    """Return the annotation of the values of a table with free keys; None if it is none."""
+    tables = (get_args(one)[1] for one in _branches(kind) if get_origin(one) is dict)
+    return next(tables, None)
 
 
 def _selected(parts: list[Any], value: dict[str, Any]) -> tuple[Any, str | None]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 from lmshealth.batch.assess import assess
@@ -23,6 +24,7 @@ def analyse(
     stage: Stage,
     *,
     columns: ColumnMap | None = None,
+    latest: datetime | None = None,
     epochs: int = 40,
     seed: int = 0,
 ) -> Assessment:
@@ -35,7 +37,7 @@ def analyse(
         beside each.
     stage : Stage
         Description of the machine.
-    columns : ColumnMap, optional
+    columns, latest
         As of `read_log`.
     epochs, seed : int
         As of `assess`.
@@ -61,7 +63,7 @@ def analyse(
     work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
     if isinstance(logs, str | Path):
         folder = Path(logs)
-        listed, work = find_logs(folder), read_maintenance(folder)
+        listed, work = find_logs(folder), read_maintenance(folder, latest=latest)
         manifest, paths = read_manifest(folder), [*listed.logs]
         refused += [*listed.refused, *manifest.refused]
         manifests = dict.fromkeys(paths, manifest)
@@ -71,7 +73,7 @@ def analyse(
     for path in paths:
         try:
             overrides = manifests[path].overrides(path)
-            log = read_log(path, columns=columns, overrides=overrides)
+            log = read_log(path, columns=columns, overrides=overrides, latest=latest)
             modes = identify(log, stage)
             found.append(LogEstimates(log.name, log.digest, log.metadata, modes, loop_error(log)))
         except BadLog as error:

@@ -48,11 +48,11 @@ KEEPALIVE = {"idle": 30, "interval": 10, "count": 3}
 """When PostgreSQL probes the connection of a run that is silent (s), again (s), and how often in
 vain: after a minute work of a computer that was cut off is left to other runs."""
 
-RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow")
-"""Reasons of refusal that depend on more than the log: on the moment, ``--max-memory`` or
-the speed of the computer. They
-are not stored, and the next run tries the log again. The same holds for logs that fail for lack of
-resources, by an error of this program, or by a crash of their process."""
+RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow", "future")
+"""Reasons of refusal that depend on more than the log: on the moment, ``--max-memory``,
+``--allow-future`` or the speed of the computer. They are not stored, and the next run tries the log
+again. The same holds for logs that fail for lack of resources, by an error of this program, or by a
+crash of their process."""
 
 ASSESSMENT_ATTEMPTS = 2
 """How often a machine is assessed in one run when its assessment is missing from the store, for

@@ -5,9 +5,10 @@ import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import Generic, NamedTuple, Self, TypeVar
+from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from lmshealth._serialize import VERSION, fingerprint
 from lmshealth.batch import constants
@@ -19,6 +20,7 @@ from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.manifest import find_logs, name_of, read_manifest
+from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import read_ambient
@@ -112,13 +114,14 @@ class Work(Generic[Piece, Job]):
 
 
 class Reading(NamedTuple):
-    """How logs are read: columns and most memory in bytes of `read_log`, links of `find_logs`.
+    """How logs are read: `columns` to `latest` as of `read_log`, links as of `find_logs`.
 
     Files that are still growing are no logs yet.
     """
 
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
+    latest: datetime | None = None
     follow_links: bool = False
     growing: frozenset[Path] = frozenset()
 
@@ -199,7 +202,7 @@ def ingest(
     cached = set()
 
     def fetch(part: Sequence[_Task]) -> Iterator[_Task]:
-        for task, outcome in _cached(part, stages, store):
+        for task, outcome in _cached(part, stages, store, reading.latest):
             add(_Outcome.of(task, outcome, is_new=False))
             cached.add(task.name)
             yield task
@@ -207,7 +210,8 @@ def ingest(
     known = {task.name for task in fetch(tasks)}
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in known]
-    identify = partial(_identify_logs, stages=tuple(stages), max_memory=reading.max_memory)
+    how = {"max_memory": reading.max_memory, "latest": reading.latest}
+    identify = partial(_identify_logs, stages=tuple(stages), how=how)
     done = 0
     for part in _identified(left, identify, resources, fetch):
         store.put_identified(one.row for one in part if one.row is not None)
@@ -336,18 +340,22 @@ def _no_digests(paths: Iterable[Path], why: str) -> dict[Path, str | BadLog]:
 
 
 def _cached(
-    tasks: Sequence[_Task], stages: Sequence[Stage], store: Store
+    tasks: Sequence[_Task], stages: Sequence[Stage], store: Store, latest: datetime | None
 ) -> Iterator[tuple[_Task, Identified]]:
     """Yield the stored outcomes that are still valid.
 
-    These are the outcomes that used no description, or that used the one which matches the log now.
+    These are the outcomes that used no description, or that used the one which matches the log now,
+    and that are not later than another run allowed.
     """
     digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
     own = {task.key(digest): task for task in tasks for digest in digests}
     for key, found in store.identified(own):
         matching = _matching(stages, Metadata(stage=found.stage, description=found.asked))
         used = "" if matching is None else matching.digest
-        if found.description in ("", _none_of(stages), used):
+        is_late = isinstance(found.outcome, LogEstimates) and is_future(
+            found.outcome.metadata.recorded_at, latest
+        )
+        if found.description in ("", _none_of(stages), used) and not is_late:
             yield own[key], found.renamed(own[key].name)
 
 
@@ -390,20 +398,21 @@ def _end_of_worker(task: _Task, why: str) -> Identified:
 
 
 def _identify_logs(
-    tasks: Sequence[_Task], stages: tuple[Stage, ...], max_memory: float
+    tasks: Sequence[_Task], stages: tuple[Stage, ...], how: Mapping[str, Any]
 ) -> list[_Outcome]:
     """Read and identify logs, and pack their outcomes where these are to be stored."""
-    return [
-        _Outcome.of(task, identify_log(task, stages, max_memory), is_new=True) for task in tasks
-    ]
+    return [_Outcome.of(task, identify_log(task, stages, how), is_new=True) for task in tasks]
 
 
-def identify_log(task: _Task, stages: tuple[Stage, ...], max_memory: float) -> Identified:
-    """Read and identify one log; every failure becomes its refusal, never an exception."""
+def identify_log(task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any]) -> Identified:
+    """Read and identify one log; every failure becomes its refusal, never an exception.
+
+    It is read with `max_memory` and `latest` of `read_log`.
+    """
     by, stage, asked = "", None, None
     try:
         read = partial(read_log, columns=task.columns, overrides=task.overrides)
-        log = read(task.path, name=task.name, max_memory=max_memory)
+        log = read(task.path, name=task.name, **how)
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
         require_identity(log)

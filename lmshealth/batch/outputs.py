@@ -69,7 +69,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page=page,
         summary=summary,
         tables={name: pack(text) for name, text in tables.items()},
-        excluded=tuple(r.log for r in found.refused if r.reason == "odometer"),
+        excluded=tuple(r.log for r in found.refused if r.reason in ("odometer", "date")),
         status=status,
         points=tuple(points(rows)),
     )

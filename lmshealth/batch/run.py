@@ -53,6 +53,8 @@ class Settings:
         How logs are read; None where their columns are those of the log contract.
     max_memory : float
         Most memory in bytes that reading a log may take.
+    latest : datetime or None
+        Latest moment of a log or of maintenance; None for a day from now.
     follow_links : bool
         Whether symbolic links out of the folder of logs are followed.
     alerts : Alerts
@@ -77,6 +79,7 @@ class Settings:
     seed: int = 0
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
+    latest: datetime | None = None
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
     growing: frozenset[Path] = frozenset()
@@ -157,7 +160,7 @@ def run(
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
     _prepare(out)
-    work = read_maintenance(folder, follow_links=settings.follow_links)
+    work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         resources = Resources(store, pool, progress)
         reading = Reading(*(getattr(settings, name) for name in Reading._fields))

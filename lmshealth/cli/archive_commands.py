@@ -115,7 +115,7 @@ def run(
 @_run_options
 @click.option(
     "--interval",
-    type=options.Finite(0, min_open=True),
+    type=options.Finite(0, 86_400, min_open=True),  # a run on every new day
     default=30.0,
     metavar="SECONDS",
     help="Time between polls; a file is analysed when it is the same at two of them.",

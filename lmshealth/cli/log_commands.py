@@ -17,6 +17,7 @@ from lmshealth._toml import decode
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import RANGES
 from lmshealth.io.log import Log, Refusal
 from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
@@ -42,6 +43,8 @@ _NO_BAND = (
     "Without a band or a description close modes may be merged or missed; select them with --band "
     "LOW HIGH. The mode names are valid for this call only."
 )
+# Most harmonics or averages; longest period or time constant in s, and amplitude in nm.
+_MOST_LINES, _LONGEST = 1_000_000, 1e12
 _TRIED = 2  # channels in which `init` looks for modes
 # Signal-to-noise ratio of the modes in the band that it proposes, and factor to its ends.
 _CLEAR, _BESIDE = 3.0, 1.3
@@ -63,12 +66,13 @@ _PLOT = click.option(
 @click.option(
     "--sample-rate",
     "rate",
-    type=options.Finite(0, min_open=True),
+    type=options.Finite(*RANGES["sample_rate_hz"]),
     metavar="HZ",
     help="Sample rate of logs that state neither times nor a rate.",
 )
 @_OVERWRITE
 @options.MOST_MEMORY
+@options.ALLOW_FUTURE
 @click.pass_context
 def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any) -> None:
     """Propose map.toml, manifest.csv and my-stage.toml from logs.
@@ -274,10 +278,15 @@ def _save(path: Path, found: LogEstimates) -> None:
     "error velocities/*.h5", "error log.h5 --count 20 --floor-nm 50 --part settling --format json"
 )
 @options.LOGS
-@click.option("--count", type=click.IntRange(1), default=100, help="Number of strongest harmonics.")
+@click.option(
+    "--count",
+    type=click.IntRange(1, _MOST_LINES),
+    default=100,
+    help="Number of strongest harmonics.",
+)
 @click.option(
     "--floor-nm",
-    type=click.FloatRange(0),
+    type=options.Finite(0, _LONGEST),
     default=30.0,
     help="Amplitude in nm above which harmonics are counted separately.",
 )
@@ -352,7 +361,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
 @options.band_option("Use only this band, in Hz; default: the excited band.")
 @click.option(
     "--period",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Finite(0, _LONGEST, min_open=True),
     metavar="S",
     help="Period of the excitation in s, to 1 %; default: found from a periodic input.",
 )
@@ -363,13 +372,13 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
 )
 @click.option(
     "--averages",
-    type=click.IntRange(2),
+    type=click.IntRange(2, _MOST_LINES),
     metavar="N",
     help="Averages of a measured response: with its coherence they give the noise.",
 )
 @click.option(
     "--exponential",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Finite(1e-12, _LONGEST),
     metavar="S",
     help="Time constant of the exponential window on a measured response; its damping is removed.",
 )
@@ -484,7 +493,7 @@ def _each(
     found: list[Result] = []
     lost: list[Refusal] = []
     manifests: dict[Path, Manifest] = {}
-    reading = {name: ctx.params[name] for name in ("columns", "max_memory")}
+    reading = {name: ctx.params[name] for name in ("columns", "max_memory", "latest")}
     named = ctx.params["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
     paths = [path for path in named if path.name not in NOT_LOGS] or named

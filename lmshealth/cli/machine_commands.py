@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
 from lmshealth.report.tables import Row
+from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision, load_stage
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
@@ -47,6 +49,7 @@ _TABLES = ("track", "track_cov", "effects", "events", "refused")
 @options.out_option(help="Table of the track.")
 @options.COV
 @options.MAINTENANCE
+@options.ALLOW_FUTURE
 @click.option("--track-cov", type=options.OUT, help="Table of the covariances of the drifts.")
 @click.option("--effects", type=options.OUT, help="Table of effects other than wear.")
 @click.option(
@@ -66,8 +69,7 @@ def track(table: Path, **given: Any) -> None:
     without --stage every covariate column is regressed about its median.
     """
     stage, targets = given["stage"], given | {"track": given["out"]}
-    more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
-    machines, notes = read_machines(table, stage, **more)
+    machines, notes = read_machines(table, stage, **_reading(given))
     rows: dict[str, list[Row]] = {name: [] for name in _TABLES}
     tracked = []
     with progress_bars(PATIENCE) as progress:
@@ -91,6 +93,12 @@ def track(table: Path, **given: Any) -> None:
     for name in _TABLES:
         if targets[name]:
             _write(targets[name], name, rows[name])
+
+
+def _reading(given: dict[str, Any]) -> dict[str, Any]:
+    """Return the options of `read_machines`."""
+    names = {"cross_terms": "cov", "maintenance": "maintenance", "latest": "latest"}
+    return {name: given[option] for name, option in names.items()}
 
 
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
@@ -132,6 +140,7 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 @click.option(
     "--shared", multiple=True, metavar="PARAMETER", help="Parameter that the machines share."
 )
+@options.ALLOW_FUTURE
 @options.EPOCHS
 @options.SEED
 @click.pass_context
@@ -156,9 +165,12 @@ def _infer_machines(
     table: Path, given: dict[str, Any], progress: Progress
 ) -> tuple[list[Health], list[str]]:
     """Infer all machines of a table; return results, and reasons of those that have none."""
-    stage, machines = given["stage"], _read_drifts(table, given["cov"])
+    stage, latest = given["stage"], given["latest"]
+    machines = _read_drifts(table, given["cov"], latest)
     if given["others"]:
-        others = [(_single(path, _read_drifts(path, None)), own) for path, own in given["others"]]
+        others = [
+            (_single(path, _read_drifts(path, None, latest)), own) for path, own in given["others"]
+        ]
         together = [(_single(table, machines), stage), *others]
         names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
         seed = seed_of(given["seed"], *names)
@@ -192,9 +204,10 @@ def _counting_map(
         yield result
 
 
-def _read_drifts(table: Path, cov: Path | None) -> list[Drifts]:
+def _read_drifts(table: Path, cov: Path | None, latest: datetime | None) -> list[Drifts]:
     default = table.with_name("track_cov.csv")
-    found, notes = read_drifts(table, cross_terms=cov or (default if default.exists() else None))
+    terms = cov or (default if default.exists() else None)
+    found, notes = read_drifts(table, cross_terms=terms, latest=latest)
     print_notes(f"{table}: {note}" for note in notes)
     return found
 
@@ -215,6 +228,7 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
 @options.out_option(help="Table of the remaining life.")
 @options.COV
 @options.MAINTENANCE
+@options.ALLOW_FUTURE
 @click.option(
     "--posterior", type=options.OUT, help="Draws of the degradation laws, as NetCDF for ArviZ."
 )
@@ -224,10 +238,12 @@ def _single(table: Path, machines: list[Drifts]) -> Drifts:
     metavar="YYYY-MM-DD",
     help="Also give the probability that a limit is reached before this day.",
 )
-@click.option("--max-risk", type=options.SHARE, help="Service on the last day within this risk.")
+@click.option(
+    "--max-risk", type=options.Finite(*RISK), help="Service on the last day within this risk."
+)
 @click.option(
     "--cost-ratio",
-    type=options.Finite(1, min_open=True),
+    type=options.Finite(1, MOST_COST_RATIO, min_open=True),
     help="Service at least cost, for this cost of a failure over that of a planned service.",
 )
 @options.SEED
@@ -240,8 +256,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
-    more = {"cross_terms": given["cov"], "maintenance": given["maintenance"]}
-    machines, notes = read_machines(table, stage, **more)
+    machines, notes = read_machines(table, stage, **_reading(given))
     print_notes(notes)
     for history, refused in machines:
         missing = missing_mode_notices(history, refused)

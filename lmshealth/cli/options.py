@@ -18,12 +18,17 @@ from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import load_columns
-from lmshealth.io.constants import MAX_MEMORY
+from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, MAX_MEMORY
+from lmshealth.io.log import MOMENTS
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
 
 # Exit status: done, but some logs or machines were refused.
 SOME_REFUSED = 3
+# Largest values of options: seeds are stored in 64 bits with a sign, days are those of a century,
+# and 60 bits address so many GB.
+_MOST_SEED, _MOST_DAYS, _MOST_GB = (1 << 63) - 1, 36_525, 1e9
+_MOST_EPOCHS, _MOST_WORKERS = 1_000_000, 1_000
 
 
 class Finite(click.FloatRange):
@@ -42,10 +47,13 @@ class Finite(click.FloatRange):
 def day(value: str) -> date:
     """Read a day of the calendar; any other text is wrong usage."""
     try:
-        return datetime.strptime(value, "%Y-%m-%d").date()
+        found = datetime.strptime(value, "%Y-%m-%d").date()
     except ValueError as error:
         detail = f"{value!r} is not a day; needed is YYYY-MM-DD, such as 2027-03-01."
         raise click.BadParameter(detail) from error
+    if not FIRST_MOMENT.date() <= found < LAST_MOMENT.date():
+        raise click.BadParameter(f"{value!r} is not a day {MOMENTS}.")
+    return found
 
 
 def _band(
@@ -129,13 +137,20 @@ _COLUMNS = click.option(
 )
 MOST_MEMORY = click.option(
     "--max-memory",
-    type=Finite(0, min_open=True),
+    type=Finite(0, _MOST_GB, min_open=True),
     default=MAX_MEMORY / 1e9,
     envvar="LMSHEALTH_MAX_MEMORY",
     show_envvar=True,
     metavar="GB",
     callback=lambda ctx, option, gigabytes: 1e9 * gigabytes,
     help="Refuse a log that needs more memory than this to be read (MAT, UFF58, TDMS).",
+)
+ALLOW_FUTURE = click.option(
+    "--allow-future",
+    "latest",
+    is_flag=True,
+    callback=lambda ctx, option, given: LAST_MOMENT if given else None,
+    help="Accept logs and maintenance that are dated after tomorrow.",
 )
 PART = click.option(
     "--part",
@@ -151,22 +166,25 @@ MAINTENANCE = click.option(
 )
 EPOCHS = click.option(
     "--epochs",
-    type=click.IntRange(1),
+    type=click.IntRange(1, _MOST_EPOCHS),
     default=40,
     help="Infer health at this many logs per machine at most.",
 )
 SEED = click.option(
-    "--seed", type=click.IntRange(0), default=0, help="Seed of all random numbers: results repeat."
+    "--seed",
+    type=click.IntRange(0, _MOST_SEED),
+    default=0,
+    help="Seed of all random numbers: results repeat.",
 )
 WORKERS = click.option(
     "--workers",
-    type=click.IntRange(1),
+    type=click.IntRange(1, _MOST_WORKERS),
     callback=lambda ctx, option, count: count or cpu_count(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
 _SILENT_DAYS = click.option(
     "--silent-days",
-    type=Finite(0, min_open=True),
+    type=Finite(0, _MOST_DAYS, min_open=True),
     metavar="N",
     help="Report a machine without a log for more than N days.",
 )
@@ -187,8 +205,8 @@ PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stag
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options by which logs are read: --columns and --max-memory (bytes)."""
-    return _COLUMNS(MOST_MEMORY(command))
+    """Add the options by which logs are read: --columns, --max-memory (bytes), --allow-future."""
+    return _COLUMNS(MOST_MEMORY(ALLOW_FUTURE(command)))
 
 
 def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -66,7 +66,7 @@ def _detections(
 )
 @click.option(
     "--seconds",
-    type=click.FloatRange(0, min_open=True),
+    type=options.Finite(0, 1e9, min_open=True),
     multiple=True,
     help="Length of a log in s; may be given several times. Default 10 to 600 s.",
 )

@@ -3,7 +3,6 @@
 A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
 """
 
-import math
 import re
 from dataclasses import dataclass
 from datetime import datetime
@@ -14,7 +13,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta, Struct
 
 from lmshealth._files import read_table
-from lmshealth._toml import decode
+from lmshealth._toml import decode, within
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
 from lmshealth.io.metadata import KEYS, as_text
@@ -136,8 +135,10 @@ def _factor(column: str, role: Role, unit: str | float) -> float:
             detail = f"column {column!r} is given the unit {unit!r}; needed {_choices(role)}"
             raise Unusable("unit", detail)
         return _UNITS[key][1]
-    if not math.isfinite(unit) or unit == 0:
-        raise Unusable("unit", f"column {column!r} is given the scale {unit}; needed a number")
+    least, most = constants.SCALES
+    if not least <= abs(unit) <= most:
+        needed = f"a number of magnitude {least:g} to {most:g}"
+        raise Unusable("unit", f"column {column!r} is given the scale {unit:g}; needed {needed}")
     return float(unit)
 
 
@@ -153,7 +154,7 @@ class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
     they are called ``"0"``, ``"1"``, ...), or the names for a file without such a line.
     """
 
-    skip_rows: Annotated[int, Meta(ge=0)] | None = None
+    skip_rows: Annotated[int, within(0, constants.MOST_ROWS)] | None = None
     delimiter: Annotated[str, Meta(min_length=1, max_length=1)] | None = None
     decimal: Literal[".", ","] | None = None
     header: bool | list[str] | None = None
@@ -173,7 +174,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     # Contract name without unit suffix to its unit, or to the SI value of one count.
     units: dict[str, str | float] = {}
     metadata: dict[str, Any] = {}  # constants that override the metadata of the file
-    sample_rate_hz: Annotated[float, Meta(gt=0)] | None = None  # in Hz
+    sample_rate_hz: Annotated[float, within(*constants.RANGES["sample_rate_hz"])] | None = None
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
 

@@ -4,6 +4,8 @@ They are read as ``constants.NAME``. Lengths of text and counts that only bound 
 hostile files may claim were chosen far above every honest export.
 """
 
+from datetime import UTC, datetime, timedelta
+
 MAX_MEMORY = 2e9
 """Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS) may
 take: ten minutes of 20 kHz take 0.1 GB per channel. The option ``--max-memory``."""
@@ -80,8 +82,34 @@ it."""
 
 LONGEST_NAME = 200
 """Most characters of a machine, servo, description or column name."""
-SLOWEST_HZ, FASTEST_HZ = 1e-9, 1e12
-"""Sample rates between which its reciprocal and its multiples stay finite."""
+RANGES = {
+    "travel_km": (0.0, 1e10),
+    "sample_rate_hz": (1e-6, 1e11),
+    "velocity_mm_s": (-1e7, 1e7),
+    "temperature_c": (-273.15, 1000.0),
+    "payload_kg": (-1e6, 1e6),
+    "position_mm": (-1e8, 1e8),
+}
+"""Least and largest value of metadata, also as columns of tables, by their name. No machine leaves
+them: an odometer of ten strokes a second counts 10¹⁰ in 30 years, 10⁷ mm/s leaves the atmosphere,
+no axis is 100 km long, an oscilloscope samples at 10¹¹ Hz. Placeholders of missing values do
+(-9999 °C, 1e300)."""
+SCALES = 1e-18, 1e12
+"""Magnitudes of the SI value of one count: an attometre, and `LARGEST_MAGNITUDE`."""
+LARGEST_NUMBER = 1e100
+"""Magnitude of any other number of a table: its square and cube are finite."""
+
+# Dates
+
+FIRST_MOMENT = datetime(1970, 1, 1, tzinfo=UTC)
+LAST_MOMENT = datetime(2100, 1, 1, tzinfo=UTC)
+"""Moments from which, and before which, a log may be recorded. Clocks begin to count in 1970, and
+nothing computed from a date before 2100 leaves the calendar, or a clock of 64 bits in ns."""
+FUTURE = timedelta(days=1)
+"""How far a moment may be in the future: clocks of controllers are set to a wrong time zone."""
+MADE = datetime(2026, 11, 27, tzinfo=UTC)
+"""When this limit was made: the clock of a computer is wrong if it is earlier, and must not refuse
+every log."""
 
 # What damaged or hostile files may claim
 

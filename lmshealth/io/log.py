@@ -8,11 +8,39 @@ import numpy as np
 
 from lmshealth._arrays import freeze
 from lmshealth._result import Result
+from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
 _SUFFIXES = {"displacement": "m", "acceleration": "m_s2", "current": "a"}
 SI_UNITS = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
+MOMENTS = f"from {constants.FIRST_MOMENT.date()} on, before {constants.LAST_MOMENT.date()}"
+"""Range of the moments of logs, for messages."""
+
+
+def expect_possible(key: str, value: float) -> None:
+    """Require a number of metadata or tables in the range of its key; `ValueError` names both."""
+    if not low_high(key)[0] <= value <= low_high(key)[1]:
+        raise ValueError(f"{key} is {value:g}, needed {possible(key)}")
+
+
+def possible(key: str) -> str:
+    """Return the range of the numbers of a key, for messages."""
+    return "a number from {:g} to {:g}".format(*low_high(key))
+
+
+def low_high(key: str) -> tuple[float, float]:
+    """Return the range of the numbers of a key."""
+    most = constants.LARGEST_NUMBER
+    return constants.RANGES.get(key, (-most, most))
+
+
+def expect_moment(moment: datetime) -> None:
+    """Require a moment with a time zone in the range of `constants`, or raise `ValueError`."""
+    zoned = isinstance(moment, datetime) and moment.tzinfo is not None
+    if not zoned or not constants.FIRST_MOMENT <= moment < constants.LAST_MOMENT:
+        found = f"{moment}, a {type(moment).__name__}"
+        raise ValueError(f"recorded_at is {found}; needed a moment with a time zone, {MOMENTS}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +77,10 @@ class Notice:
 
 @dataclass(frozen=True, slots=True)
 class Metadata:
-    """Metadata of a log; None where nothing is stated."""
+    """Metadata of a log; None where nothing is stated.
+
+    `ValueError` for moments and numbers out of the ranges of `constants`.
+    """
 
     stage: str | None = None  # identity of the physical machine
     recorded_at: datetime | None = None  # with time zone
@@ -60,6 +91,16 @@ class Metadata:
     baseline: bool | None = None  # whether the log belongs to the baseline
     description: str | None = None  # stage description that the manifest names for this log
     velocity: float | None = None  # set velocity in m/s, for logs without a set point
+
+    def __post_init__(self) -> None:
+        if self.recorded_at is not None:
+            freeze(self)
+            expect_moment(self.recorded_at)
+        numbers = dict(self.covariates)
+        numbers |= {} if self.travel is None else {"travel_km": self.travel / 1e3}
+        numbers |= {} if self.velocity is None else {"velocity_mm_s": self.velocity * 1e3}
+        for key, value in numbers.items():
+            expect_possible(key, value)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,8 +133,7 @@ class Log(Result):
     guessed: tuple[str, ...] = ()  # of the layout: what neither file nor column map states
 
     def __post_init__(self) -> None:
-        if self.sample_rate <= 0 or not np.isfinite(self.sample_rate):
-            raise ValueError(f"sample_rate is {self.sample_rate}, needed a positive number")
+        expect_possible("sample_rate_hz", self.sample_rate)
         sizes = {channel.values.size for channel in self.channels}
         if len(sizes) > 1:
             raise ValueError(f"channels have lengths {sorted(sizes)}, needed one length")

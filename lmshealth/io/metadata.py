@@ -4,12 +4,12 @@ import math
 import re
 import unicodedata
 from collections.abc import Mapping
-from datetime import UTC, date, datetime
+from datetime import UTC, date, datetime, timedelta
 
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.log import Metadata
+from lmshealth.io.log import MOMENTS, Metadata, expect_moment, expect_possible, possible
 from lmshealth.io.refusal import Unusable
 
 COVARIATES = ("temperature_c", "payload_kg", "position_mm")
@@ -35,32 +35,28 @@ INVISIBLE = (
 _BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
 
-def parse_metadata(text: Mapping[str, str]) -> tuple[Metadata, float | None]:
+def parse_metadata(
+    text: Mapping[str, str], latest: datetime | None = None
+) -> tuple[Metadata, float | None]:
     """Convert the metadata of a log; unknown keys and empty values are ignored.
 
-    The sample rate in Hz is returned beside the rest. `Unusable` (``metadata``) names key and
-    value.
+    The sample rate in Hz is returned beside the rest. `Unusable` (``metadata``, or ``future`` for a
+    moment after `latest`, see `parse_moment`) names key and value.
     """
     given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
-    travel = _number(given, "travel_km", scale=1e3)
-    if travel is not None and travel < 0:
-        raise _bad(given, "travel_km", "an odometer of 0 or more")
+    travel, velocity = _number(given, "travel_km"), _number(given, "velocity_mm_s")
     if (flag := given.get("baseline", "").lower()) and flag not in _BOOLEANS:
         raise _bad(given, "baseline", "true or false")
-    metadata = Metadata(
+    return Metadata(
         stage=parse_name(given, "stage"),
-        recorded_at=parse_moment(given),
-        travel=travel,
+        recorded_at=parse_moment(given, latest),
+        travel=None if travel is None else 1e3 * travel,
         covariates={key: value for key in COVARIATES if (value := _number(given, key)) is not None},
         servo_id=parse_name(given, "servo_id"),
         baseline=_BOOLEANS.get(flag),
         description=parse_name(given, "description"),
-        velocity=_number(given, "velocity_mm_s", scale=1e-3),
-    )
-    rate = _number(given, "sample_rate_hz")
-    if rate is not None and not constants.SLOWEST_HZ < rate < constants.FASTEST_HZ:
-        raise _bad(given, "sample_rate_hz", "a positive number")
-    return metadata, rate
+        velocity=None if velocity is None else 1e-3 * velocity,
+    ), _number(given, "sample_rate_hz")
 
 
 def _bad(given: Mapping[str, str], key: str, needed: str) -> Unusable:
@@ -82,33 +78,51 @@ def parse_name(given: Mapping[str, str], key: str) -> str | None:
     return unicodedata.normalize("NFC", name)
 
 
-def parse_moment(given: Mapping[str, str]) -> datetime | None:
-    """Read ``recorded_at``; None where it is not given, refused without date or time zone."""
+def parse_moment(given: Mapping[str, str], latest: datetime | None = None) -> datetime | None:
+    """Read ``recorded_at``; None where it is not given.
+
+    `Unusable`: ``metadata`` without date or time zone, or out of the range of `constants`;
+    ``future`` for one after `latest`, by default a day from now.
+    """
     if not given.get("recorded_at"):
         return None
-    needed = "ISO 8601 with a time zone, such as 2026-03-01T08:30:00+01:00"
     try:
         moment = datetime.fromisoformat(given["recorded_at"])
-        if moment.tzinfo is None:
-            raise _bad(given, "recorded_at", needed)
-        moment.astimezone(UTC)
-    except (ValueError, OverflowError) as error:
+        expect_moment(moment)
+    except ValueError as error:
+        needed = f"ISO 8601 with a time zone, {MOMENTS}, such as 2026-03-01T08:30:00+01:00"
         raise _bad(given, "recorded_at", needed) from error
+    if is_future(moment, latest):
+        what = f"recorded_at is {given['recorded_at'][:80]!a}, in the future"
+        raise Unusable("future", f"{what}; correct it, or set --allow-future")
     return moment
 
 
-def _number(given: Mapping[str, str], key: str, *, scale: float = 1.0) -> float | None:
-    """Read a number times a scale; None where it is not given."""
+def is_future(moment: datetime | None, latest: datetime | None = None) -> bool:
+    """Return whether a log of a moment was recorded after `latest`, by default a day from now."""
+    now = max(datetime.now(UTC), constants.MADE)
+    return moment is not None and moment > (latest or now + constants.FUTURE)
+
+
+def _number(given: Mapping[str, str], key: str) -> float | None:
+    """Read a number in the range of its key; None where it is not given."""
     if key not in given:
         return None
     try:
         # Python reads 1_000 as a number; no exporter means that.
-        value = math.nan if "_" in given[key] else float(given[key]) * scale
-    except ValueError:
-        value = math.nan
-    if not math.isfinite(value):
-        raise _bad(given, key, "a finite number")
+        value = math.nan if "_" in given[key] else float(given[key])
+        expect_possible(key, value)
+    except ValueError as error:
+        raise _bad(given, key, possible(key)) from error
     return value
+
+
+def moment_after(epoch: datetime, count: float, unit: timedelta = timedelta(seconds=1)) -> str:
+    """Write a moment after an epoch; `parse_moment` refuses what is out of the calendar."""
+    try:
+        return (epoch + count * unit).isoformat()
+    except OverflowError:
+        return f"{count:g} times {unit.total_seconds():g} s after {epoch.date()}"
 
 
 def as_text(value: object) -> str:

@@ -4,6 +4,7 @@ import hashlib
 import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import NamedTuple, cast
 
@@ -16,7 +17,7 @@ from lmshealth.io.channel_checks import check_signal, independent, missing_range
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
@@ -35,6 +36,7 @@ def read_log(
     overrides: Mapping[str, str] | None = None,
     name: str | None = None,
     max_memory: float = constants.MAX_MEMORY,
+    latest: datetime | None = None,
 ) -> Log:
     """Read a log.
 
@@ -51,6 +53,9 @@ def read_log(
     max_memory : float, optional
         Most memory in bytes that decoding one variable (MAT), data set (UFF58) or segment (TDMS)
         may take; a log that needs more is refused with reason ``too-large``.
+    latest : datetime, optional
+        Latest moment of recording; a later one is refused with reason ``future``. By default a day
+        from now.
 
     Returns
     -------
@@ -85,7 +90,8 @@ def read_log(
     used = ColumnMap() if columns is None else columns
     try:
         content = load(Path(path), used, max_memory)
-        return _to_log(content, used, overrides or {}, name=label, digest=digest)
+        metadata = parse_metadata(_stated(content, used, overrides), latest)
+        return _to_log(content, used, metadata, name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 
@@ -127,12 +133,24 @@ class _Series(NamedTuple):
     values: Samples
 
 
+def _stated(
+    content: Content, layout: ColumnMap, overrides: Mapping[str, str] | None
+) -> dict[str, str]:
+    """Merge the metadata of a file, of the column map and of a manifest."""
+    filled = {key: value for key, value in (overrides or {}).items() if value.strip()}
+    return content.metadata | layout.constants() | filled
+
+
 def _to_log(
-    content: Content, layout: ColumnMap, overrides: Mapping[str, str], *, name: str, digest: str
+    content: Content,
+    layout: ColumnMap,
+    parsed: tuple[Metadata, float | None],
+    *,
+    name: str,
+    digest: str,
 ) -> Log:
-    """Apply the log contract to the content of a file."""
-    filled = {key: value for key, value in overrides.items() if value.strip()}
-    metadata, rate = parse_metadata(content.metadata | layout.constants() | filled)
+    """Apply the log contract to the content of a file, with its metadata and sample rate."""
+    metadata, rate = parsed
     series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)

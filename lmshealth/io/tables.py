@@ -17,6 +17,8 @@ import pandas as pd
 from lmshealth._files import read_table
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
+from lmshealth.io.log import low_high, possible
+from lmshealth.io.metadata import parse_moment
 from lmshealth.io.refusal import Unusable, listed, repeated
 
 _MOST_LISTED = 3
@@ -115,29 +117,38 @@ def lines(table: pd.DataFrame, wrong: "pd.Series[bool]") -> str:
 def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
     """Convert columns to numbers, in place; missing columns are ignored, empty cells are NaN.
 
-    Any other cell raises `BadTable`.
+    Any other cell raises `BadTable`, and so does a number out of the range of its column.
     """
     for name in [name for name in names if name in table.columns]:
-        given = table[name].str.strip() != ""
+        text = table[name]
+        given = text.str.strip() != ""
         numbers = pd.to_numeric(table[name], errors="coerce")
         if numbers.dtype == float:  # before 3.1 pandas rounds their last digits
             known = np.isfinite(numbers)
             numbers[known] = table[name][known].astype(float)
         table[name] = numbers
-        wrong = given & ~np.isfinite(numbers)
-        if wrong.any():
-            raise BadTable(f"{path}, {lines(table, wrong)}: {name} is no finite number")
+        for wrong, needed in (
+            (~np.isfinite(numbers), "a finite number"),
+            (~numbers.between(*low_high(name)), possible(name)),
+        ):
+            if (wrong := wrong & given).any():
+                what = f"{name} is {text[wrong].iloc[0][:80]!a}, needed {needed}"
+                raise BadTable(f"{path}, {lines(table, wrong)}: {what}")
 
 
-def to_moments(path: Path, table: pd.DataFrame) -> None:
-    """Convert the column recorded_at to dates with time zone, in place, or raise `BadTable`."""
+def to_moments(path: Path, table: pd.DataFrame, latest: datetime | None = None) -> None:
+    """Convert the column recorded_at to dates with time zone, in place, or raise `BadTable`.
+
+    Those after `latest` are refused, too (`parse_moment`).
+    """
     moments = []
     for index, text in zip(table.index, table["recorded_at"], strict=True):
-        where = f"{path}, line {int(index) + 2}: recorded_at {text!r}"
         try:
-            moments.append(datetime.fromisoformat(text))
-        except ValueError as error:
-            raise BadTable(f"{where} is no ISO date, such as 2026-03-01T06:00:00+00:00") from error
-        if moments[-1].tzinfo is None:
-            raise BadTable(f"{where} needs a time zone, such as {text}+00:00")
-    table["recorded_at"] = moments
+            moment = parse_moment({"recorded_at": text}, latest)
+        except Unusable as error:
+            raise BadTable(f"{path}, line {int(index) + 2}: {error.detail}") from error
+        if moment is None:
+            raise BadTable(f"{path}, line {int(index) + 2}: recorded_at is empty")
+        moments.append(moment)
+    # Of another type pandas would make Timestamps of them.
+    table["recorded_at"] = pd.Series(moments, table.index, dtype=object)

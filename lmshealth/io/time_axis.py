@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from lmshealth._arrays import FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
+from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
 IntArray = NDArray[np.int64]
@@ -117,6 +118,10 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
     if n_lost > constants.LARGEST_MISSING * time.size or (varies and spread):
         needed = "export samples of one clock, or cut the record where the rate changes"
         raise Unusable("time", f"{note}; {needed}")
+    try:
+        expect_possible("sample_rate_hz", own)
+    except ValueError as error:
+        raise Unusable("time", f"time_s: {error}") from error
     if not varies:
         return TimeAxis(own, breaks, note, gone)
     return TimeAxis(own, breaks, f"{note}: resampled to the lowest", gone, tuple(clocks))

@@ -1,5 +1,24 @@
 """Constants that decide what is accepted and published of a stage description."""
 
+# --- Ranges of the numbers of a description -------------------------------------------------------
+# Wider than any machine: buildings vibrate at 0.1 Hz, ultrasonic drives at 10⁵ Hz; quartz has a
+# damping ratio of 10⁻⁷. Within them nothing that is computed overflows or is lost in rounding.
+FREQUENCY_HZ, DAMPING_RATIO, SNR = (1e-3, 1e7), (1e-7, 0.99), (1e-6, 1e12)
+# Part of the frequency that a mode is searched in: healthy machines drift by more than the least.
+SEARCH = 1e-4, 0.9
+# Health parameters in their units, with their priors and limits; travel and its rates; sigma of a
+# logarithm; exponents of wear.
+VALUE, LIFE_KM, SIGMA, EXPONENT = (1e-12, 1e12), (1e-6, 1e12), (1e-4, 10.0), (0.01, 20.0)
+# Least relative width of a distribution, and least standard deviation of a ln parameter: rounding.
+LEAST_WIDTH, LEAST_PRIOR_STD = 1e-9, 1e-5
+# Coefficients of covariates per unit and their references; places of sensors in m; components of
+# shapes and directions in any unit, of which the largest is not rounded to 0.
+EFFECT, REFERENCE, PLACE_M, COMPONENT, LEAST_COMPONENT = (1e-12, 1e3), 1e9, 1e6, 1e9, 1e-9
+WAVELENGTH_MM, KM_PER_DAY, HORIZON_KM = (1e-6, 1e9), (1e-9, 1e6), (1e-3, 1e10)
+WEIGHT, RISK, MOST_COST_RATIO = (1e-6, 1e6), (1e-9, 1 - 1e-9), 1e9
+# Least ratio of neighbouring values of a parameter on the grid of a map.
+LEAST_STEP = 1 + 1e-6
+
 # --- Health parameters -------------------------------------------------------------------------
 # Least share of the prior variance of a ln parameter that the data must remove before its value is
 # published: from a half on the data contribute more than the prior.
@@ -29,6 +48,8 @@ MAP_ERRORS = ((1.0, 0.75), (3.0, 0.25))
 BAND_HALF_WIDTH = 8.0
 # Least duration of a segment times the half-power bandwidth of a mode identified in it.
 LEAST_RESOLUTION = 2.0
+# Fourier frequencies that are summed; from there on a bound is inverse to the duration.
+MOST_ORDINATES = 400_000
 
 # --- Check of a description ---------------------------------------------------------------------
 # Duration in s of the typical logs of the check; there are as many now as in the baseline.

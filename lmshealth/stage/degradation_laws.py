@@ -7,6 +7,7 @@ import numpy as np
 from scipy.special import expit, log_expit
 
 from lmshealth._arrays import FloatArray
+from lmshealth._toml import within
 from lmshealth.stage import constants
 from lmshealth.stage.priors import Lognormal, Prior, Uniform
 
@@ -32,7 +33,7 @@ class Law(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True)
     """
 
     # Prior probability in proportion to the other laws of the parameter.
-    weight: Annotated[float, msgspec.Meta(gt=0, le=1e6)] = 1.0
+    weight: Annotated[float, within(*constants.WEIGHT)] = 1.0
     names: ClassVar[tuple[str, ...]] = ()  # of the natural parameters: columns of theta
     label: ClassVar[str]  # words of the report
 
@@ -91,9 +92,11 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     names: ClassVar[tuple[str, ...]] = ("life_m", "exponent")
 
     def __post_init__(self) -> None:
-        _expect_mass("life_km", self.life_km, 0.0, np.inf)
-        if not self.exponent.low > 0:
-            raise ValueError(f"exponent needs a range above 0, got {self.exponent}")
+        _expect_mass("life_km", self.life_km, *constants.LIFE_KM)
+        least, most = constants.EXPONENT
+        if not least <= self.exponent.low < self.exponent.high <= most:
+            needed = f"a range within {least:g} to {most:g}"
+            raise ValueError(f"exponent needs {needed}, got {self.exponent}")
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
         """Convert y1 = n ln(now / s_w) and y2 = logit of n in its range."""
@@ -117,7 +120,8 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Return the health, 0 from s_w on."""
         life, n = theta[:, :1], theta[:, 1:]
-        left = 1 - (np.maximum(travel, 0) / life) ** n
+        with np.errstate(over="ignore"):
+            left = 1 - (np.maximum(travel, 0) / life) ** n
         return np.asarray(np.maximum(left, 0) ** self.outer)
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
@@ -142,7 +146,7 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
     names: ClassVar[tuple[str, ...]] = ("floor", "life_m")
 
     def __post_init__(self) -> None:
-        _expect_mass("life_km", self.life_km, 0.0, np.inf)
+        _expect_mass("life_km", self.life_km, *constants.LIFE_KM)
         _expect_mass("floor", self.floor, 0.0, 1.0)
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:

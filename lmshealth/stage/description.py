@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-import sys
+from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import date
 from difflib import get_close_matches
@@ -16,10 +16,10 @@ from msgspec import Meta, Struct
 
 from lmshealth._arrays import FloatArray
 from lmshealth._files import escapes, read_table
-from lmshealth._toml import decode
+from lmshealth._toml import decode, within
 from lmshealth.errors import BadStage
-from lmshealth.io.constants import LONGEST_NAME
-from lmshealth.io.log import Metadata
+from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, LONGEST_NAME
+from lmshealth.io.log import MOMENTS, Metadata
 from lmshealth.io.metadata import INVISIBLE
 from lmshealth.io.refusal import repeated
 from lmshealth.stage import constants
@@ -28,11 +28,12 @@ from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
 _SHIPPED = Path(__file__).parent / "descriptions"
-Positive = Annotated[float, Meta(gt=0, le=sys.float_info.max)]
-Share = Annotated[float, Meta(gt=0, lt=1)]
+Value = Annotated[float, within(*constants.VALUE)]
+Frequency = Annotated[float, within(*constants.FREQUENCY_HZ)]
+Component = Annotated[float, within(-constants.COMPONENT, constants.COMPONENT)]
+Place = Annotated[float, within(-constants.PLACE_M, constants.PLACE_M)]
 # Names appear on terminals, in tables and pages.
 Name = Annotated[str, Meta(max_length=LONGEST_NAME, pattern=f"^[^{INVISIBLE}]*\\Z")]
-CostRatio = Annotated[float, Meta(gt=1, le=sys.float_info.max)]
 
 
 class _Part(Struct, frozen=True, forbid_unknown_fields=True):
@@ -52,16 +53,26 @@ class ModeSpec(_Part, frozen=True):
     """
 
     name: Annotated[Name, Meta(examples=["pitch"])]
-    frequency_hz: Annotated[Positive, Meta(examples=[136.4])]
-    damping_ratio: Annotated[Share, Meta(examples=[0.015])]
+    frequency_hz: Annotated[Frequency, Meta(examples=[136.4])]
+    damping_ratio: Annotated[float, within(*constants.DAMPING_RATIO, 0.015)]
     direction: Name = ""
-    snr: Positive = 100.0
-    search: Share = 0.15
+    snr: Annotated[float, within(*constants.SNR)] = 100.0
+    search: Annotated[float, within(*constants.SEARCH)] = 0.15
     tracked: bool = True
-    shape: dict[str, float] = {}
+    shape: dict[str, Component] = {}
+
+    def __post_init__(self) -> None:
+        if self.shape:
+            _expect_length(f"the shape of {self.name}", self.shape.values())
 
     def __hash__(self) -> int:
         return hash((self.name, self.frequency_hz))
+
+
+def _expect_length(name: str, components: Iterable[float]) -> None:
+    if max(map(abs, components)) < constants.LEAST_COMPONENT:
+        needed = f"needed a component of at least {constants.LEAST_COMPONENT:g}"
+        raise ValueError(f"{name} has no length; {needed}")
 
 
 def _expect_ascending(name: str, low: float, high: float) -> None:
@@ -72,8 +83,8 @@ def _expect_ascending(name: str, low: float, high: float) -> None:
 class WatchedBand(_Part, frozen=True):
     """A narrow band of which only the acceleration level is reported."""
 
-    low_hz: Annotated[Positive, Meta(examples=[1950])]
-    high_hz: Annotated[Positive, Meta(examples=[2050])]
+    low_hz: Annotated[Frequency, Meta(examples=[1950])]
+    high_hz: Annotated[Frequency, Meta(examples=[2050])]
 
     def __post_init__(self) -> None:
         _expect_ascending("the band", self.low_hz, self.high_hz)
@@ -82,7 +93,7 @@ class WatchedBand(_Part, frozen=True):
 class Limit(_Part, frozen=True):
     """Value below which a health parameter is worn out."""
 
-    below: Annotated[Positive, Meta(examples=[0.6])]
+    below: Annotated[Value, Meta(examples=[0.6])]
 
 
 class ParameterSpec(_Part, frozen=True):
@@ -94,7 +105,7 @@ class ParameterSpec(_Part, frozen=True):
 
     name: Annotated[Name, Meta(examples=["guide_preload"])]
     prior: Prior
-    baseline: Positive = 1.0
+    baseline: Value = 1.0
     unit: Name = ""
     limit: Annotated[Limit | None, Meta(examples=[{"below": 0.6}])] = None
     law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
@@ -128,27 +139,26 @@ class MapSpec(_Part, frozen=True):
     """File of the modal map and relative standard deviation of its sensitivities."""
 
     file: Annotated[Name, Meta(examples=["my-stage.map.csv"])]
-    model_std: Annotated[float, Meta(ge=0, lt=1)] = 0.05
+    model_std: Annotated[float, within(0, 1)] = 0.05
 
 
 class Order(_Part, frozen=True):
     """A spectral line at velocity / wavelength."""
 
     name: Annotated[Name, Meta(examples=["ball pass"])]
-    wavelength_mm: Annotated[Positive, Meta(examples=[4.0])]
+    wavelength_mm: Annotated[float, within(*constants.WAVELENGTH_MM, 4.0)]
 
 
 class ChannelSpec(_Part, frozen=True):
     """Place of a sensor in m and the direction that it measures, for drawings of mode shapes."""
 
     name: Annotated[Name, Meta(examples=["acc_pitch"])]
-    position_m: Annotated[tuple[float, float, float], Meta(examples=[[0.1, 0.0, 0.25]])]
+    position_m: Annotated[tuple[Place, Place, Place], Meta(examples=[[0.1, 0.0, 0.25]])]
     # Of any length but 0.
-    direction: Annotated[tuple[float, float, float], Meta(examples=[[0, 0, 1]])]
+    direction: Annotated[tuple[Component, Component, Component], Meta(examples=[[0, 0, 1]])]
 
     def __post_init__(self) -> None:
-        if not any(self.direction):
-            raise ValueError(f"the direction of {self.name} has no length")
+        _expect_length(f"the direction of {self.name}", self.direction)
 
 
 class Covariate(_Part, frozen=True):
@@ -159,15 +169,15 @@ class Covariate(_Part, frozen=True):
     """
 
     name: Annotated[Name, Meta(examples=["temperature_c"])]
-    reference: Annotated[float, Meta(examples=[21.0])]
-    prior_std: Annotated[Positive, Meta(examples=[0.001])]
-    curvature_std: Annotated[float, Meta(ge=0)] = 0.0
+    reference: Annotated[float, within(-constants.REFERENCE, constants.REFERENCE, 21.0)]
+    prior_std: Annotated[float, within(*constants.EFFECT, 0.001)]
+    curvature_std: Annotated[float, within(0, constants.EFFECT[1])] = 0.0
 
 
 class Baseline(_Part, frozen=True):
     """Least number of logs since the baseline for a verdict, and its size in `stage` and `plan`."""
 
-    logs: Annotated[int, Meta(ge=1)] = 5
+    logs: Annotated[int, within(1, constants.MOST_LOGS)] = 5
 
 
 class Decision(_Part, frozen=True):
@@ -176,14 +186,17 @@ class Decision(_Part, frozen=True):
     ``cost_ratio`` is the cost of a failure over that of a planned service.
     """
 
-    max_risk: Share | None = None
-    cost_ratio: CostRatio | None = None
+    max_risk: Annotated[float, within(*constants.RISK)] | None = None
+    cost_ratio: Annotated[float, Meta(gt=1, le=constants.MOST_COST_RATIO)] | None = None
     next_service: date | None = None
 
     def __post_init__(self) -> None:
         if self.max_risk is not None and self.cost_ratio is not None:
             both = f"cost_ratio = {self.cost_ratio:g} and max_risk = {self.max_risk:g}"
             raise ValueError(f"{both} each choose a service date: state one of them")
+        first, end = FIRST_MOMENT.date(), LAST_MOMENT.date()
+        if self.next_service is not None and not first <= self.next_service < end:
+            raise ValueError(f"next_service is {self.next_service}, needed a day {MOMENTS}")
 
     @property
     def accepted(self) -> float | None:
@@ -196,8 +209,8 @@ class Decision(_Part, frozen=True):
 class Usage(_Part, frozen=True):
     """Travel per day and horizon of the prognosis."""
 
-    km_per_day: Positive | None = None
-    horizon_km: Positive = 20000.0
+    km_per_day: Annotated[float, within(*constants.KM_PER_DAY)] | None = None
+    horizon_km: Annotated[float, within(*constants.HORIZON_KM)] = 20000.0
 
 
 class Description(_Part, frozen=True):
@@ -207,7 +220,7 @@ class Description(_Part, frozen=True):
     mode: Annotated[tuple[ModeSpec, ...], Meta(min_length=1)]
     source: str = ""
     match: Match = Match()
-    health_band_hz: tuple[Positive, Positive] | None = None
+    health_band_hz: tuple[Frequency, Frequency] | None = None
     watch: tuple[WatchedBand, ...] = ()
     parameter: tuple[ParameterSpec, ...] = ()
     map: MapSpec | None = None
@@ -417,7 +430,10 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
                 f"{np.exp(high):.4g}"
             )
         try:
-            JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
+            own = JointPrior((parameter.name,), (parameter.prior,), *ends[:, [k]])
+            if (std := float(np.sqrt(own.variance[0]))) < constants.LEAST_PRIOR_STD:
+                needed = f"at least {constants.LEAST_PRIOR_STD:g} of the value"
+                raise BadStage(f"its standard deviation is {std:.2g}, needed {needed}")
         except BadStage as error:
             raise BadStage(f"{path}: parameter[{k}].prior: {error}") from error
     described = [mode.name for mode in description.mode]

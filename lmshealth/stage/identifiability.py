@@ -114,7 +114,12 @@ def identifiability_of(stage: Stage) -> Identifiability:
 
 @lru_cache(maxsize=1 << 14)
 def _bound(mode: ModeSpec, duration: float) -> float:
-    """Bound the variance of ln f in the band that identification uses."""
+    """Bound the variance of ln f in the band that identification uses; infinite by short logs."""
     f, zeta = mode.frequency_hz, mode.damping_ratio
+    if 2 * zeta * f * duration < constants.LEAST_RESOLUTION:
+        return np.inf
+    longest = constants.MOST_ORDINATES / (2 * constants.BAND_HALF_WIDTH * zeta * f)
+    if duration > longest:
+        return _bound(mode, longest) * longest / duration
     band = (f * (1 - constants.BAND_HALF_WIDTH * zeta), f * (1 + constants.BAND_HALF_WIDTH * zeta))
     return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])

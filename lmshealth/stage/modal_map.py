@@ -13,6 +13,7 @@ from numpy.polynomial.chebyshev import chebder, chebvander
 from lmshealth._arrays import BoolArray, FloatArray
 from lmshealth._files import read_table
 from lmshealth.errors import BadStage, OutsideMap
+from lmshealth.stage import constants
 
 # The degree is raised until the error of ln f is far below that of any measurement.
 _MAX_DEGREE, _NEGLIGIBLE = 14, 1e-6
@@ -120,10 +121,11 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         )
     numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
     for name, column in numbers.items():
-        wrong = ~(np.isfinite(column) & (column > 0)).to_numpy()
+        low, high = constants.FREQUENCY_HZ if name == "frequency_hz" else constants.VALUE
+        wrong = ~column.between(low, high).to_numpy()
         if wrong.any():
             found = f"{_line(path, table, wrong)}: {name} is {table[name].iloc[wrong.argmax()]}"
-            raise BadStage(f"{found}; needed is a positive number")
+            raise BadStage(f"{found}; needed is a positive number, {low:g} to {high:g}")
     unnamed = table["mode"].isna().to_numpy()
     if unnamed.any():
         raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
@@ -153,6 +155,9 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
     if min(axis.size for axis in axes) < 3:
         found = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
         raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {found}")
+    for name, axis in zip(parameters, axes, strict=True):
+        if (axis[1:] / axis[:-1]).min() < constants.LEAST_STEP:
+            raise BadStage(f"{path}: grid values of {name} are equal but for rounding")
     points = np.log(wide.index.to_frame().to_numpy(dtype=float))
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1

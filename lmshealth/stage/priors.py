@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import ndtr, ndtri
 
 from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._toml import within
 from lmshealth.errors import BadStage
 from lmshealth.stage import constants
 
@@ -26,8 +27,8 @@ class _Distribution(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
     """Lognormal distribution by its median and the standard deviation of the logarithm."""
 
-    median: Annotated[float, msgspec.Meta(examples=[1.0])]
-    sigma: Annotated[float, msgspec.Meta(examples=[0.3])]
+    median: Annotated[float, within(*constants.VALUE, 1.0)]
+    sigma: Annotated[float, within(*constants.SIGMA, 0.3)]
 
     def __post_init__(self) -> None:
         if not (0 < self.median < np.inf and 0 < self.sigma < np.inf):
@@ -66,12 +67,14 @@ class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
 class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
     """Normal distribution."""
 
-    mean: Annotated[float, msgspec.Meta(examples=[1.0])]
-    std: Annotated[float, msgspec.Meta(examples=[0.3])]
+    mean: Annotated[float, within(-constants.VALUE[1], constants.VALUE[1], 1.0)]
+    std: Annotated[float, within(*constants.VALUE, 0.3)]
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.mean) and 0 < self.std < np.inf):
             raise ValueError(f"normal needs a finite mean and a finite std above 0, got {self}")
+        if self.std < constants.LEAST_WIDTH * abs(self.mean):
+            raise ValueError(f"normal needs a std that its mean does not round to 0, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density."""
@@ -102,12 +105,14 @@ class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
 class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     """Uniform distribution between low and high."""
 
-    low: Annotated[float, msgspec.Meta(examples=[0.3])]
-    high: Annotated[float, msgspec.Meta(examples=[1.0])]
+    low: Annotated[float, within(-constants.VALUE[1], constants.VALUE[1], 0.3)]
+    high: Annotated[float, within(-constants.VALUE[1], constants.VALUE[1], 1.0)]
 
     def __post_init__(self) -> None:
         if not -np.inf < self.low < self.high < np.inf:
             raise ValueError(f"uniform needs finite ends with high above low, got {self}")
+        if self.high - self.low < constants.LEAST_WIDTH * max(-self.low, self.high):
+            raise ValueError(f"uniform needs ends that rounding does not make equal, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density, -inf outside."""
@@ -177,7 +182,9 @@ class JointPrior:
         columns = []
         for j, prior in enumerate(self.priors):
             below, mass = self._mass(prior, self.low[j], self.high[j])
-            columns.append(np.log(prior.quantile(below + mass * level[:, j])))
+            value = prior.quantile(below + mass * level[:, j])
+            # A narrow prior has no probability below the box: its ends are 0 or infinite.
+            columns.append(np.log(np.clip(value, *np.exp([self.low[j], self.high[j]]))))
         # Rounding of quantiles must not leave the box.
         return np.asarray(np.clip(np.column_stack(columns), self.low, self.high))
 

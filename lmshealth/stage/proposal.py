@@ -115,7 +115,7 @@ def moment_of(path: Path, log: Log) -> tuple[str, str]:
         local, where = f"{date['y']}-{date['m']}-{date['d']} {clock}", "name of the file"
     try:
         moment = datetime.fromisoformat(local).astimezone().isoformat()
-    except ValueError:
+    except (ValueError, OverflowError):
         return "", ""
     return moment, f"{where}, time zone of this computer"
 

@@ -170,11 +170,20 @@ INITIATION_ODDS, CONFIRMATION_PROBABILITY, DELETION_ODDS = 1e-3, 0.95, 1e-5
 LEAST_LOGS_NEW, LEAST_LOGS_NAMED = 3, 2
 
 # --- Notes and tables ----------------------------------------------------------------------------
+# Dates of few logs at one end are wrong, as of a clock without a battery: beyond a gap of a year
+# (one log), or of ten years (a tenth of the logs), in which the odometer gains less than this share
+# of what the other logs gain in that time. With a wrong date it gains the distance of two logs; a
+# machine in use, a third or more. One that was idle so long loses one log, until a second one
+# confirms its date. Rates need so many logs.
+IDLE_S, LONGEST_IDLE_S, IDLE_SHARE, DATED_LOGS = 365.25 * 86400, 10 * 365.25 * 86400, 0.02, 5
 # So many logs in a row without an assigned estimate of a mode are reported.
 MISSING_LOGS = 3
 # Smallest relative standard deviation of a frequency in a foreign table, and smallest and largest
 # standard deviation of a drift: smaller ones are lost in rounding, a factor of 20 is no drift.
 LEAST_RELATIVE_STD, LEAST_DRIFT_STD, MOST_DRIFT = 1e-7, 1e-9, 3.0
+# Range of damping ratios, and relative standard deviation beyond which one says nothing: their
+# squares must be finite and positive.
+DAMPING, MOST_RELATIVE_STD = (1e-9, 10.0), 1e3
 
 # Logs of a history that is smoothed for its covariates: in a longer one few logs are so early that
 # the filter knows its level less well.

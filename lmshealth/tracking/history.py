@@ -282,8 +282,8 @@ def build_history(
     history : History
         Its first baseline is the first log that the manifest declares one, else the first log.
     refused : list of Refusal
-        Logs whose odometer contradicts the others, which are left out, and estimates that are
-        assigned to no mode, which are missing.
+        Logs whose odometer or date contradicts the others, which are left out, and estimates that
+        are assigned to no mode, which are missing.
 
     Raises
     ------
@@ -305,6 +305,8 @@ def build_history(
         name = "" if stage is None else f"{stage.name}: "
         raise NotEnoughData(f"{name}no usable log")
     ordered, refused = _without_contradictions(sort_by_time(readings))
+    ordered, misdated = _without_lone_dates(ordered)
+    refused += misdated
     # Missing values are None here and NaN in arrays.
     travel = np.array([r.metadata.travel for r in ordered], dtype=float)
     moments = tuple(r.metadata.recorded_at or _NO_MOMENT for r in ordered)
@@ -413,6 +415,45 @@ def _without_contradictions(
         if k not in kept
     ]
     return tuple(ordered[k] for k in sorted(kept)), refused
+
+
+def _without_lone_dates(
+    ordered: tuple[LogEstimates, ...],
+) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
+    """Refuse few logs at either end whose dates lie years away, which the odometer contradicts.
+
+    Of a wrong date in between the odometer is contradictory, or the order of the logs is unharmed.
+    """
+    moments = [reading.metadata.recorded_at for reading in ordered]
+    if None in moments or any(reading.metadata.travel is None for reading in ordered):
+        return ordered, []
+    refused: list[Refusal] = []
+    travel = np.array([reading.metadata.travel for reading in ordered], dtype=float)
+    seconds = np.array([moment.timestamp() for moment in moments if moment])
+    while (n := len(ordered)) > constants.DATED_LOGS:
+        first = int(np.argmax(np.diff(seconds))) + 1  # log after the longest gap
+        gap, gained = (float(own[first] - own[first - 1]) for own in (seconds, travel))
+        few, rest = slice(0, first), slice(first, n)
+        if first > n - first:
+            few, rest = rest, few
+        n_few, span = min(first, n - first), float(seconds[rest][-1] - seconds[rest][0])
+        usual = gap / max(span, 1.0) * float(travel[rest][-1] - travel[rest][0])
+        is_long = gap > (constants.IDLE_S if n_few == 1 else constants.LONGEST_IDLE_S)
+        enough = n - n_few >= constants.DATED_LOGS and n_few <= max(1, n // 10)
+        if not (is_long and enough and gained < constants.IDLE_SHARE * usual):
+            break
+        detail = (
+            f"is {gap / constants.IDLE_S:.3g} years away from the other logs, in which the "
+            f"odometer gained {gained / 1000:.4g} km, against {usual / 1000:.4g} km at their rate: "
+            "a clock that was not set; correct it in manifest.csv (if it is right, further logs of "
+            "that time confirm it)"
+        )
+        refused += [
+            Refusal(reading.log, "date", f"recorded_at {reading.metadata.recorded_at} {detail}")
+            for reading in ordered[few]
+        ]
+        ordered, seconds, travel = ordered[rest], seconds[rest], travel[rest]
+    return ordered, refused
 
 
 def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[Step, ...]:

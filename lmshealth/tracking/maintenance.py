@@ -6,8 +6,9 @@ from datetime import datetime
 from pathlib import Path
 from typing import Self
 
+from lmshealth._arrays import freeze
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Notice, Refusal
+from lmshealth.io.log import Notice, Refusal, expect_moment
 from lmshealth.io.manifest import find_sheets, name_of
 from lmshealth.io.metadata import parse_moment, parse_name
 from lmshealth.io.refusal import Unusable, shown
@@ -28,6 +29,10 @@ class Action:
     stage: str
     recorded_at: datetime
     action: str
+
+    def __post_init__(self) -> None:
+        freeze(self)
+        expect_moment(self.recorded_at)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,24 +61,29 @@ NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""
 
 
-def read_maintenance(folder: Path, *, follow_links: bool = False) -> Maintenance:
-    """Read every ``maintenance.csv`` below a folder, or raise `BadTable` if it is none."""
+def read_maintenance(
+    folder: Path, *, follow_links: bool = False, latest: datetime | None = None
+) -> Maintenance:
+    """Read every ``maintenance.csv`` below a folder, or raise `BadTable` if it is none.
+
+    Rows after the moment `latest`, by default a day from now, cannot be read.
+    """
     found = find_sheets(folder, _FILE, follow_links=follow_links)
-    work = _read((path, name_of(path, folder)) for path in found.logs)
+    work = _read(((path, name_of(path, folder)) for path in found.logs), latest)
     return replace(
         work, unread=(*(UnreadableRow(one, None) for one in found.refused), *work.unread)
     )
 
 
-def read_actions(path: Path) -> tuple[Action, ...]:
+def read_actions(path: Path, latest: datetime | None = None) -> tuple[Action, ...]:
     """Read one table of maintenance, or raise `BadTable` if any row cannot be read."""
-    work = _read([(path, shown(path))])
+    work = _read([(path, shown(path))], latest)
     for one in work.unread:
         raise BadTable(f"{one.refusal.log}, {one.refusal.detail}")
     return work.actions
 
 
-def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
+def _read(tables: Iterable[tuple[Path, str]], latest: datetime | None) -> Maintenance:
     """Read tables, each with the name that its refusals have."""
     actions: list[Action] = []
     unread: list[UnreadableRow] = []
@@ -81,7 +91,7 @@ def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
         try:
             for row in read_sheet(path, _NEEDED):
                 try:
-                    actions.append(_action(row))
+                    actions.append(_action(row, latest))
                 except Unusable as error:
                     refusal = Refusal(name, "bad-row", f"{row.where}: {error.detail}")
                     unread.append(UnreadableRow(refusal, _machine(row)))
@@ -90,7 +100,7 @@ def _read(tables: Iterable[tuple[Path, str]]) -> Maintenance:
     return Maintenance(tuple(sorted(actions, key=lambda a: a.recorded_at)), tuple(unread))
 
 
-def _action(row: Row) -> Action:
+def _action(row: Row, latest: datetime | None) -> Action:
     """Read a row; other columns are ignored."""
     if row.trouble:
         raise Unusable("bad-row", row.trouble)
@@ -98,7 +108,7 @@ def _action(row: Row) -> Action:
         raise Unusable(
             "bad-row", f"action {row.cells['action'][:80]!r} is unknown; known are {list(known)}"
         )
-    stage, moment = parse_name(row.cells, "stage"), parse_moment(row.cells)
+    stage, moment = parse_name(row.cells, "stage"), parse_moment(row.cells, latest)
     if stage is None or moment is None:
         raise Unusable("bad-row", "stage and recorded_at are needed")
     return Action(stage, moment, row.cells["action"])

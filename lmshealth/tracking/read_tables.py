@@ -16,7 +16,7 @@ import pandas as pd
 
 from lmshealth._arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Metadata, Refusal
+from lmshealth.io.log import Metadata, Refusal, low_high
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.io.tables import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.modal.modes import Modes
@@ -55,7 +55,11 @@ class Drifts:
 
 
 def read_estimates(
-    path: Path, *, cross_terms: Path | None = None, stage: Stage | None = None
+    path: Path,
+    *,
+    cross_terms: Path | None = None,
+    stage: Stage | None = None,
+    latest: datetime | None = None,
 ) -> tuple[list[LogEstimates], list[str]]:
     """Read the estimates of each log from a table in the columns of ``modes.csv``.
 
@@ -66,7 +70,8 @@ def read_estimates(
     The covariates of the stage are read too, and other mode names than its own are refused.
     `BadTable` if a table cannot be read, a column is missing, a value is not valid, an estimate
     exists twice, or rows of one log contradict each other. The notes returned state what the table
-    lacks, and what is assumed instead.
+    lacks, and what is assumed instead. Logs after the moment `latest`, by default a day from now,
+    are refused.
     """
     table = _read(path, _NEEDED, "estimate")
     covariates = [*COVARIATES]
@@ -79,7 +84,7 @@ def read_estimates(
         if name not in table.columns:
             table[name] = value
     notes = name_machine(path, table)
-    to_moments(path, table)
+    to_moments(path, table, latest)
     notes += _drop_bad_damping(table)
     _check(path, table, stage)
     terms = None
@@ -102,6 +107,7 @@ def read_machines(
     *,
     cross_terms: Path | None = None,
     maintenance: Path | None = None,
+    latest: datetime | None = None,
 ) -> tuple[list[tuple[History, list[Refusal]]], list[str]]:
     """Read a table in the columns of ``modes.csv``: a history per machine, with its refusals.
 
@@ -110,8 +116,8 @@ def read_machines(
     """
     default = path.with_name("modes_cov.csv")
     terms = cross_terms or (default if default.exists() else None)
-    logs, notes = read_estimates(path, cross_terms=terms, stage=stage)
-    actions = read_actions(maintenance) if maintenance else ()
+    logs, notes = read_estimates(path, cross_terms=terms, stage=stage, latest=latest)
+    actions = read_actions(maintenance, latest) if maintenance else ()
     own: dict[str, list[LogEstimates]] = {}
     for one in logs:
         own.setdefault(str(one.metadata.stage), []).append(one)
@@ -126,7 +132,9 @@ def read_machines(
     return machines, notes
 
 
-def read_drifts(path: Path, *, cross_terms: Path | None = None) -> tuple[list[Drifts], list[str]]:
+def read_drifts(
+    path: Path, *, cross_terms: Path | None = None, latest: datetime | None = None
+) -> tuple[list[Drifts], list[str]]:
     """Read the drifts of each machine, and notes, from a table in the columns of ``track.csv``.
 
     Needed are ``recorded_at``, ``mode``, ``drift`` (of ln frequency against baseline) and
@@ -137,7 +145,7 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> tuple[list[Dr
     table = _read(path, ("recorded_at", "mode", "drift", "drift_std"), "drift")
     notes = name_machine(path, table)
     to_numbers(path, table, ("drift", "drift_std", "travel_km"))
-    to_moments(path, table)
+    to_moments(path, table, latest)
     std, most = table["drift_std"], constants.MOST_DRIFT
     _refuse(path, table, "drift", table["drift"].abs() > most, "a change of ln frequency")
     wrong = (std < 0) | (std > most) | ((std > 0) & (std < constants.LEAST_DRIFT_STD))
@@ -151,7 +159,7 @@ def read_drifts(path: Path, *, cross_terms: Path | None = None) -> tuple[list[Dr
         if "stage" not in terms.columns:
             terms["stage"] = str(table["stage"].iloc[0])
         to_numbers(cross_terms, terms, ("cov_drift",))
-        to_moments(cross_terms, terms)
+        to_moments(cross_terms, terms, latest)
     elif table["mode"].nunique() > 1:
         notes.append(
             "no covariances between the drifts of modes: they are assumed independent, though "
@@ -181,7 +189,8 @@ def _refuse(path: Path, table: pd.DataFrame, name: str, wrong: pd.Series[bool], 
 def _drop_bad_damping(table: pd.DataFrame) -> list[str]:
     """Remove dampings without a positive value and standard deviation, in place."""
     ratio, std = (table[name] for name in _DAMPING)
-    bad = ratio.notna() & ~((ratio > 0) & (std > 0))
+    relative = (std / ratio).between(constants.LEAST_RELATIVE_STD, constants.MOST_RELATIVE_STD)
+    bad = ratio.notna() & ~(ratio.between(*constants.DAMPING) & relative)
     if not bad.any():
         return []
     table.loc[bad, list(_DAMPING)] = np.nan
@@ -194,9 +203,10 @@ def _drop_bad_damping(table: pd.DataFrame) -> list[str]:
 def _check(path: Path, table: pd.DataFrame, stage: Stage | None) -> None:
     """Refuse estimates that are not valid, exist twice or have an unknown name."""
     std = "the standard deviation of a frequency, without which nothing is known"
+    most = low_high("sample_rate_hz")[1]
     for name, what in (("frequency_hz", "a frequency"), ("frequency_std_hz", std)):
-        needed = f"{what}, a positive number; leave rows out that have none"
-        _refuse(path, table, name, ~(table[name] > 0), needed)
+        needed = f"{what}, above 0 and at most {most:g} Hz; leave rows out that have none"
+        _refuse(path, table, name, ~((table[name] > 0) & (table[name] <= most)), needed)
     named = table[table["mode"] != ""]
     twice = named.duplicated(["stage", "log", "mode", "source"], keep=False)
     if twice.any():

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth import identify, read_log
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import load_stage
@@ -277,7 +278,7 @@ def _identify_all(folder: Path, plan: Plan) -> Estimates:
     ln_f, ln_zeta, loop = np.full((n, m), np.nan), np.full((n, m), np.nan), np.full(n, np.nan)
     cov = np.full((n, 2 * m, 2 * m), np.nan)
     for k, path in enumerate(find_logs(folder).logs):
-        log = read_log(path, overrides=manifest.overrides(path), name=path.name)
+        log = read_log(path, overrides=manifest.overrides(path), name=path.name, latest=LAST_MOMENT)
         modes = identify(log, stage)
         # Those that were found: their places in the result and among the guide modes.
         at = [i for i, name in enumerate(modes.names) if name in GUIDE_MODES]

@@ -14,6 +14,7 @@ from lmshealth import identify, read_log
 from lmshealth.errors import LmshealthError
 from lmshealth.health.inference import infer
 from lmshealth.health.verdict import degraded_below, doubt_of_names, judge, verdict_of
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.stage.description import Stage, load_stage
@@ -188,7 +189,9 @@ def identified(seed: int, logs: int, seconds: float) -> list[Row]:
         simulate_life(plan, Path(folder))
         manifest = read_manifest(Path(folder))
         for path, visit in zip(find_logs(Path(folder)).logs, visits, strict=True):
-            log = read_log(path, overrides=manifest.overrides(path), name=path.name)
+            log = read_log(
+                path, overrides=manifest.overrides(path), name=path.name, latest=LAST_MOMENT
+            )
             truth = {m.name: m for m in closed_loop_modes(visit.stage, visit.condition)}
             for name, stage in (("shipped", shipped), ("corrected", corrected)):
                 modes = identify(log, stage)

@@ -35,6 +35,7 @@ import numpy as np
 
 from lmshealth import LogEstimates, build_history, identify, read_log
 from lmshealth.health.verdict import degraded_below, verdict_of
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
@@ -133,7 +134,9 @@ def read(plan: Plan, stage: Stage) -> list[LogEstimates]:
         simulate_life(plan, Path(folder))
         manifest = read_manifest(Path(folder))
         for path in find_logs(Path(folder)).logs:
-            log = read_log(path, overrides=manifest.overrides(path), name=path.name)
+            log = read_log(
+                path, overrides=manifest.overrides(path), name=path.name, latest=LAST_MOMENT
+            )
             modes = identify(log, stage)
             readings.append(
                 LogEstimates(log.name, log.digest, log.metadata, modes, loop_error(log))

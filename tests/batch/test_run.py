@@ -37,6 +37,7 @@ from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NotConverged, NothingUsable
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
 from lmshealth.modal.identification import AmbientReading
 from lmshealth.prognosis import life_posterior
@@ -543,6 +544,26 @@ def test_a_log_that_changes_while_it_is_read_is_done_again(
     assert {row["reason"] for row in rows(tmp_path / "out" / "refused.csv")} == {"changed"}
     again = run(logs, [modes_only], tmp_path / "out")
     assert (again.n_remembered, again.n_refused) == (0, 0)
+
+
+@pytest.mark.slow
+def test_a_log_of_the_future_is_refused_until_it_is_allowed(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """Neither the refusal nor the result of a run that allowed it outlives the question."""
+    logs, out = write_archive(tmp_path / "logs", 3), tmp_path / "out"
+    (logs / "manifest.csv").write_text("file,recorded_at\nlog-02.h5,2062-03-01T08:00:00Z\n")
+    for settings, lost, remembered in (
+        (Settings(), 1, 0),
+        (Settings(latest=LAST_MOMENT), 0, 2),  # the refusal is not stored
+        (Settings(latest=LAST_MOMENT), 0, 3),
+        (Settings(), 1, 2),  # the stored result is not used
+    ):
+        done = run(logs, [modes_only], out, settings)
+        assert (done.n_refused, done.n_remembered) == (lost, remembered)
+        refused = [(row["log"], row["reason"]) for row in rows(out / "refused.csv")]
+        assert refused == [("log-02.h5", "future")] * lost
+        assert len({row["log"] for row in rows(out / "modes.csv")}) == 3 - lost
 
 
 @pytest.mark.slow

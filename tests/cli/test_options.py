@@ -7,6 +7,7 @@ import pytest
 from click.testing import CliRunner
 
 from lmshealth.cli import options
+from lmshealth.cli.main import main
 from lmshealth.cli.stage_commands import plan
 
 
@@ -26,6 +27,37 @@ def test_a_band_has_its_ends_in_order() -> None:
         result = run(echo, ["--band", *band])
         assert result.exit_code == 2
         assert "Invalid value for --band: needs 0 <= LOW < HIGH" in result.output
+
+
+CONTEXT = click.Context(main)
+NUMBERS = [
+    (name, option)
+    for name in main.list_commands(CONTEXT)
+    for option in main.get_command(CONTEXT, name).params
+    if isinstance(option.type, click.types.IntParamType | click.types.FloatParamType)
+    and option.name != "band"  # two numbers, which are compared
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "option"), NUMBERS, ids=[f"{name} {option.opts[0]}" for name, option in NUMBERS]
+)
+def test_every_number_has_a_range(name: str, option: click.Option) -> None:
+    """Huge, infinite and undefined numbers are wrong usage, whatever the option."""
+    assert option.type.min is not None and option.type.max is not None
+    whole = isinstance(option.type, click.IntRange)
+    for value in (str(10**400), "-1", *(() if whole else ("1e300", "nan", "inf", "-inf"))):
+        given = (value,) if option.multiple else value
+        with pytest.raises(click.BadParameter, match=r"range|finite|not a valid"):
+            option.type_cast_value(CONTEXT, given)
+
+
+def test_a_day_is_in_the_calendar() -> None:
+    """Days are from 1970 to 2099."""
+    assert options.day("2027-03-01").year == 2027
+    for wrong in ("1969-12-31", "2100-01-01", "9999-12-31", "0001-01-01"):
+        with pytest.raises(click.BadParameter, match="is not a day from 1970-01-01 on"):
+            options.day(wrong)
 
 
 def test_examples_are_one_per_line_and_not_wrapped() -> None:

@@ -86,6 +86,44 @@ def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
         assert f"{wrong / 1000:g}" in refused[0].detail
 
 
+def dated(days: list[float], travel: list[float], stage: Stage) -> tuple[list[str], list[str]]:
+    """Return the logs of a history, and those refused for their date; logs are days and km."""
+    readings = [
+        make_reading(str(k), day, 1e3 * km, {"roll": 4.8})
+        for k, (day, km) in enumerate(zip(days, travel, strict=True))
+    ]
+    history, refused = build_history(readings, stage)
+    assert all(one.reason == "date" for one in refused)
+    return list(history.logs), [one.log for one in refused]
+
+
+@pytest.mark.parametrize(
+    ("days", "lost"),
+    [
+        ({39: 36 * 365.0}, ["39"]),  # in 2062
+        ({0: -56 * 365.0}, ["0"]),  # 1970
+        ({0: -26 * 365.0, 39: 36 * 365.0}, ["0", "39"]),
+        ({0: -46 * 365.0, 1: -46 * 365.0 + 0.01}, ["0", "1"]),
+        ({39: 39 + 200.0}, []),  # idle for half a year
+        ({38: 38 + 800.0, 39: 39 + 800.0}, []),  # idle for two years, confirmed
+    ],
+)
+def test_a_date_years_away_that_the_odometer_contradicts_is_refused(
+    stage: Stage, days: dict[int, float], lost: list[str]
+) -> None:
+    """A clock that was not set does not move the usage of forty logs; a machine may be idle."""
+    moments = [days.get(k, float(k)) for k in range(40)]
+    kept, refused = dated(moments, [10.0 * k for k in range(40)], stage)
+    assert sorted(refused) == sorted(lost) and len(kept) == 40 - len(lost)
+
+
+def test_a_late_log_after_much_travel_is_kept(stage: Stage) -> None:
+    """Ten daily logs and one after two years of the same use agree."""
+    days = [*map(float, range(10)), 730.0]
+    kept, refused = dated(days, [10 * day for day in days], stage)
+    assert not refused and len(kept) == 11
+
+
 def jumping(values: list[float], stage: Stage) -> tuple[list[bool], list[str]]:
     """Return the logs that kept their roll of these ln frequencies, and those refused."""
     readings = [

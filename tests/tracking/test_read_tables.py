@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pandas as pd
 import pytest
 
+from lmshealth._serialize import fingerprint
 from lmshealth.errors import BadTable
+from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates
-from lmshealth.tracking.read_tables import read_drifts, read_estimates
+from lmshealth.tracking.history import LogEstimates, build_history
+from lmshealth.tracking.read_tables import read_drifts, read_estimates, read_machines
 from tests.lives import FADING, make_stage, make_track
 
 HEAD = "stage,log,recorded_at,travel_km,temperature_c,mode,source,frequency_hz,frequency_std_hz,"
@@ -69,6 +73,44 @@ def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
     np.testing.assert_allclose(reading.modes.correlation, [0.5, 0.0])
 
 
+def test_dates_of_one_offset_are_plain_datetimes(tmp_path: Path) -> None:
+    """Pandas makes Timestamps of a column of dates: a history of them could not be packed."""
+    text = HEAD + "".join(row(log=f"{k}", day=k + 1) for k in range(3))
+    readings = read(tmp_path, text)
+    assert {type(one.metadata.recorded_at) for one in readings} == {datetime}
+    history, _ = build_history(readings)
+    stamped = replace(history, recorded_at=tuple(map(pd.Timestamp, history.recorded_at)))
+    assert {type(moment) for moment in stamped.recorded_at} == {datetime}
+    assert fingerprint(stamped) == fingerprint(history)
+    terms = tmp_path / "none.csv"
+    terms.write_text("recorded_at,mode_a,mode_b,cov_drift\n")
+    (tmp_path / "track.csv").write_text(DRIFT_HEAD + drift_row())
+    (drifts,), _ = read_drifts(tmp_path / "track.csv", cross_terms=terms)
+    assert {type(moment) for moment in drifts.recorded_at} == {datetime}
+    fingerprint(drifts)
+
+
+def test_logs_of_the_future_are_refused_unless_allowed(tmp_path: Path) -> None:
+    """The moment up to which dates are accepted holds for estimates, drifts and maintenance."""
+    path, late = tmp_path / "modes.csv", "2062-03-01T06:00:00+00:00"
+    path.write_text(HEAD + row().replace("2026-", "2062-"))
+    with pytest.raises(BadTable, match=r"modes.csv, line 2: recorded_at is '2062-.*allow-future"):
+        read_machines(path)
+    work = tmp_path / "maintenance.csv"
+    work.write_text(f"stage,recorded_at,action\nAX-1,{late},servo\n")
+    now = tmp_path / "now.csv"
+    now.write_text(HEAD + row())
+    with pytest.raises(BadTable, match=r"maintenance.csv, line 2: recorded_at is '2062-"):
+        read_machines(now, maintenance=work)
+    ((history, _),), _ = read_machines(path, latest=LAST_MOMENT, maintenance=work)
+    assert history.recorded_at[0].year == 2062
+    drifts = tmp_path / "track.csv"
+    drifts.write_text(DRIFT_HEAD + drift_row().replace("2026-", "2062-"))
+    with pytest.raises(BadTable, match=r"track.csv, line 2: recorded_at is '2062-"):
+        read_drifts(drifts)
+    assert read_drifts(drifts, latest=LAST_MOMENT)[0][0].recorded_at[0].year == 2062
+
+
 def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
     """Cross terms of other logs, and of estimates that do not exist, are ignored."""
     text = HEAD + row() + row(mode="pitch") + row(log="b", day=2)
@@ -122,13 +164,20 @@ def test_assumptions_are_noted(tmp_path: Path) -> None:
         ),
         ("recorded_at;frequency_hz\n1;2\n", "columns are separated by commas"),
         (HEAD + row(f=0), "line 2: frequency_hz is 0"),
-        (HEAD + row(f="fast"), "line 2: frequency_hz is no finite number"),
-        (HEAD + row(f="inf"), "line 2: frequency_hz is no finite number"),
+        (HEAD + row(f="fast"), "line 2: frequency_hz is 'fast', needed a finite number"),
+        (HEAD + row(f="inf"), "line 2: frequency_hz is 'inf', needed a finite number"),
+        (HEAD + row(f="1e300"), "line 2: frequency_hz is '1e300', needed a number from"),
+        (HEAD + row(f=1e12), "line 2: frequency_hz is 1e+12; needed is a frequency"),
+        (HEAD + row(km=1e300), "line 2: travel_km is '1e+300', needed a number from 0 to 1e+10"),
+        (HEAD + row(km=-1), "line 2: travel_km is '-1', needed a number from 0 to 1e+10"),
+        (HEAD + row().replace("2026", "1969"), "line 2: recorded_at is '1969-"),
+        (HEAD + row().replace("2026", "9999"), "line 2: recorded_at is '9999-"),
+        (HEAD + row().replace("2026", "2099"), "in the future; correct it, or set --allow-future"),
         (HEAD + row() + row(), "line 2, 3: roll by acc exists twice"),
         (HEAD + row() + row(mode="pitch", km=11), "log a has travel_km 10 and 11"),
         (HEAD + row(rho=1.0), "correlation_f_zeta reaches 1"),
-        (HEAD + row().replace("+00:00", ""), "needs a time zone"),
-        (HEAD + row().replace("2026-03-01T", "1.3.2026 "), "is no ISO date"),
+        (HEAD + row().replace("+00:00", ""), "ISO 8601 with a time zone"),
+        (HEAD + row().replace("2026-03-01T", "1.3.2026 "), "needed ISO 8601"),
     ],
 )
 def test_values_that_are_not_valid_are_refused_with_their_line(
@@ -145,7 +194,7 @@ def test_cross_terms_that_are_no_covariance_are_refused(tmp_path: Path) -> None:
     text = HEAD + row() + row(mode="pitch")
     with pytest.raises(BadTable, match="log a: variances and cross terms are no covariance"):
         read(tmp_path, text, "a,acc,roll,acc,pitch,1e-3\n")
-    with pytest.raises(BadTable, match="cov_ln_f is no finite number"):
+    with pytest.raises(BadTable, match="cov_ln_f is 'x', needed a finite number"):
         read(tmp_path, text, "a,acc,roll,acc,pitch,x\n")
 
 
@@ -254,21 +303,25 @@ def test_several_machines_stay_apart(tmp_path: Path) -> None:
     [
         ("stage;recorded_at\n", "", "separated by commas"),
         (DRIFT_HEAD, "", "no row"),
-        (DRIFT_HEAD + drift_row(drift="much"), "", "line 2: drift is no finite number"),
+        (
+            DRIFT_HEAD + drift_row(drift="much"),
+            "",
+            "line 2: drift is 'much', needed a finite number",
+        ),
         (DRIFT_HEAD + drift_row() + drift_row(2, std=-1), "", "line 3: drift_std is -1"),
         (DRIFT_HEAD + drift_row() + drift_row(2, std=1e-170), "", "line 3: drift_std is 1e-170"),
         (
-            DRIFT_HEAD + drift_row() + drift_row(2, std=1e200),
+            DRIFT_HEAD + drift_row() + drift_row(2, std=1e20),
             "",
-            "drift_std is 1e.200; needed is a standard",
+            "drift_std is 1e.20; needed is a standard",
         ),
         (
-            DRIFT_HEAD + drift_row(drift=1e300),
+            DRIFT_HEAD + drift_row(drift=1e30),
             "",
-            "line 2: drift is 1e.300; needed is a change of ln",
+            "line 2: drift is 1e.30; needed is a change of ln",
         ),
         (DRIFT_HEAD + drift_row().replace("AX-1", ""), "", "line 2: stage is empty"),
-        (DRIFT_HEAD + drift_row().replace("+00:00", ""), "", "needs a time zone"),
+        (DRIFT_HEAD + drift_row().replace("+00:00", ""), "", "ISO 8601 with a time zone"),
         (
             DRIFT_HEAD + drift_row() + drift_row(mode="pitch"),
             DRIFT_TERM.format(day=1, cov=1),

@@ -11,7 +11,6 @@ import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -26,6 +25,7 @@ from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_
 from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose
+from lmshealth.io.metadata import moment_after
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
@@ -56,7 +56,6 @@ _TICKS = (
     *((1e15, 1e6, "µs", 0), (1e12, 1e3, "ms", 0)),
 )
 _LATEST, _UNIX_TIMES = 1e10, (1e9, 2.2e9)
-_UNIX = datetime(1970, 1, 1, tzinfo=UTC)
 # Days since 1900 from 1954 to 2173, which spreadsheets write, and their largest step: in s it would
 # be a sample rate of 1 MHz.
 _DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
@@ -357,8 +356,8 @@ def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], 
     guessed = (f"times in {what} since an epoch",) if what else ()
     if epoch is None:
         return spool.samples(), guessed, {}
-    moment = _UNIX + timedelta(seconds=start / scale + epoch)
-    return spool.samples(), guessed, {"recorded_at": moment.isoformat()}
+    moment = moment_after(constants.FIRST_MOMENT, start / scale + epoch)
+    return spool.samples(), guessed, {"recorded_at": moment}
 
 
 def _too_long(row: object, found: str, needed: int) -> Unusable:

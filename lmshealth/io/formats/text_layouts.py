@@ -10,6 +10,7 @@ from datetime import UTC, datetime, timedelta
 
 from lmshealth.io.formats.dialect import Dialect, fields_of
 from lmshealth.io.formats.unit_channels import Described, rate_of
+from lmshealth.io.metadata import moment_after
 from lmshealth.io.refusal import corrupt
 
 _GCS_LINE = re.compile(r"#\s*([A-Z_]+\d*)\s*=\s*(.*\S)\s*")
@@ -49,8 +50,9 @@ def twincat(lines: Sequence[str]) -> Dialect | None:
     # The numbers of the first row may be whole.
     decimal = "," if delimiter != "," and any("," in row for row in lines[first + 1 :]) else "."
     ticks = fields_of(lines[start], delimiter)[1:2]
-    moment = _FILETIME_EPOCH + timedelta(microseconds=int(ticks[0]) // 10) if ticks else None
-    metadata = {} if moment is None else {"recorded_at": moment.isoformat()}
+    counted = int(ticks[0]) if ticks else 0  # 0 states no moment
+    moment = moment_after(_FILETIME_EPOCH, counted // 10, timedelta(microseconds=1))
+    metadata = {"recorded_at": moment} if counted else {}
     return Dialect(delimiter, decimal, tuple(channels), first + 1, metadata)
 
 

@@ -5,6 +5,7 @@ The README of the folder lists the columns of a table.
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -63,6 +64,7 @@ def read_responses(
     columns: ColumnMap | None = None,
     overrides: Mapping[str, str] | None = None,
     max_memory: float = limits.MAX_MEMORY,
+    latest: datetime | None = None,
 ) -> tuple[MeasuredResponse, ...]:
     """Read the frequency responses of a file; none from a log, which holds time records.
 
@@ -83,7 +85,7 @@ def read_responses(
             own = _ResponseColumns(columns=given.columns, csv=given.csv)
             content = load(path, own, max_memory)
             functions, stated = _tabulated(content, own), content.metadata
-        metadata, _ = parse_metadata(stated | given.constants() | dict(overrides or {}))
+        metadata, _ = parse_metadata(stated | given.constants() | dict(overrides or {}), latest)
         coherences = {f[:2]: f.values.real for f in functions if f.coherence}
         responses = []
         for f in (f for f in functions if not f.coherence):
