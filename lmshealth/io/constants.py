@@ -89,6 +89,7 @@ RANGES = {
     "temperature_c": (-273.15, 1000.0),
     "payload_kg": (-1e6, 1e6),
     "position_mm": (-1e8, 1e8),
+    "frequency_hz": (0.0, 1e11),
 }
 """Least and largest value of metadata, also as columns of tables, by their name. No machine leaves
 them: an odometer of ten strokes a second counts 10¹⁰ in 30 years, 10⁷ mm/s leaves the atmosphere,

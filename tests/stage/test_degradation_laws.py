@@ -221,8 +221,14 @@ def test_far_off_walkers_raise_no_warning(law: AnyLaw, y: list[float]) -> None:
 @pytest.mark.parametrize(
     ("law", "message"),
     [
-        (lambda: HertzWear(life_km=Uniform(-5.0, -1.0)), "life_km must lie between 0 and inf"),
-        (lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)), "exponent needs a range above"),
+        (
+            lambda: HertzWear(life_km=Uniform(-5.0, -1.0)),
+            "life_km must lie between 1e-06 and 1e.12",
+        ),
+        (
+            lambda: HertzWear(Lognormal(8000, 1), Uniform(-0.7, 1.6)),
+            "exponent needs a range within 0.01 to 20",
+        ),
         (lambda: Loosening(Lognormal(4000, 1), Uniform(1.3, 2.0)), "floor must lie between"),
         (lambda: Loosening(Normal(-9.0, 1.0), Uniform(0.3, 1.0)), "life_km must lie between"),
     ],
