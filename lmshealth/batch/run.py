@@ -11,14 +11,21 @@ from tempfile import TemporaryFile
 import msgspec
 from sqlalchemy import URL
 
-from lmshealth._files import write_text
+from lmshealth._files import remove_abandoned, write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
-from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
+from lmshealth.batch.alerts import (
+    Alerts,
+    Scope,
+    announce,
+    deliver,
+    last_number,
+    write_statuses,
+)
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
 from lmshealth.batch.ingest import Progress, Reading, Resources, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
-from lmshealth.batch.status import Change, Fleet, Status
+from lmshealth.batch.status import Change, Status
 from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -102,6 +109,7 @@ class RunResult:
     statuses: tuple[Status, ...] = ()
     changes: tuple[Change, ...] = ()
     unsent: dict[str, str] = field(default_factory=dict)  # options whose alerts failed, and why
+    notes: tuple[str, ...] = ()  # damage that was found, and what became of it
 
     @property
     def pages(self) -> tuple[Path, ...]:
@@ -160,6 +168,7 @@ def run(
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
+        scope = Scope(folder, out, last_number(store))
         resources = Resources(store, pool, progress)
         reading = Reading(*(getattr(settings, name) for name in Reading._fields))
         ingested = ingest(folder, stages, resources, out=out, reading=reading)
@@ -173,10 +182,20 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        done, fleet, excluded = _report(usable, refused, resources, out, settings.alerts)
-    if machines:
-        write_index(out, done.rows, refused)
-    unsent = publish(fleet, settings.alerts, out)
+        done, made, tables, excluded = _report(usable, refused, resources, out)
+        moment = datetime.now(UTC)
+        with store.alone():  # a run that ends before its tables are written has announced nothing
+            statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
+            store.put_status(statuses, changes, moment)
+            changed = [msgspec.to_builtins(change) for change in changes]
+            of_run = {"refused": refused_rows(refused), "changes": changed}
+            tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
+            write_tables(out, [machine.name for machine in usable], tables)
+        if machines:
+            write_index(out, done.rows, refused)
+        unsent = deliver(store, statuses, settings.alerts, out)
+        write_statuses(statuses, out)
+        notes += store.notes
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
     lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
     if not machines:
@@ -192,7 +211,10 @@ def run(
         n_remembered=ingested.n_cached,
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
         failed=failed | done.failed,
+        statuses=statuses,
+        changes=tuple(changes),
         unsent=unsent,
+        notes=tuple(notes),
     )
 
 
@@ -230,6 +252,7 @@ def report(
         index=write_index(out, ranked, store.refused(one.refused for one in present)),
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
+        notes=tuple(store.notes),
     )
 
 
@@ -256,10 +279,11 @@ def write_interactive(url: str | URL, result: RunResult) -> tuple[Path, ...]:
 
 
 def _prepare(out: Path) -> None:
-    """Create the folder of the output, and check that it is writable."""
+    """Create the folder of the output, check that it is writable, and tidy up after killed runs."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=out).close()
+        remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
 
@@ -282,12 +306,10 @@ def _report(
     refused: Sequence[Refusal],
     resources: Resources,
     out: Path,
-    alerts: Alerts,
-) -> tuple[RunResult, Fleet, set[str]]:
-    """Write pages and tables; return the result without counts, status, and excluded logs.
+) -> tuple[RunResult, dict[str, Status], dict[str, dict[str, bytes]], set[str]]:
+    """Write pages; return the result without counts, statuses, packed tables, and excluded logs.
 
-    Changes are those since the last run into this folder. Machines whose assessment is missing, or
-    cannot be decoded, are assessed once more.
+    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
@@ -316,22 +338,13 @@ def _report(
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
-    moment = datetime.now(UTC)
-    fleet, changes = update_fleet(read_fleet(out), made, moment, alerts)
-    store.put_status(fleet.machines, changes, moment)
-    changed = [msgspec.to_builtins(change) for change in changes]
-    of_run = {"refused": refused_rows(refused), "changes": changed}
-    tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
-    write_tables(out, names, tables)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     result = RunResult(
         index=out / "index.html",
         rows=tuple(by_urgency(rows.values())),
         failed=not_updated | unread | failed,
-        statuses=fleet.machines,
-        changes=tuple(changes),
     )
-    return result, fleet, excluded
+    return result, made, tables, excluded
 
 
 def _outputs(

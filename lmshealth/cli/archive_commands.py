@@ -64,7 +64,16 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
-    names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
+    names = [
+        "n_logs",
+        "n_refused",
+        "n_remembered",
+        "n_unread",
+        "failed",
+        "unsent",
+        "notes",
+        "changes",
+    ]
     head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
@@ -78,7 +87,8 @@ def _write_others(result: RunResult, store: str | URL, *, pdf: bool, interactive
 
 
 def _errors(result: RunResult) -> list[str]:
-    return [f"{name}: {why}" for name, why in (*result.failed.items(), *result.unsent.items())]
+    failed = (*result.failed.items(), *result.unsent.items())
+    return [*result.notes, *(f"{name}: {why}" for name, why in failed)]
 
 
 @options.command(
@@ -174,6 +184,6 @@ def report(
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")
-    terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
+    terminal.print_errors(_errors(result))
     _write_others(result, store, pdf=pdf, interactive=interactive)
-    ctx.exit(options.SOME_REFUSED if result.failed else 0)
+    ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)

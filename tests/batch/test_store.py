@@ -438,7 +438,7 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
             file.execute(
                 f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
             )
-            file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
+            file.execute(f"UPDATE summaries_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
         assert got_from(store, "k", "a.h5") is None
         assert recall(store, "B", "k1") is None
         assert recall(store, "A", "k2") is not None
@@ -458,7 +458,7 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
             keep(store, machine, "k1", worn(tmp_path, machine))
             store.put_part(machine, "p", pack(machine))
         with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
-            for table in ("identified", "assessed", "parts", "reported"):
+            for table in ("identified", "assessed", "parts", "summaries"):
                 other = f"SELECT content FROM {table}_{SCHEMA} ORDER BY rowid"
                 (first,), *_ = file.execute(other).fetchall()
                 file.execute(f"UPDATE {table}_{SCHEMA} SET content = ?", (first,))
@@ -489,7 +489,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
         Store(f"sqlite:///{path}").close()
     finally:
         event.remove(Engine, "before_cursor_execute", be_quicker)
-    assert len(made) == 10 + 3
+    assert len(made) == 12 + 3
 
 
 @pytest.mark.slow
@@ -643,7 +643,7 @@ def test_what_no_run_computes_again_comes_from_the_schema_before(
     with engine.begin() as connection:
         for view in ("status", "points", "changes"):
             connection.execute(text(f"DROP VIEW lmshealth_{view}"))
-        for name in ("points", "changes", "reported", "assessed"):
+        for name in ("points", "changes", "summaries", "assessed"):
             new = f"{name}_{SCHEMA - 1}"
             connection.execute(text(f"ALTER TABLE {name}_{SCHEMA} RENAME TO {new}"))
         # A column that is no more, and one that is new.
