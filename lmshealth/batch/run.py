@@ -1,5 +1,6 @@
 """Run over an archive: from a folder of logs to tables and a report."""
 
+from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
@@ -23,7 +24,7 @@ from lmshealth.batch.alerts import (
     write_statuses,
 )
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import Progress, Reading, Resources, Work, ingest
+from lmshealth.batch.ingest import NOT_LISTED, Progress, Reading, Resources, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Status
 from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
@@ -33,6 +34,7 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
+from lmshealth.io.refusal import visible
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
@@ -104,6 +106,7 @@ class RunResult:
     n_logs: int = 0  # distinct logs found
     n_refused: int = 0  # of them, refused as a whole
     n_remembered: int = 0  # of them, taken from the store
+    n_unlisted: int = 0  # of them, omitted by the manifest of their folder
     n_unread: int = 0  # unreadable rows of ``manifest.csv`` and ``maintenance.csv``, or tables
     # Status of all machines, those of earlier runs with it, and changes since the run before.
     statuses: tuple[Status, ...] = ()
@@ -197,11 +200,13 @@ def run(
         write_statuses(statuses, out)
         notes += store.notes
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
+    unlisted = {refusal.log for refusal in refused if refusal.reason == NOT_LISTED}
+    others = {refusal.log for refusal in refused if refusal.reason not in ("duplicate", NOT_LISTED)}
+    lost = (others - copies | excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
-            f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
-            f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
+            f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
+            f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
     return replace(
@@ -209,6 +214,7 @@ def run(
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
+        n_unlisted=len(unlisted),
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
         failed=failed | done.failed,
         statuses=statuses,
@@ -286,6 +292,16 @@ def _prepare(out: Path) -> None:
         remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _others(folder: Path, logs: frozenset[str]) -> str:
+    """Return the suffixes of the files of a folder without logs."""
+    if logs:
+        return ""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
+    counts = Counter(path.suffix for path in files if path.name[0] != ".")
+    found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in counts.most_common(3))
+    return f" (files: {found}; `lmshealth init FILE` tries one)" if found else ""
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:

@@ -64,16 +64,8 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
-    names = [
-        "n_logs",
-        "n_refused",
-        "n_remembered",
-        "n_unread",
-        "failed",
-        "unsent",
-        "notes",
-        "changes",
-    ]
+    counts = ["n_logs", "n_refused", "n_remembered", "n_unlisted", "n_unread"]
+    names = [*counts, "failed", "unsent", "notes", "changes"]
     head = {"schema": constants.STATUS_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
@@ -113,6 +105,8 @@ def run(
         used = result.n_logs - result.n_refused
         again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
         click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
+        if result.n_unlisted:
+            click.echo(f"{result.n_unlisted} logs are not listed in manifest.csv: see refused.csv.")
         if result.n_unread:
             click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
         views.print_summaries(result.rows)
@@ -123,7 +117,7 @@ def run(
         click.echo(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     _write_others(result, given["store"] or default_url(out), pdf=pdf, interactive=interactive)
-    some = result.n_refused or result.n_unread or result.failed
+    some = result.n_refused or result.n_unlisted or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
 
 
@@ -156,7 +150,8 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             terminal.print_json(_document(result), indent=-1)
         else:
             used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
-            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run")
+            more = f", {result.n_unlisted} not in manifest.csv" if result.n_unlisted else ""
+            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run{more}")
             for change in result.changes:
                 click.echo(f"{now}{plain(str(change))}")
         terminal.print_errors(now + error for error in _errors(result))
