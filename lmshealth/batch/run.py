@@ -27,7 +27,7 @@ from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, pack
 from lmshealth.batch.ingest import NOT_LISTED, Progress, Reading, Resources, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Status
-from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
+from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
@@ -250,8 +250,7 @@ def report(
                 rows[record.machine] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
-        found = "the store holds only results of another version of lmshealth"
-        raise StoreError(f"{found}; `lmshealth run LOGS --store URL` fills it")
+        raise store.unfilled("no assessment that this version of lmshealth can read")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(

@@ -251,12 +251,12 @@ class Store:
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
-            raise self._unfilled(f"{found} (no table {min(missing)})")
+            raise self.unfilled(f"{found} (no table {min(missing)})")
 
-    def _unfilled(self, found: str) -> StoreError:
-        return StoreError(
-            f"the store {self._shown} holds {found}; `lmshealth run LOGS --store URL` fills it"
-        )
+    def unfilled(self, found: str) -> StoreError:
+        """Return the error of a store without the results that are needed."""
+        step = "; ".join(["`lmshealth run LOGS --store URL` fills it", *self.notes])
+        return StoreError(f"the store {self._shown} holds {found}; {step}")
 
     def close(self) -> None:
         """Close all connections."""
@@ -487,7 +487,7 @@ class Store:
         found = [unpack_or_none(content, Published) for _, (content,) in self._intact(_PRESENT)]
         present: list[Published] = [one for one in found if one is not None]
         if not present:
-            raise self._unfilled("no assessment")
+            raise self.unfilled("no assessment")
         return tuple(sorted(present, key=lambda one: one.machine))
 
     def refused(self, keys: Iterable[str]) -> tuple[Refusal, ...]:
@@ -577,6 +577,9 @@ class Store:
             columns = zip(table.primary_key.columns, keys, strict=True)
             with self._begin() as connection:
                 connection.execute(sql.delete(table).where(*(one == key for one, key in columns)))
+                if table is _ASSESSED:
+                    # Parts of it would lead to other draws than those from nothing.
+                    connection.execute(sql.delete(_PARTS).where(_PARTS.c.machine == keys[0]))
 
     def _put(self, table: sql.Table, **row: Any) -> None:
         with self._begin() as connection:
