@@ -175,11 +175,15 @@ class PackedAssessment:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Key of the assessment of a machine that was published last, and of its refused logs."""
+    """Key of the assessment of a machine that was published last, and of its refused logs.
+
+    ``kept`` are the keys of all its assessments that were stored then.
+    """
 
     machine: str
     key: str
     refused: str
+    kept: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -409,8 +413,15 @@ class Store:
         """Fetch a part of the last assessment of a machine; None where it is not stored."""
         return self._record(_PARTS, "content", machine=_id(machine), key=key)
 
-    def parts(self, machine: str) -> dict[str, bytes]:
-        """Fetch the parts of the last assessment of a machine by key."""
+    def parts(self, machine: str, key: str = "") -> dict[str, bytes]:
+        """Fetch the parts of the last assessment of a machine, for the next one, by their keys.
+
+        There are none for one that was lost: from its own parts it would have other draws.
+        """
+        content = self._record(_PRESENT, "content", machine=_id(machine))
+        present: Published | None = unpack_or_none(content, Published)
+        if present is not None and key in present.kept:
+            return {}
         return {key: part for (_, key), (part,) in self._intact(_PARTS, machine=_id(machine))}
 
     def put_points(self, machine: str, points: Iterable[dict[str, Any]]) -> None:
@@ -457,7 +468,7 @@ class Store:
         ``refused`` is that of the list of logs that belong to no machine.
         """
         own, key, stored = _id(machine), keys[0], _ASSESSED.c
-        present = pack(Published(machine, key, refused))
+        present = pack(Published(machine, key, refused, tuple(keys)))
         summary = self._record(_ASSESSED, "summary", machine=own, key=key)
         number = 1 + max((one.number for _, one in self._summarised(machine)), default=0)
         others = sql.delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
@@ -577,9 +588,6 @@ class Store:
             columns = zip(table.primary_key.columns, keys, strict=True)
             with self._begin() as connection:
                 connection.execute(sql.delete(table).where(*(one == key for one, key in columns)))
-                if table is _ASSESSED:
-                    # Parts of it would lead to other draws than those from nothing.
-                    connection.execute(sql.delete(_PARTS).where(_PARTS.c.machine == keys[0]))
 
     def _put(self, table: sql.Table, **row: Any) -> None:
         with self._begin() as connection:

@@ -355,8 +355,8 @@ def fill(store: Store, folder: Path) -> dict[str, Callable[[], bool]]:
     return {
         "hashed": lambda: bool(store.digests(["k"])),
         "identified": lambda: got_from(store, "k", "a.h5") is not None,
-        "parts": lambda: store.part("A", "p") is not None,  # a damaged assessment costs its parts
         "assessed": lambda: store.has_assessment("A", "k1"),
+        "parts": lambda: store.part("A", "p") is not None,
         "summaries": lambda: store.previous_summary("A", "k2") is not None,
         "refused": lambda: bool(store.refused([key])),
         "announced": lambda: bool(store.announced()),
@@ -405,6 +405,15 @@ def test_a_store_that_is_only_read_keeps_its_damage(file_url: str, tmp_path: Pat
             store.published()
         assert "1 of present" in store.notes[0]
         assert _ask(store, f"SELECT count(*) FROM present_{SCHEMA}") == [(1,)]
+
+
+def test_a_lost_assessment_is_made_from_nothing(file_url: str, tmp_path: Path) -> None:
+    """Its own parts would give it other draws; the next assessment uses them."""
+    with closing(Store(file_url)) as store:
+        keep(store, "A", "k1", worn(tmp_path))
+        store.put_part("A", "p", b"part")
+        assert store.parts("A", "k2") == {"p": b"part"}
+        assert store.parts("A", "k1") == {}
 
 
 def test_one_run_at_a_time_is_alone(url: str) -> None:
