@@ -291,7 +291,9 @@ def read_only(
     call = program.command(
         "report", "--store", f"sqlite:///{out}/lmshealth.sqlite", "--out", str(pages)
     )
-    mount = f"mount --bind {out} {out} && mount -o remount,bind,ro {out} && " if unwritable else ""
+    place = shlex.quote(str(out))
+    mount = f"mount --bind {place} {place} && mount -o remount,bind,ro {place} && "
+    mount = mount if unwritable else ""
     shell = ["unshare", *(["--map-root-user"] if os.geteuid() else []), "--mount", "sh", "-c"]
     done = subprocess.run(
         [*shell, f"{mount}exec {shlex.join(call)}"],
