@@ -4,14 +4,21 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import secrets
 import stat
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext, suppress
+from functools import cache
 from pathlib import Path
 from typing import IO, TYPE_CHECKING
 
 from lmshealth.errors import BadTable
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
 
 if TYPE_CHECKING:
     from xarray import DataTree
@@ -47,7 +54,7 @@ def write_text(target: Path, text: str) -> None:
 
 def write_bytes(target: Path, content: bytes) -> None:
     """Write bytes in the same way."""
-    with _writing(target), _in_place_of(target) as part, part.open("xb") as stream:
+    with _writing(target), _in_place_of(target) as part, part.open("wb") as stream:
         stream.write(content)
 
 
@@ -60,7 +67,7 @@ def replacing(target: Path) -> Iterator[IO[str]]:
     odd = "backslashreplace"  # one unprintable name must not keep all others from being written
     with (
         _in_place_of(target) as part,
-        part.open("x", encoding="utf-8", errors=odd, newline="\n") as stream,
+        part.open("w", encoding="utf-8", errors=odd, newline="\n") as stream,
     ):
         yield stream
 
@@ -70,10 +77,41 @@ def _in_place_of(target: Path) -> Iterator[Path]:
     # A random name: nobody can have put a link there.
     part = target.with_name(f".{secrets.token_hex(8)}.part")
     try:
-        yield part
-        part.replace(target)
+        with _locked(part, os.O_CREAT | os.O_EXCL):
+            yield part
+            part.replace(target)
     finally:
         part.unlink(missing_ok=True)
+
+
+def remove_abandoned(folder: Path) -> None:
+    """Remove incomplete files of a folder whose writers were killed: nobody holds their locks."""
+    for part in folder.glob(".*.part"):
+        if re.fullmatch(r"\.[0-9a-f]{16}\.part", part.name):
+            with suppress(OSError), _locked(part):
+                part.unlink()
+
+
+_tidy = cache(remove_abandoned)  # once per process: a run writes many files
+
+
+@contextmanager
+def _locked(part: Path, create: int = 0) -> Iterator[None]:
+    """Hold the lock of a file, which ends with the process; `OSError` if another one has it.
+
+    Windows needs none: it removes no file that is open. On a file system without locks nothing is
+    removed.
+    """
+    if fcntl is None:
+        yield
+        return
+    guard = os.open(part, os.O_RDWR | create, 0o666)
+    try:
+        with suppress(OSError) if create else nullcontext():
+            fcntl.flock(guard, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        yield
+    finally:
+        os.close(guard)
 
 
 def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) -> None:
@@ -91,6 +129,7 @@ def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) 
 def _writing(target: Path) -> Iterator[None]:
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
+        _tidy(target.parent.absolute())
         yield
     except OSError as error:
         raise BadTable(f"{target}: cannot be written: {error.strerror or error}") from error

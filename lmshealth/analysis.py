@@ -63,8 +63,9 @@ def analyse(
     work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
     if isinstance(logs, str | Path):
         folder = Path(logs)
-        listed, work = find_logs(folder), read_maintenance(folder, latest=latest)
-        manifest, paths = read_manifest(folder), [*listed.logs]
+        manifest, work = read_manifest(folder), read_maintenance(folder, latest=latest)
+        listed = find_logs(folder, manifest=manifest)
+        paths = [*listed.logs]
         refused += [*listed.refused, *manifest.refused]
         manifests = dict.fromkeys(paths, manifest)
     else:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
-from lmshealth._files import write_bytes, write_text
+from lmshealth._files import remove_abandoned, write_bytes, write_text
 from lmshealth.errors import BadTable
 
 
@@ -71,3 +73,30 @@ def test_a_failure_to_write_is_an_error(tmp_path: Path) -> None:
     for target in (tmp_path / "file" / "below", tmp_path / ("long" * 100)):
         with pytest.raises(BadTable, match=r"cannot be written: [A-Z]"):
             write_bytes(target, b"")
+
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from lmshealth._files import replacing
+with replacing(Path(sys.argv[1])) as stream:
+    print("writing", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_only_incomplete_files_of_killed_writers_are_removed(tmp_path: Path) -> None:
+    """A file that another process writes stays until that is killed; other names stay for good."""
+    pytest.importorskip("fcntl", reason="Windows removes no open file")
+    others = [tmp_path / name for name in (".part", "a.part", ".0123.part", ".git")]
+    for path in others:
+        path.write_text("")
+    command = [sys.executable, "-c", HOLD, str(tmp_path / "target.csv")]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, cwd=Path(__file__).parents[1]) as writer:
+        assert writer.stdout is not None and writer.stdout.readline()
+        (part,) = set(tmp_path.iterdir()) - set(others)
+        remove_abandoned(tmp_path)
+        assert part.exists()
+        writer.kill()
+    remove_abandoned(tmp_path)
+    assert sorted(tmp_path.iterdir()) == sorted(others)

@@ -1,4 +1,8 @@
-"""Alerts: changes of machines since the last run, delivered once to a command or a messenger."""
+"""Alerts: changes of machines since the last run, delivered to a command or a messenger.
+
+The store holds what was announced of each machine, and which changes are to be delivered in which
+way. ``status.json`` is a view of it.
+"""
 
 import os
 import signal
@@ -7,18 +11,21 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from pathlib import Path
+from pathlib import Path, PurePath
 from tempfile import TemporaryFile
+from threading import Thread
+from typing import IO, Any, NamedTuple
 
 import msgspec
 
 from lmshealth._files import read_table, write_bytes
 from lmshealth.batch import constants
 from lmshealth.batch.status import Change, Fleet, Status, compare
-from lmshealth.io.refusal import visible
+from lmshealth.batch.store import Announced, Store, Unsent
+from lmshealth.io.refusal import shown, visible
 
 FILE = "status.json"
-"""Status of all machines in the folder of the output: what the next run compares with."""
+"""Status of all machines in the folder of the output."""
 
 # Not the folder of the process: it may hold a module of any name.
 _NOTIFY = ("-P", "-c", "from lmshealth.batch.addresses import notify; notify()")
@@ -39,86 +46,168 @@ class Alerts:
         return {name: command for name, command in asked.items() if command}
 
 
-def read_fleet(folder: Path) -> Fleet:
-    """Read the status of all machines after the last run; empty without one, or of other keys."""
+class Scope(NamedTuple):
+    """Folders of the logs and of the output of a run, and the `last_number` as it began."""
+
+    logs: Path
+    out: Path
+    began: int
+
+
+def last_number(store: Store) -> int:
+    """Return the number of the last comparison on a store; 0 without one."""
+    return max((one.number for one in store.announced().values()), default=0)
+
+
+def announce(
+    store: Store,
+    made: Mapping[str, Status],
+    moment: datetime,
+    alerts: Alerts,
+    scope: Scope,
+) -> tuple[tuple[Status, ...], list[Change], list[str]]:
+    """Compare all machines of a folder of logs with what was announced, and queue their changes.
+
+    A machine that has no result in this run keeps its last one: its logs may have been removed. A
+    store without any of them takes ``status.json`` for what was announced. Only within
+    `Store.alone`; return statuses, changes, and notes of damage.
+    """
+    unsent, everything = store.unsent(), store.announced()
+    folder, notes = shown(scope.logs.absolute()), list[str]()
+    own = {
+        stage: one
+        for stage, one in everything.items()
+        if stage in made or PurePath(one.folder).is_relative_to(folder)
+    }
+    known = {stage: one.status for stage, one in own.items()}
     try:
-        return msgspec.json.decode(read_table(folder / FILE), type=Fleet)
-    except (OSError, ValueError):
-        return Fleet()
+        written = msgspec.json.decode(read_table(scope.out / FILE), type=Fleet)
+    except FileNotFoundError:
+        written = Fleet()
+    except (OSError, ValueError) as error:
+        written, step = Fleet(), "written anew from the store"
+        if not known:
+            step = "the store has no status either: losses, alarms and silences are announced again"
+        notes.append(f"{scope.out / FILE} cannot be read ({error}); {step}")
+    last_run = {one.stage: one for one in written.machines}
+    lost_change, lost_status = (store.damaged[name] for name in ("unsent", "announced"))
+    present = known | dict(made) if known and not lost_status else last_run | known | dict(made)
+    if lost_change:  # it is not known which one: what is bad now is announced again
+        known = {}
+    elif not lost_status:
+        known = known or last_run
+    asked = set(alerts.channels())
+    everywhere = asked.union(*(one.channels for one in own.values()))
+    number = 1 + max((one.number for one in everything.values()), default=0)
+    announced, changes, queued = [], list[Change](), list[Unsent]()
+    for stage, status in sorted(present.items()):
+        last = own.get(stage)
+        judged, found = compare(known.get(stage), status, moment, alerts.silent_days)
+        if last and last.number > scope.began and status.recorded_at < last.status.recorded_at:
+            # Another run, of later logs, has ended since this one began.
+            judged, found = last.status, []
+        channels = asked.union(last.channels) if last else everywhere
+        new = channels.difference(last.channels if last else ())
+        waiting = {one.change: None for one in unsent if one.change.stage == stage}
+        queued += [Unsent(one, name, number) for name in new for one in waiting]
+        queued += [Unsent(one, name, number) for name in channels for one in found]
+        changes += found
+        place = folder if stage in made or not last else last.folder
+        announced.append(Announced(judged, place, tuple(sorted(channels)), number))
+    store.put_announced(announced)
+    store.put_unsent(queued)
+    return tuple(one.status for one in announced), changes, notes
 
 
-def update_fleet(
-    before: Fleet, made: Mapping[str, Status], moment: datetime, alerts: Alerts
-) -> tuple[Fleet, list[Change]]:
-    """Judge all machines of this run and of the last, and list their changes.
+def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path) -> dict[str, str]:
+    """Deliver the changes of machines that were not delivered yet; return why an option failed.
 
-    A machine that has no result in this run keeps its last one: its logs may have been removed.
+    One run at a time delivers. What it delivers is removed after that: a run that is killed between
+    the two leaves it to the next run, which delivers it once more.
     """
-    known = {one.stage: one for one in before.machines}
-    machines, changes = [], list[Change]()
-    for stage, status in sorted((known | dict(made)).items()):
-        judged, own = compare(known.get(stage), status, moment, alerts.silent_days)
-        machines.append(judged)
-        changes += own
-    pending = {name: (*before.pending.get(name, ()), *changes) for name in alerts.channels()}
-    return Fleet(tuple(machines), {name: own for name, own in pending.items() if own}), changes
+    by_stage, failed = {one.stage: one for one in machines}, dict[str, str]()
+
+    def waiting(name: str) -> list[Unsent]:
+        unsent = store.unsent()
+        return [one for one in unsent if one.channel == name and one.change.stage in by_stage]
+
+    for name, command in alerts.channels().items():
+        if not waiting(name):
+            continue
+        with store.alone():
+            unsent = waiting(name)  # another run may have delivered some meanwhile
+            rows = [_row(one.change, by_stage[one.change.stage], out) for one in unsent]
+            content = {"schema": constants.JSON_SCHEMA, "changes": rows}
+            why = run_command(command, msgspec.json.encode(content)) if rows else ""
+            if why:
+                again = "are sent again by the next run with this option"
+                failed[name] = f"{why}; {len(rows)} changes {again}"
+            else:
+                store.remove_unsent(unsent)
+    return failed
 
 
-def publish(fleet: Fleet, alerts: Alerts, out: Path) -> dict[str, str]:
-    """Deliver pending changes, and write the status of each machine and of all.
+def _row(change: Change, status: Status, out: Path) -> dict[str, Any]:
+    """Return a change as an alert has it."""
+    row: dict[str, Any] = msgspec.to_builtins(change)
+    page = str(out.absolute() / status.page)
+    return row | {"text": str(change), "DeviceHealth": status.device_health, "page": page}
 
-    Return why an option failed; its changes stay pending.
-    """
-    by_stage, failed = {one.stage: one for one in fleet.machines}, dict[str, str]()
-    for name, changes in fleet.pending.items():
-        rows = [
-            msgspec.to_builtins(change)
-            | {"text": str(change), "DeviceHealth": by_stage[change.stage].device_health}
-            | {"page": str(out.absolute() / by_stage[change.stage].page)}
-            for change in changes
-        ]
-        content = {"schema": constants.JSON_SCHEMA, "changes": rows}
-        if why := run_command(alerts.channels()[name], msgspec.json.encode(content)):
-            failed[name] = f"{why}; {len(changes)} changes are sent again by the next run"
-    left = {name: fleet.pending[name] for name in failed}
+
+def write_statuses(machines: Sequence[Status], out: Path) -> None:
+    """Write the status of each machine and of all."""
     # Where the page of a machine that is gone has the name of another, the newer one is kept.
     documents: list[tuple[str, Status | Fleet]] = [
         (f"{Path(one.page).stem}.status.json", one)
-        for one in sorted(fleet.machines, key=lambda one: one.recorded_at)
+        for one in sorted(machines, key=lambda one: one.recorded_at)
     ]
-    for name, document in (*documents, (FILE, msgspec.structs.replace(fleet, pending=left))):
+    for name, document in (*documents, (FILE, Fleet(tuple(machines)))):
         encoded = msgspec.json.encode(document, enc_hook=lambda number: number.item())
         write_bytes(out / name, msgspec.json.format(encoded, indent=1))
-    return failed
 
 
 def run_command(command: Sequence[str], content: bytes) -> str:
     """Run a command without a shell, with bytes on standard input; return why it failed, or "".
 
-    It is killed with its children after `constants.ALERT_TIMEOUT_S`. Files take its input and its
-    output: a pipe that a child holds open would be waited for.
+    It is killed with its children after `constants.ALERT_TIMEOUT_S`. Of its output, however long,
+    the end is kept. A file has its input, and a thread reads its output: a child that holds a pipe
+    open is not waited for.
     """
-    with TemporaryFile() as given, TemporaryFile() as output:
+    last = bytearray()
+    with TemporaryFile() as given:
         given.write(content)
         given.seek(0)
         try:
             process = subprocess.Popen(
-                command, stdin=given, stdout=output, stderr=output, start_new_session=True
+                command,
+                stdin=given,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                start_new_session=True,
             )
         except OSError as error:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
-        try:
-            status = process.wait(constants.ALERT_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            return f"took longer than {constants.ALERT_TIMEOUT_S} s, and was killed"
-        finally:
-            if process.poll() is None:
-                if hasattr(os, "killpg"):
-                    os.killpg(process.pid, signal.SIGKILL)
-                else:  # Windows
-                    process.kill()
-                process.wait()
-        output.seek(max(output.seek(0, os.SEEK_END) - 1000, 0))
-        lines = output.read().decode(errors="replace").split("\n")
-    last = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
-    return f"ended with status {status}: {visible(last[:200])}" if status else ""
+    reader = Thread(target=_keep_end, args=(process.stdout, last), daemon=True)
+    reader.start()
+    try:
+        status = process.wait(constants.ALERT_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        return f"took longer than {constants.ALERT_TIMEOUT_S} s, and was killed"
+    finally:
+        if process.poll() is None:
+            if hasattr(os, "killpg"):
+                os.killpg(process.pid, signal.SIGKILL)
+            else:  # Windows
+                process.kill()
+            process.wait()
+    reader.join(constants.ALERT_OUTPUT_S)
+    lines = bytes(last).decode(errors="replace").split("\n")
+    line = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
+    return f"ended with status {status}: {visible(line[:200])}" if status else ""
+
+
+def _keep_end(stream: IO[bytes], last: bytearray) -> None:
+    """Read a stream up to its end, and keep its last bytes."""
+    with stream:
+        while block := os.read(stream.fileno(), 1 << 16):
+            last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]

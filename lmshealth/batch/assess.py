@@ -294,7 +294,7 @@ def _assessed(
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
-        return one, packed_logs(one, store), {} if force else store.parts(one.name)
+        return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
 
     def mapper(jobs: Iterator[_Job]) -> Iterator[tuple[_Job, PackedAssessment | str]]:
         if pool.executor is None or len(machines) >= pool.size:

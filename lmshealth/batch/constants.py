@@ -24,8 +24,9 @@ FILES_PER_HASH_TASK = 16
 ROWS_PER_QUERY = 400
 """Rows fetched by one query: far below the 999 variables that old builds of SQLite accept."""
 
-SQLITE_BUSY_TIMEOUT_S = 120
-"""Seconds (s) that a writer waits while other processes write to the same SQLite file."""
+SQLITE_BUSY_TIMEOUT_S = 300
+"""Seconds (s) that a writer waits while other processes write to the same SQLite file: longer than
+a run that delivers its changes by two commands, each of which hangs."""
 
 SERVER_TIMEOUT_S = 20
 """Seconds (s) that a database server has to answer, unless its URL has ``connect_timeout``."""
@@ -34,7 +35,7 @@ ANSWER_TIMEOUT_S = 60
 """Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
 end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
-SCHEMA = 7
+SCHEMA = 8
 """Version of the tables of a store, part of their names: older tables are not read."""
 
 SETTLED_S = 10
@@ -76,6 +77,13 @@ plan a service."""
 
 ALERT_TIMEOUT_S = 60
 """Seconds (s) that an alert command may take before it is killed with its children."""
+
+ALERT_OUTPUT_BYTES = 1000
+"""End of the output of an alert command that is kept (bytes): its last line is printed."""
+
+ALERT_OUTPUT_S = 1.0
+"""Seconds (s) that the end of its output may come after its own: a child that it leaves behind may
+hold its output open without end."""
 
 TRACK_POINTS = 1000
 """Newest rows of track.csv of a machine that are in the store for dashboards: a year of daily logs

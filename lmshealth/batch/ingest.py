@@ -7,7 +7,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from dataclasses import dataclass
 from datetime import datetime
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from lmshealth._serialize import VERSION, fingerprint
@@ -19,7 +19,7 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Metadata, Refusal
-from lmshealth.io.manifest import find_logs, name_of, read_manifest
+from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
 from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
@@ -32,6 +32,9 @@ from lmshealth.tracking.history import LogEstimates
 
 Progress = Callable[[str, int, int], None]
 """Callback: name of the step, how many items are done, how many there are."""
+
+NOT_LISTED = "not-listed"
+"""Reason in refused.csv of a log that is analysed, though the manifest of its folder omits it."""
 
 LogKey = tuple[str, str]
 """Name of a log, and the key of its estimates in the store."""
@@ -131,7 +134,8 @@ class Ingested:
     """Logs of each machine that have estimates, and the digest of its description.
 
     Refused are logs as a whole, copies, and rows of a manifest that name no log; ``logs`` are the
-    names of all logs found; the outcomes of ``n_cached`` logs were in the store.
+    names of all logs that are there or that a manifest lists; the outcomes of ``n_cached`` logs
+    were in the store.
     """
 
     machines: dict[str, tuple[LogKey, ...]]
@@ -184,11 +188,17 @@ def ingest(
     """
     store, progress = resources.store, resources.progress
     folder = folder.absolute()  # workers may have another working directory
-    archive = find_logs(folder, follow_links=reading.follow_links)
+    manifest = read_manifest(folder, follow_links=reading.follow_links)
+    archive = find_logs(folder, manifest=manifest, follow_links=reading.follow_links)
     inside = out.resolve()
     logs = (path for path in archive.logs if path not in reading.growing)
     found = [path for path in logs if inside not in path.resolve().parents]
-    tasks, refused = _tasks(folder, found, reading, resources)
+    tasks, refused = _tasks(folder, found, manifest, reading, resources)
+    refused += [
+        Refusal(name_of(path, folder), NOT_LISTED, "it is read with its own metadata; add a row")
+        for path in found
+        if manifest.omits(path)
+    ]
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}
     lost: list[Refusal] = []
@@ -220,13 +230,14 @@ def ingest(
         done += len(part)
         progress("identifying", len(cached) + done, len(tasks))
     names = {name_of(path, folder) for path in found}
+    names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, descriptions, others = _grouped(groups, [stage.digest for stage in stages])
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
     return Ingested(
         machines=machines,
         descriptions=descriptions,
         refused=(*archive.refused, *refused, *lost),
-        logs=frozenset(names | {refusal.log for refusal in archive.refused}),
+        logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=len(cached),
     )
 
@@ -249,10 +260,13 @@ def _grouped(
 
 
 def _tasks(
-    folder: Path, found: Sequence[Path], reading: Reading, resources: Resources
+    folder: Path,
+    found: Sequence[Path],
+    manifest: Manifest,
+    reading: Reading,
+    resources: Resources,
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
-    manifest = read_manifest(folder, follow_links=reading.follow_links)
     digests = _all_digests({path: _file_key(path, folder) for path in found}, resources)
     tasks: list[_Task] = []
     refused: list[Refusal] = list(manifest.refused)

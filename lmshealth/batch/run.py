@@ -1,5 +1,6 @@
 """Run over an archive: from a folder of logs to tables and a report."""
 
+from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass, field, replace
@@ -10,21 +11,29 @@ from tempfile import TemporaryFile
 
 import msgspec
 
-from lmshealth._files import write_text
+from lmshealth._files import remove_abandoned, write_text
 from lmshealth._serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
-from lmshealth.batch.alerts import Alerts, publish, read_fleet, update_fleet
+from lmshealth.batch.alerts import (
+    Alerts,
+    Scope,
+    announce,
+    deliver,
+    last_number,
+    write_statuses,
+)
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import Progress, Reading, Resources, Work, ingest
+from lmshealth.batch.ingest import NOT_LISTED, Progress, Reading, Resources, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
-from lmshealth.batch.status import Change, Fleet, Status
-from lmshealth.batch.store import Store, StoreError, default_url, unpack_or_none
+from lmshealth.batch.status import Change, Status
+from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
+from lmshealth.io.refusal import visible
 from lmshealth.report.assessment import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
@@ -99,11 +108,13 @@ class RunResult:
     n_logs: int = 0  # distinct logs found
     n_refused: int = 0  # of them, refused as a whole
     n_remembered: int = 0  # of them, taken from the store
+    n_unlisted: int = 0  # of them, omitted by the manifest of their folder
     n_unread: int = 0  # unreadable rows of ``manifest.csv`` and ``maintenance.csv``, or tables
     # Status of all machines, those of earlier runs with it, and changes since the run before.
     statuses: tuple[Status, ...] = ()
     changes: tuple[Change, ...] = ()
     unsent: dict[str, str] = field(default_factory=dict)  # options whose alerts failed, and why
+    notes: tuple[str, ...] = ()  # damage that was found, and what became of it
 
     @property
     def pages(self) -> tuple[Path, ...]:
@@ -162,6 +173,7 @@ def run(
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
+        scope = Scope(folder, out, last_number(store))
         resources = Resources(store, pool, progress)
         reading = Reading(*(getattr(settings, name) for name in Reading._fields))
         ingested = ingest(folder, stages, resources, out=out, reading=reading)
@@ -175,16 +187,28 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        done, fleet, excluded = _report(usable, refused, resources, out, settings.alerts)
-    if machines:
-        write_index(out, done.rows, refused)
-    unsent = publish(fleet, settings.alerts, out)
+        done, made, tables, excluded = _report(usable, refused, resources, out)
+        moment = datetime.now(UTC)
+        with store.alone():  # a run that ends before its tables are written has announced nothing
+            statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
+            store.put_status(statuses, changes, moment)
+            changed = [msgspec.to_builtins(change) for change in changes]
+            of_run = {"refused": refused_rows(refused), "changes": changed}
+            tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
+            write_tables(out, [machine.name for machine in usable], tables)
+        if machines:
+            write_index(out, done.rows, refused)
+        unsent = deliver(store, statuses, settings.alerts, out)
+        write_statuses(statuses, out)
+        notes += store.notes
     copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    lost = ({refusal.log for refusal in refused} - copies | excluded) & ingested.logs
+    unlisted = {refusal.log for refusal in refused if refusal.reason == NOT_LISTED}
+    others = {refusal.log for refusal in refused if refusal.reason not in ("duplicate", NOT_LISTED)}
+    lost = (others - copies | excluded) & ingested.logs
     if not machines:
         raise NothingUsable(
-            f"{folder}: no usable log: {len(ingested.logs)} found, {len(lost)} refused"
-            f"{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
+            f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
+            f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
     return replace(
@@ -192,9 +216,13 @@ def run(
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
+        n_unlisted=len(unlisted),
         n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
         failed=failed | done.failed,
+        statuses=statuses,
+        changes=tuple(changes),
         unsent=unsent,
+        notes=tuple(notes),
     )
 
 
@@ -224,24 +252,35 @@ def report(
                 rows[record.machine] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
-        found = "the store holds only results of another version of lmshealth"
-        raise StoreError(f"{found}; `lmshealth run LOGS --store URL` fills it")
+        raise store.unfilled("no assessment that this version of lmshealth can read")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(
         index=write_index(out, ranked, store.refused(one.refused for one in present)),
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
+        notes=tuple(store.notes),
     )
 
 
 def _prepare(out: Path) -> None:
-    """Create the folder of the output, and check that it is writable."""
+    """Create the folder of the output, check that it is writable, and tidy up after killed runs."""
     try:
         out.mkdir(parents=True, exist_ok=True)
         TemporaryFile(dir=out).close()
+        remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _others(folder: Path, logs: frozenset[str]) -> str:
+    """Return the suffixes of the files of a folder without logs."""
+    if logs:
+        return ""
+    files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
+    counts = Counter(path.suffix for path in files if path.name[0] != ".")
+    found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in counts.most_common(3))
+    return f" (files: {found}; `lmshealth init FILE` tries one)" if found else ""
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:
@@ -262,12 +301,10 @@ def _report(
     refused: Sequence[Refusal],
     resources: Resources,
     out: Path,
-    alerts: Alerts,
-) -> tuple[RunResult, Fleet, set[str]]:
-    """Write pages and tables; return the result without counts, status, and excluded logs.
+) -> tuple[RunResult, dict[str, Status], dict[str, dict[str, bytes]], set[str]]:
+    """Write pages; return the result without counts, statuses, packed tables, and excluded logs.
 
-    Changes are those since the last run into this folder. Machines whose assessment is missing, or
-    cannot be decoded, are assessed once more.
+    Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
@@ -296,22 +333,13 @@ def _report(
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
-    moment = datetime.now(UTC)
-    fleet, changes = update_fleet(read_fleet(out), made, moment, alerts)
-    store.put_status(fleet.machines, changes, moment)
-    changed = [msgspec.to_builtins(change) for change in changes]
-    of_run = {"refused": refused_rows(refused), "changes": changed}
-    tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
-    write_tables(out, names, tables)
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
     result = RunResult(
         index=out / "index.html",
         rows=tuple(by_urgency(rows.values())),
         failed=not_updated | unread | failed,
-        statuses=fleet.machines,
-        changes=tuple(changes),
     )
-    return result, fleet, excluded
+    return result, made, tables, excluded
 
 
 def _outputs(

@@ -62,10 +62,9 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Fleet(msgspec.Struct, frozen=True):
-    """Status of all machines after a run, and changes that were not delivered by channel."""
+    """Status of all machines after a run."""
 
     machines: tuple[Status, ...] = ()
-    pending: dict[str, tuple[Change, ...]] = {}
     schema: int = constants.JSON_SCHEMA
 
 
@@ -157,13 +156,12 @@ def compare(
 ) -> tuple[Status, list[Change]]:
     """Judge a status at a moment, and list its changes since the run before; None if it is new.
 
-    An alarm of a mode is a change once per baseline, the silence of a machine once until its next
-    log. Without ``silent_days`` a silence only lasts.
+    An alarm of a mode is a change once per baseline. The silence of a machine is one once, and
+    lasts until its next log, also where the clock is set back; without ``silent_days`` none begins.
     """
-    if silent_days is None:
-        silent = before is not None and before.silent and before.recorded_at == now.recorded_at
-    else:
-        silent = moment - now.recorded_at > timedelta(days=silent_days)
+    silent = before is not None and before.silent and before.recorded_at == now.recorded_at
+    if silent_days is not None:
+        silent = silent or moment - now.recorded_at > timedelta(days=silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
     announced = tuple(dict.fromkeys((*known, *now.alarms)))
     # A status of an earlier schema is written again in this one.

@@ -1,15 +1,19 @@
 """Store of results: a content-addressed cache and the published assessments (SQLite, PostgreSQL).
 
 The key of a result is a fingerprint of everything that the result depends on. A change of any of it
-gives another key, so that only stale results are computed again. A row that is damaged, or that
-this version cannot decode, counts as absent. Every write may be repeated, and may be made by two
-runs at once: runs may be killed, and may share a store.
+gives another key, so that only stale results are computed again. Every row that a run reads is
+sealed by a digest of it and of its keys: one that is damaged is removed and computed again, and
+one that this version cannot decode counts as absent. Every write may be repeated, and may be made
+by two runs at once: runs may be killed, and may share a store.
 """
 
 import hashlib
 import logging
+import os
 import re
 import socket
+import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -48,16 +52,25 @@ class StoreError(LmshealthError):
 
 # Tables: the key of a machine is a digest, because its name may be longer than an index allows
 
+
+class _Bytes(sql.LargeBinary):
+    """Bytes as the database returns them: a damaged row of SQLite may hold a number or a text."""
+
+    def result_processor(self, dialect: Any, coltype: Any) -> None:
+        """Convert nothing: `Store` checks what it reads."""
+
+
 _METADATA = sql.MetaData()
-_BYTES, _DIGEST = sql.LargeBinary, sql.String(64)
+_BYTES, _DIGEST = _Bytes, sql.String(64)
 _KINDS: dict[str, Any] = {"content": _BYTES, "evidence": _BYTES, "summary": _BYTES}
-_KINDS |= {"number": sql.Integer, "version": sql.Text, "machine": sql.Text, "name": sql.Text}
+_KINDS |= {"version": sql.Text, "machine": sql.Text, "name": sql.Text}
 _KINDS |= dict.fromkeys(("low", "median", "high", "probability"), sql.Float)
 _KINDS |= dict.fromkeys(("service_by", "inspect_by"), sql.Date)
 _KINDS |= dict.fromkeys(("recorded_at", "noticed_at"), sql.DateTime(timezone=True))
 _KINDS |= dict.fromkeys(("state", "verdict", "service", "alarms", "silent"), sql.Text)
 _KINDS |= dict.fromkeys(("quantity", "subject", "what", "before", "now"), sql.Text)
-_DIGEST_BYTES = 16  # of a record and its keys, before the record
+_SEAL_BYTES = 16  # digest of a record and its keys, before the record
+_ALONE = "alone"  # the lock of `Store.alone`
 _OPTIONAL = {"machine", "low", "median", "high", "probability", "service_by", "inspect_by"}
 
 
@@ -72,7 +85,7 @@ def _table(table: str, keys: str, columns: str) -> sql.Table:
 
 
 # Digest of the content of each file, by its name, size and times.
-_HASHED = _table("hashed", "key", "digest")
+_HASHED = _table("hashed", "key", "content")
 # Outcome of each log; the columns between key and content are for people.
 _IDENTIFIED = _table("identified", "key", "digest description version machine content")
 # The present assessment of each machine, and the one before the fleet prior was applied.
@@ -80,9 +93,9 @@ _ASSESSED = _table("assessed", "machine key", "content evidence summary")
 # Parts of the last assessment of each machine, by the fingerprint of what they depend on.
 _PARTS = _table("parts", "machine key", "content")
 # Which assessment of each machine was published last, and the key of its list of refused logs.
-_PRESENT = _table("present", "machine", "name key refused")
+_PRESENT = _table("present", "machine", "content")
 # Summaries of all published assessments, numbered in the order of publication.
-_REPORTED = _table("reported", "machine key", "number content")
+_SUMMARIES = _table("summaries", "machine key", "content")
 # Lists of logs that belong to no machine, by the fingerprint of the list.
 _REFUSED = _table("refused", "key", "content")
 # For dashboards: the present status of each machine, its values at logs, changes between runs.
@@ -90,6 +103,10 @@ _SHOWN = "recorded_at verdict probability service service_by inspect_by"
 _STATUS = _table("status", "machine", f"name {_SHOWN} state alarms silent")
 _POINTS = _table("points", "machine key", "name recorded_at quantity subject low median high")
 _CHANGES = _table("changes", "machine key", "name recorded_at noticed_at what before now")
+# Alerts: what was announced of each machine last, and changes that are to be delivered.
+_ANNOUNCED = _table("announced", "machine", "name content")
+_UNSENT = _table("unsent", "machine key channel", "content")
+_CARRIED = (_SUMMARIES, _POINTS, _CHANGES, _ANNOUNCED, _UNSENT)  # no run computes these again
 _CREATE_VIEW = {"sqlite": "CREATE VIEW IF NOT EXISTS", "postgresql": "CREATE OR REPLACE VIEW"}
 _VIEWS = {f"lmshealth_{table.name.split('_')[0]}": table for table in (_STATUS, _POINTS, _CHANGES)}
 
@@ -158,11 +175,46 @@ class PackedAssessment:
 
 @dataclass(frozen=True, slots=True)
 class Published:
-    """Key of the assessment of a machine that was published last, and of its refused logs."""
+    """Key of the assessment of a machine that was published last, and of its refused logs.
+
+    ``kept`` are the keys of all its assessments that were stored then.
+    """
 
     machine: str
     key: str
     refused: str
+    kept: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class _Summarised:
+    """Packed summary of a published assessment, and its number among those of the machine."""
+
+    number: int
+    summary: bytes
+
+
+@dataclass(frozen=True, slots=True)
+class Announced:
+    """Status of a machine that was compared last, and the state of its alerts.
+
+    ``folder`` is that of its logs, ``channels`` are the ways of delivery that a run over it has
+    had; ``number`` is that of the comparison.
+    """
+
+    status: Status
+    folder: str
+    channels: tuple[str, ...]
+    number: int
+
+
+@dataclass(frozen=True, slots=True)
+class Unsent:
+    """A change that is to be delivered in a way, and the number of the comparison that found it."""
+
+    change: Change
+    channel: str
+    number: int
 
 
 def unpack_or_none(content: bytes | None, kind: Any) -> Any:
@@ -192,25 +244,39 @@ class Store:
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:
         self._engine, self._address = _connect(url, create=create)
-        self._shown = shown_address(self._address)
-        tables = sql.inspect(self._engine).get_table_names()
+        self._shown, self._writes = shown_address(self._address), create
         self._claims: Connection | None = None
-        optional = {table.name for table in (_HASHED, *_VIEWS.values())}
+        self._alone: Connection | None = None
+        self.damaged: Counter[str] = Counter()  # rows that were damaged, by the name of the table
+        with self._faults():
+            tables = sql.inspect(self._engine).get_table_names()
+        optional = {table.name for table in (_HASHED, _ANNOUNCED, _UNSENT, *_VIEWS.values())}
         if missing := _METADATA.tables.keys() - optional - set(tables):
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
-            raise self._unfilled(f"{found} (no table {min(missing)})")
+            raise self.unfilled(f"{found} (no table {min(missing)})")
 
-    def _unfilled(self, found: str) -> StoreError:
-        return StoreError(
-            f"the store {self._shown} holds {found}; `lmshealth run LOGS --store URL` fills it"
-        )
+    def unfilled(self, found: str) -> StoreError:
+        """Return the error of a store without the results that are needed."""
+        step = "; ".join(["`lmshealth run LOGS --store URL` fills it", *self.notes])
+        return StoreError(f"the store {self._shown} holds {found}; {step}")
 
     def close(self) -> None:
         """Close all connections."""
         self._drop_claims()
         self._engine.dispose()
+
+    @property
+    def notes(self) -> list[str]:
+        """Describe the damaged rows that were found since the store was opened."""
+        if not (n := self.damaged.total()):
+            return []
+        tables = ", ".join(f"{n} of {name}" for name, n in sorted(self.damaged.items()))
+        return [
+            f"the store {self._shown} had {n} damaged rows ({tables}): they were left out, and "
+            "what a run computes is computed again; check the disk"
+        ]
 
     # Division of work among runs
 
@@ -264,16 +330,36 @@ class Store:
             self._claims.close()
             self._claims = None
 
+    @contextmanager
+    def alone(self) -> Iterator[None]:
+        """Do all that follows in one transaction; one run on the store at a time does so.
+
+        It ends with the process: another run goes on where the transaction began.
+        """
+        with self._begin() as connection:
+            if self.is_divided:
+                number = sql.cast(_lock_number(_ALONE), sql.BigInteger)
+                lock = sql.func.pg_try_advisory_xact_lock(number)
+                while not connection.scalar(sql.select(lock)):
+                    time.sleep(constants.OTHERS_POLL_S)
+            else:
+                connection.exec_driver_sql("BEGIN IMMEDIATE")
+            self._alone = connection
+            try:
+                yield
+            finally:
+                self._alone = None
+
     # Logs
 
     def digests(self, keys: Iterable[str]) -> dict[str, str]:
         """Fetch the digests of the content of those files that are known by their keys."""
-        return {row.key: row.digest for row in self._of_keys(_HASHED, _HASHED.c.digest, keys)}
+        return {key: content.decode() for key, content in self._of_keys(_HASHED, keys)}
 
     def put_digests(self, digests: Mapping[str, str]) -> None:
         """Store digests of the content of files."""
         with self._begin() as connection:
-            rows = [{"key": key, "digest": digest} for key, digest in digests.items()]
+            rows = [{"key": key, "content": digest.encode()} for key, digest in digests.items()]
             self._put_rows(connection, _HASHED, rows)
 
     def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
@@ -284,64 +370,59 @@ class Store:
 
     def packed_identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Fetch the same as bytes, for `unpack_or_none` in a worker."""
-        for row in self._of_keys(_IDENTIFIED, _IDENTIFIED.c.content, keys):
-            if (content := _unsealed(row.content, row.key)) is not None:
-                yield row.key, content
+        yield from self._of_keys(_IDENTIFIED, keys)
 
     def put_identified(self, rows: Iterable[OutcomeRow]) -> None:
         """Store outcomes of logs in one transaction."""
-        whole = [
-            row._asdict() | {"content": _sealed(row.content, row.key), "version": VERSION}
-            for row in rows
-        ]
+        whole = [row._asdict() | {"version": VERSION} for row in rows]
         with self._begin() as connection:
             self._put_rows(connection, _IDENTIFIED, whole)
 
     # Machines
 
     def has_assessment(self, machine: str, key: str) -> bool:
-        """Return whether a machine has an assessment under a key."""
-        return self._of_assessment(sql.literal(True), machine, key) is not None
+        """Return whether a machine has an undamaged assessment under a key."""
+        return bool(self._intact(_ASSESSED, machine=_id(machine), key=key))
 
     def assessment(self, machine: str, key: str) -> bytes | None:
         """Fetch a packed assessment; None where it is not stored."""
-        return _unsealed(self._of_assessment(_ASSESSED.c.content, machine, key), machine, key)
+        return self._record(_ASSESSED, "content", machine=_id(machine), key=key)
 
     def evidence(self, machine: str, key: str) -> bytes | None:
         """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
-        return _unsealed(self._of_assessment(_ASSESSED.c.evidence, machine, key), machine, key)
+        return self._record(_ASSESSED, "evidence", machine=_id(machine), key=key)
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine, and its parts in place of those stored before."""
         own, parts = _id(machine), made.parts
-        row = {
-            name: _sealed(getattr(made, name), machine, key)
-            for name in ("content", "evidence", "summary")
-        }
+        contents = {name: getattr(made, name) for name in ("content", "evidence", "summary")}
         with self._begin() as connection:
-            connection.execute(self._upsert(_ASSESSED, {"machine": own, "key": key} | row))
+            self._put_rows(connection, _ASSESSED, [{"machine": own, "key": key} | contents])
             if parts is None:
                 return
             of_this = _PARTS.c.machine == own
             connection.execute(sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(parts))))
-            self._put_rows(connection, _PARTS, [_part(machine, *part) for part in parts.items()])
+            rows = [{"machine": own, "key": k, "content": part} for k, part in parts.items()]
+            self._put_rows(connection, _PARTS, rows)
 
     def put_part(self, machine: str, key: str, content: bytes) -> None:
         """Store one more part of the last assessment of a machine."""
-        self._put(_PARTS, _part(machine, key, content))
+        self._put(_PARTS, machine=_id(machine), key=key, content=content)
 
     def part(self, machine: str, key: str) -> bytes | None:
         """Fetch a part of the last assessment of a machine; None where it is not stored."""
-        where = _PARTS.c.machine == _id(machine), _PARTS.c.key == key
-        return _unsealed(self._first(sql.select(_PARTS.c.content).where(*where)), machine, key)
+        return self._record(_PARTS, "content", machine=_id(machine), key=key)
 
-    def parts(self, machine: str) -> dict[str, bytes]:
-        """Fetch the parts of the last assessment of a machine by key."""
-        query = sql.select(_PARTS.c.key, _PARTS.c.content).where(_PARTS.c.machine == _id(machine))
-        with self._begin() as connection:
-            rows = connection.execute(query).all()
-        found = {row.key: _unsealed(row.content, machine, row.key) for row in rows}
-        return {key: content for key, content in found.items() if content is not None}
+    def parts(self, machine: str, key: str = "") -> dict[str, bytes]:
+        """Fetch the parts of the last assessment of a machine, for the next one, by their keys.
+
+        There are none for one that was lost: from its own parts it would have other draws.
+        """
+        content = self._record(_PRESENT, "content", machine=_id(machine))
+        present: Published | None = unpack_or_none(content, Published)
+        if present is not None and key in present.kept:
+            return {}
+        return {key: part for (_, key), (part,) in self._intact(_PARTS, machine=_id(machine))}
 
     def put_points(self, machine: str, points: Iterable[dict[str, Any]]) -> None:
         """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
@@ -377,7 +458,7 @@ class Store:
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
-        self._put(_REFUSED, {"key": key, "content": _sealed(pack(refused), key)})
+        self._put(_REFUSED, key=key, content=pack(refused))
         return key
 
     def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
@@ -387,98 +468,152 @@ class Store:
         ``refused`` is that of the list of logs that belong to no machine.
         """
         own, key, stored = _id(machine), keys[0], _ASSESSED.c
-        present = {"machine": own, "name": machine, "key": key, "refused": refused}
-        newest = sql.func.coalesce(sql.func.max(_REPORTED.c.number), 0)
-        summary: dict[str, Any] = {"machine": sql.literal(own), "key": sql.literal(key)}
-        summary["number"] = sql.select(newest + 1).scalar_subquery()
-        summary["content"] = stored.summary
+        present = pack(Published(machine, key, refused, tuple(keys)))
+        summary = self._record(_ASSESSED, "summary", machine=own, key=key)
+        number = 1 + max((one.number for _, one in self._summarised(machine)), default=0)
         others = sql.delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
         with self._begin() as connection:
-            connection.execute(self._upsert(_PRESENT, present))
-            of_this = (stored.machine == own) & (stored.key == key)
-            connection.execute(self._upsert(_REPORTED, summary, where=of_this))
+            self._put_rows(connection, _PRESENT, [{"machine": own, "content": present}])
+            if summary is not None:
+                content = pack(_Summarised(number, summary))
+                row = {"machine": own, "key": key, "content": content}
+                self._put_rows(connection, _SUMMARIES, [row])
             connection.execute(others)
 
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
-        query = (
-            sql.select(_REPORTED.c.key, _REPORTED.c.content)
-            .where(_REPORTED.c.machine == _id(machine), _REPORTED.c.key != key)
-            .order_by(_REPORTED.c.number.desc())
-        )
-        with self._begin() as connection:
-            summaries = (
-                unpack_or_none(_unsealed(row.content, machine, row.key), Summary)
-                for row in connection.execute(query)
-            )
-            return next((summary for summary in summaries if summary is not None), None)
+        others = [one for own, one in self._summarised(machine) if own != key]
+        newest_first = sorted(others, key=lambda one: one.number, reverse=True)
+        summaries = (unpack_or_none(one.summary, Summary) for one in newest_first)
+        return next((summary for summary in summaries if summary is not None), None)
+
+    def _summarised(self, machine: str) -> list[tuple[str, _Summarised]]:
+        """Fetch the summaries of all published assessments of a machine, with their keys."""
+        rows = self._intact(_SUMMARIES, machine=_id(machine))
+        found = ((key, unpack_or_none(content, _Summarised)) for (_, key), (content,) in rows)
+        return [(key, one) for key, one in found if one is not None]
 
     def published(self) -> tuple[Published, ...]:
         """List the published assessments of all machines by name; `StoreError` if none is."""
-        query = sql.select(_PRESENT.c.name, _PRESENT.c.key, _PRESENT.c.refused)
-        with self._begin() as connection:
-            rows = connection.execute(query).all()
-        if not rows:
-            raise self._unfilled("no assessment")
-        return tuple(sorted((Published(*row) for row in rows), key=lambda one: one.machine))
+        found = [unpack_or_none(content, Published) for _, (content,) in self._intact(_PRESENT)]
+        present: list[Published] = [one for one in found if one is not None]
+        if not present:
+            raise self.unfilled("no assessment")
+        return tuple(sorted(present, key=lambda one: one.machine))
 
     def refused(self, keys: Iterable[str]) -> tuple[Refusal, ...]:
         """Fetch lists of logs that belong to no machine, each refusal once."""
         found: dict[Refusal, None] = {}
         for key in dict.fromkeys(keys):
-            content = self._first(sql.select(_REFUSED.c.content).where(_REFUSED.c.key == key))
-            listed = unpack_or_none(_unsealed(content, key), tuple[Refusal, ...])
-            found |= dict.fromkeys(listed or ())
+            content = self._record(_REFUSED, "content", key=key)
+            found |= dict.fromkeys(unpack_or_none(content, tuple[Refusal, ...]) or ())
         return tuple(found)
+
+    # Alerts
+
+    def announced(self) -> dict[str, Announced]:
+        """Fetch what was announced of each machine last."""
+        found = [unpack_or_none(content, Announced) for _, (content,) in self._intact(_ANNOUNCED)]
+        return {one.status.stage: one for one in found if one is not None}
+
+    def put_announced(self, announced: Iterable[Announced]) -> None:
+        """Store what was announced of machines."""
+        stages = [(one.status.stage, pack(one)) for one in announced]
+        rows = [{"machine": _id(m), "name": m, "content": content} for m, content in stages]
+        with self._begin() as connection:
+            self._put_rows(connection, _ANNOUNCED, rows)
+
+    def unsent(self) -> list[Unsent]:
+        """Fetch the changes that are to be delivered, the oldest first."""
+        found = [unpack_or_none(content, Unsent) for _, (content,) in self._intact(_UNSENT)]
+        unsent: list[Unsent] = [one for one in found if one is not None]
+        return sorted(unsent, key=lambda one: (one.number, one.change.stage))
+
+    def put_unsent(self, unsent: Iterable[Unsent]) -> None:
+        """Store changes that are to be delivered."""
+        rows = [_unsent_keys(one) | {"content": pack(one)} for one in unsent]
+        with self._begin() as connection:
+            self._put_rows(connection, _UNSENT, rows)
+
+    def remove_unsent(self, sent: Iterable[Unsent]) -> None:
+        """Remove changes that were delivered."""
+        with self._begin() as connection:
+            for one in sent:
+                connection.execute(sql.delete(_UNSENT).filter_by(**_unsent_keys(one)))
 
     # Statements
 
-    def _of_keys(self, table: sql.Table, column: Any, keys: Iterable[str]) -> Iterator[Any]:
-        """Fetch a column of the rows that are there under keys, some rows in each query."""
+    def _of_keys(self, table: sql.Table, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Fetch the records that are there under keys, some rows in each query."""
         asked = list(dict.fromkeys(keys))
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
             part = asked[first : first + constants.ROWS_PER_QUERY]
-            query = sql.select(table.c.key, column).where(table.c.key.in_(part))
+            yield from ((key, content) for (key,), (content,) in self._intact(table, key=part))
+
+    def _record(self, table: sql.Table, column: str, **keys: str) -> bytes | None:
+        """Fetch one record; None where there is none, or it is damaged."""
+        return next((content for _, (content,) in self._intact(table, column, **keys)), None)
+
+    def _intact(
+        self, table: sql.Table, *columns: str, **keys: str | Sequence[str]
+    ) -> list[tuple[tuple[str, ...], tuple[bytes, ...]]]:
+        """Fetch keys and records of rows, by default all records of each.
+
+        Rows of which a record is damaged are removed and counted.
+        """
+        named = columns or [one.name for one in table.columns if isinstance(one.type, _Bytes)]
+        query = sql.select(*table.primary_key.columns, *(table.c[name] for name in named))
+        for name, key in keys.items():
+            one = table.c[name]
+            query = query.where(one == key if isinstance(key, str) else one.in_(key))
+        with self._begin() as connection:
+            rows = [tuple(row) for row in connection.execute(query)]
+        found, n = list[tuple[tuple[str, ...], tuple[bytes, ...]]](), len(table.primary_key)
+        for row in rows:
+            opened = [
+                _unsealed(one, name, *row[:n]) for name, one in zip(named, row[n:], strict=True)
+            ]
+            records = tuple(record for record in opened if record is not None)
+            if len(records) == len(named):
+                found.append((row[:n], records))
+            else:
+                self._remove_damaged(table, row[:n])
+        return found
+
+    def _remove_damaged(self, table: sql.Table, keys: tuple[Any, ...]) -> None:
+        name = table.name.rpartition("_")[0]
+        self.damaged[name] += 1
+        _logger.warning("damaged row of %s in the store %s", name, self._shown)
+        if self._writes:
+            columns = zip(table.primary_key.columns, keys, strict=True)
             with self._begin() as connection:
-                rows = connection.execute(query).all()
-            yield from rows
+                connection.execute(sql.delete(table).where(*(one == key for one, key in columns)))
 
-    def _of_assessment(self, column: Any, machine: str, key: str) -> Any:
-        where = _ASSESSED.c.machine == _id(machine), _ASSESSED.c.key == key
-        return self._first(sql.select(column).where(*where))
-
-    def _first(self, query: Any) -> Any:
-        """Fetch the first value of a query; None if there is none."""
+    def _put(self, table: sql.Table, **row: Any) -> None:
         with self._begin() as connection:
-            return connection.scalars(query).first()
-
-    def _put(self, table: sql.Table, row: dict[str, Any]) -> None:
-        with self._begin() as connection:
-            connection.execute(self._upsert(table, row))
+            self._put_rows(connection, table, [row])
 
     def _put_rows(
         self, connection: Connection, table: sql.Table, rows: Sequence[dict[str, Any]]
     ) -> None:
-        """Write rows in one statement."""
-        if rows:
-            connection.execute(self._upsert(table, rows[0]), rows)
-
-    def _upsert(self, table: sql.Table, row: dict[str, Any], *, where: Any = None) -> Any:
-        """Insert or update a row, of another table with ``where``: a later write replaces it."""
-        insert = _INSERT[self._engine.dialect.name](table)
-        if where is None:
-            insert = insert.values(row)
-        else:
-            insert = insert.from_select(list(row), sql.select(*row.values()).where(where))
+        """Write rows, their records sealed, in one statement; later writes replace them."""
+        if not rows:
+            return
+        insert = _INSERT[self._engine.dialect.name](table).values(rows[0])
         keys = [column.name for column in table.primary_key]
-        rest = {name: insert.excluded[name] for name in row if name not in keys}
-        return insert.on_conflict_do_update(index_elements=keys, set_=rest)
+        rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
+        upsert = insert.on_conflict_do_update(index_elements=keys, set_=rest)
+        connection.execute(upsert, [_sealed(row, keys) for row in rows])
 
     @contextmanager
     def _begin(self) -> Iterator[Connection]:
-        """Open a transaction."""
-        with self._faults(), self._engine.begin() as connection:
-            yield connection
+        """Open a transaction, or go on with that of `alone`."""
+        with self._faults():
+            if self._alone is not None:
+                yield self._alone
+            else:
+                with self._engine.begin() as connection:
+                    yield connection
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -486,9 +621,11 @@ class Store:
         try:
             yield
         except SQLAlchemyError as error:
-            why = f"{_reason(error, self._address)}; its results are kept, run again to continue"
+            why = _reason(error, self._address)
+            step = _next_step(error, self._address)
+            step = step or "its results are kept, run again to continue"
             # The cause would quote the row.
-            raise StoreError(f"the store {self._shown} failed: {why}") from None
+            raise StoreError(f"the store {self._shown} failed: {why}; {step}") from None
 
 
 def _lock_number(key: str) -> int:
@@ -509,31 +646,41 @@ def _named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
     ]
 
 
-def _sealed(content: bytes, *keys: str) -> bytes:
-    """Prefix a record with a digest of it and of its keys.
+def _sealed(row: dict[str, Any], keys: Sequence[str]) -> dict[str, Any]:
+    """Prefix every record of a row with a digest of it, of its column and of the keys.
 
     A damaged index of SQLite leads to the record of another key, which is intact by itself.
     """
-    return _digest(content, keys) + content
+    own = [row[key] for key in keys]
+    return {
+        name: _seal(value, name, *own) + value if isinstance(value, bytes) else value
+        for name, value in row.items()
+    }
 
 
-def _unsealed(stored: bytes | None, *keys: str) -> bytes | None:
-    """Return the record that was stored under these keys; None for none or a damaged one."""
-    if stored is None:
+def _unsealed(stored: Any, *place: Any) -> bytes | None:
+    """Return the record that was stored in a column under keys; None for a damaged one."""
+    if isinstance(stored, memoryview):  # of psycopg2
+        stored = bytes(stored)
+    if not isinstance(stored, bytes):
         return None
-    digest, content = stored[:_DIGEST_BYTES], stored[_DIGEST_BYTES:]
-    return content if digest == _digest(content, keys) else None
+    seal, content = stored[:_SEAL_BYTES], stored[_SEAL_BYTES:]
+    return content if seal == _seal(content, *place) else None
 
 
-def _digest(content: bytes, keys: tuple[str, ...]) -> bytes:
-    subject = "\0".join(keys).encode("utf-8", "surrogatepass")
+def _seal(content: bytes, *place: Any) -> bytes:
+    subject = "\0".join(map(str, place)).encode("utf-8", "surrogatepass")
     return hashlib.blake2b(
-        content, digest_size=_DIGEST_BYTES, key=hashlib.sha256(subject).digest()
+        content, digest_size=_SEAL_BYTES, key=hashlib.sha256(subject).digest()
     ).digest()
 
 
-def _part(machine: str, key: str, content: bytes) -> dict[str, Any]:
-    return {"machine": _id(machine), "key": key, "content": _sealed(content, machine, key)}
+def _unsent_keys(one: Unsent) -> dict[str, str]:
+    return {
+        "machine": _id(one.change.stage),
+        "key": fingerprint(one.change),
+        "channel": one.channel,
+    }
 
 
 # Databases
@@ -555,7 +702,8 @@ def _connect(url: str | URL, *, create: bool) -> tuple[Engine, str]:
     except (SQLAlchemyError, ImportError, TypeError, ValueError) as error:
         if engine is not None:
             engine.dispose()
-        reason = _reason(error, address)
+        step = _next_step(error, address)
+        reason = _reason(error, address) + (f"; {step}" if step else "")
         # The cause would be printed with it, and quotes passwords.
         raise StoreError(f"cannot open the store {shown_address(address)}: {reason}") from None
 
@@ -582,7 +730,8 @@ def _engine(url: URL, *, create: bool) -> Engine:
         if not is_uri and not Path(name).exists():
             raise ValueError("there is no such file; `lmshealth run LOGS --store URL` makes it")
         path = name if is_uri else f"file:{quote(name)}"
-        url = url.set(database=path).update_query_dict({"mode": "rw", "uri": "true"})
+        how = {"mode": "rw", "uri": "true"} | ({} if is_uri else _unwritable(Path(name)))
+        url = url.set(database=path).update_query_dict(how)
     engine = sql.create_engine(url, connect_args={"timeout": constants.SQLITE_BUSY_TIMEOUT_S})
 
     @sql.event.listens_for(engine, "connect")
@@ -593,8 +742,22 @@ def _engine(url: URL, *, create: bool) -> Engine:
             if create:
                 connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
+        # A damaged key is another key, and no error of the whole query.
+        connection.text_factory = lambda text: text.decode("utf-8", "replace")
 
     return engine
+
+
+def _unwritable(path: Path) -> dict[str, str]:
+    """Return options that open a file of SQLite whose folder, or itself, is read-only.
+
+    SQLite makes files beside it to read one in WAL mode. None are needed where no run has it open,
+    and none has left results in its ``-wal``.
+    """
+    if all(os.access(one, os.W_OK) for one in (path, path.absolute().parent)):
+        return {}
+    is_used = path.with_name(path.name + "-wal").exists()
+    return {"mode": "ro"} | ({} if is_used else {"immutable": "1"})
 
 
 def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, Any]) -> Any:
@@ -653,7 +816,7 @@ def _carry_over(connection: Connection, table: sql.Table, existing: set[str]) ->
     name, _, number = table.name.rpartition("_")
     found = (re.fullmatch(rf"{name}_(\d+)", other) for other in existing)
     older = max((n for one in found if one and (n := int(one[1])) < int(number)), default=None)
-    if table not in (_REPORTED, _POINTS, _CHANGES) or older is None:
+    if table not in _CARRIED or older is None:
         return
     there = {column["name"] for column in sql.inspect(connection).get_columns(f"{name}_{older}")}
     columns = [column for column in table.columns if column.name in there]
@@ -679,6 +842,32 @@ def _create_views(connection: Connection) -> None:
         columns = ", ".join("name AS stage" if name == "name" else name for name in names)
         create = _CREATE_VIEW[connection.dialect.name]
         connection.execute(sql.text(f"{create} {name} AS SELECT {columns} FROM {table.name}"))
+
+
+# SQLite (beginning of its codes): faults of the computer, another process or its rights.
+_PASSING = ("FULL", "BUSY", "LOCKED", "IOERR", "NOMEM", "INTERRUPT", "PROTOCOL", "PERM", "AUTH")
+_COST = (
+    "the next run then identifies all logs and assesses all machines again; comparisons with "
+    "earlier reports, earlier runs on dashboards and alerts that were not sent are lost"
+)
+
+
+def _next_step(error: Exception, address: str) -> str:
+    """Return what to do about a database that is damaged or cannot be written to, else nothing."""
+    if (origin := getattr(error, "orig", None)) is None:
+        return ""
+    file = make_url(address).database
+    code = getattr(origin, "sqlite_errorname", "").removeprefix("SQLITE_")
+    if str(getattr(origin, "sqlstate", "")) in ("XX001", "XX002"):  # damaged data, damaged index
+        tables = f"the tables *_{constants.SCHEMA} of lmshealth"
+        return f"restore the database from a backup, or drop {tables} in it: {_COST}"
+    if code.startswith(("READONLY", "CANTOPEN")):
+        return f"copy {file} and {file}-wal, where there is one, to a folder that can be written to"
+    if code == "NOTADB":
+        return f"give another file by --store; if it was a store, delete it: {_COST}"
+    if code and not code.startswith(_PASSING):
+        return f"it is damaged: delete {file}, and {file}-wal and -shm where they are: {_COST}"
+    return ""
 
 
 def _reason(error: Exception, address: str) -> str:

@@ -62,13 +62,15 @@ def _settings(given: dict[str, Any]) -> Settings:
 
 def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
-    names = ["n_logs", "n_refused", "n_remembered", "n_unread", "failed", "unsent", "changes"]
+    counts = ["n_logs", "n_refused", "n_remembered", "n_unlisted", "n_unread"]
+    names = [*counts, "failed", "unsent", "notes", "changes"]
     head = {"schema": constants.JSON_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 
 def _errors(result: RunResult) -> list[str]:
-    return [f"{name}: {why}" for name, why in (*result.failed.items(), *result.unsent.items())]
+    failed = (*result.failed.items(), *result.unsent.items())
+    return [*result.notes, *(f"{name}: {why}" for name, why in failed)]
 
 
 @options.command(
@@ -93,6 +95,8 @@ def run(
         used = result.n_logs - result.n_refused
         again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
         click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
+        if result.n_unlisted:
+            click.echo(f"{result.n_unlisted} logs are not listed in manifest.csv: see refused.csv.")
         if result.n_unread:
             click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
         views.print_summaries(result.rows)
@@ -104,7 +108,7 @@ def run(
     terminal.print_errors(_errors(result))
     if pdf:
         write_pdfs(result.pages)
-    some = result.n_refused or result.n_unread or result.failed
+    some = result.n_refused or result.n_unlisted or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
 
 
@@ -137,7 +141,8 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             terminal.print_json(_document(result), indent=-1)
         else:
             used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
-            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run")
+            more = f", {result.n_unlisted} not in manifest.csv" if result.n_unlisted else ""
+            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run{more}")
             for change in result.changes:
                 click.echo(f"{now}{plain(str(change))}")
         terminal.print_errors(now + error for error in _errors(result))
@@ -162,7 +167,7 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     click.echo(f"Report: {result.index}")
-    terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
+    terminal.print_errors(_errors(result))
     if pdf:
         write_pdfs(result.pages)
-    ctx.exit(options.SOME_REFUSED if result.failed else 0)
+    ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)

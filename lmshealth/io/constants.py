@@ -78,6 +78,17 @@ LONGEST_REACH = 0.02
 """Longest distance in s to either side of that difference: the set point of a stroke changes in
 it."""
 
+# Files of folders
+
+SAMPLED_BYTES = 1 << 16
+"""Beginning of a file that decides whether it holds samples: headers of exports are shorter."""
+SAMPLED_ROWS, SAMPLED_ROWS_CUT = 100, 20
+"""Rows of numbers at the end of that beginning which make a file a log: where it ends there, and
+where it goes on, because rows of many channels are long. A log of 1 s has more; tables of settings,
+sensors and results beside logs have fewer."""
+BACKUPS = ("~", ".bak", ".old", ".orig", ".tmp", ".part", ".filepart", ".crdownload")
+"""Ends of names of copies that editors and transfers make: they are no further logs."""
+
 # Metadata
 
 LONGEST_NAME = 200

@@ -3,13 +3,14 @@
 import os
 import stat
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
 from lmshealth._files import escapes
 from lmshealth.errors import BadLog, BadTable
-from lmshealth.io.formats.registry import is_log
+from lmshealth.io import constants
+from lmshealth.io.formats.registry import format_of, holds_samples, is_log
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import KEYS
 from lmshealth.io.refusal import Unusable, shown
@@ -31,16 +32,23 @@ class Manifest:
     """Rows of the manifests of a folder, by the absolute path of the log.
 
     ``rows`` are metadata without empty cells; ``refused`` manifests that cannot be read, and rows
-    that name no log of the folder; ``bad`` the fault of one of the rows of a log.
+    that name no log of the folder; ``bad`` the fault of one of the rows of a log. ``registers`` are
+    the folders of manifests that state machine and date of logs; others only correct some logs.
     """
 
     rows: dict[Path, dict[str, str]]
     refused: tuple[Refusal, ...]
     bad: dict[Path, str]
+    registers: set[Path] = field(default_factory=set)
 
     def names(self, log: Path) -> bool:
         """Return whether this log has a row."""
         return _absolute(log) in self.rows
+
+    def omits(self, log: Path) -> bool:
+        """Return whether this log has no row in a manifest that lists the logs of its folder."""
+        path = _absolute(log)
+        return path not in self.rows and not self.registers.isdisjoint(path.parents)
 
     def overrides(self, log: Path) -> dict[str, str]:
         """Return the metadata that override those of a log; empty for a log without a row.
@@ -53,14 +61,41 @@ class Manifest:
         return dict(self.rows.get(path, {}))
 
 
-def find_logs(folder: str | Path, *, follow_links: bool = False) -> FileList:
-    """Find the logs of a folder and its subfolders by their suffix; `BadTable` if it is none.
+def find_logs(
+    folder: str | Path, *, manifest: Manifest | None = None, follow_links: bool = False
+) -> FileList:
+    """Find the logs of a folder and its subfolders; `BadTable` if it is none.
 
-    Hidden files and folders are ignored. Symbolic links to files are followed as long as they
-    stay in the folder, and with ``follow_links`` wherever they lead; links to folders are not.
+    Logs are files with the suffix of a log, those that a manifest lists, and texts that hold
+    samples. Samples under a suffix that is not read are refused (``skipped``), and so are rows of
+    the manifest for files that are none of these (``bad-row``). Hidden files and folders are
+    ignored. Symbolic links to files are followed as long as they stay in the folder, and with
+    ``follow_links`` wherever they lead; links to folders are not.
     """
-    fits = lambda path: path.name not in NOT_LOGS and is_log(path)  # noqa: E731
-    return _find(Path(folder), fits, follow_links=follow_links)
+    root, listed = Path(folder), manifest.rows if manifest else {}
+    skipped = list[Path]()
+
+    def fits(path: Path) -> bool:
+        if path.name in NOT_LOGS:
+            return False
+        if is_log(path) or _absolute(path) in listed:
+            return True
+        if path.name.endswith(constants.BACKUPS) or _trouble(path, root, follow_links=follow_links):
+            return False
+        if not holds_samples(path):
+            return False
+        if format_of(path) is None:
+            skipped.append(path)
+        return format_of(path) is not None
+
+    found = _find(root, fits, follow_links=follow_links)
+    named = {refusal.log for refusal in found.refused} | {name_of(one, root) for one in found.logs}
+    detail = "holds samples, and its suffix is not read; rename it to .csv, or move it out"
+    refused = [Refusal(name_of(path, root), "skipped", detail) for path in skipped]
+    detail = "manifest.csv lists it, and a hidden file or a table is no log; rename it"
+    others = (_name_in(path, root) for path in sorted(listed) if path.is_file())
+    refused += [Refusal(name, "bad-row", detail) for name in others if name not in named]
+    return FileList(found.logs, (*found.refused, *refused))
 
 
 def find_sheets(folder: str | Path, name: str, *, follow_links: bool = False) -> FileList:
@@ -106,6 +141,11 @@ def _merged(root: Path, found: FileList, *, follow_links: bool = False) -> Manif
 def name_of(path: Path, folder: Path) -> str:
     """Name a file relative to the folder of logs, as printable text."""
     return shown(path.relative_to(folder).as_posix())
+
+
+def _name_in(path: Path, root: Path) -> str:
+    """Name an absolute path relative to the folder of logs."""
+    return name_of(path, _absolute(root))
 
 
 def _absolute(path: Path) -> Path:
@@ -171,6 +211,8 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         if trouble:
             manifest.bad[log] = f"{place}: {trouble}"
         if not os.path.isfile(log):
-            yield Refusal(shown(file), "missing-file", f"{place} names no file")
+            yield Refusal(_name_in(log, root), "missing-file", f"{place} names no file")
+    if any(row.keys() >= {"stage", "recorded_at"} for row in own.values()):
+        manifest.registers.add(_absolute(path.parent))
     for log, row in own.items():
         manifest.rows[log] = manifest.rows.get(log, {}) | row

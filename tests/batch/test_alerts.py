@@ -5,8 +5,11 @@ from __future__ import annotations
 import csv
 import json
 import os
+import sqlite3
 import sys
+import threading
 import time
+from contextlib import closing
 from dataclasses import replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -18,9 +21,9 @@ import pytest
 from lmshealth.batch import alerts as alerting
 from lmshealth.batch import constants, ingest, outputs
 from lmshealth.batch import run as running
-from lmshealth.batch.alerts import Alerts, read_fleet, run_command
+from lmshealth.batch.alerts import Alerts, run_command
 from lmshealth.batch.run import RunResult, Settings, run
-from lmshealth.batch.store import Identified
+from lmshealth.batch.store import Identified, Store
 from lmshealth.errors import NothingUsable
 from lmshealth.stage.description import Stage
 from studies.harness.servers import wait_until
@@ -75,6 +78,11 @@ class Nights:
         given = {"silent_days": 3.0, "command": self.command, **alerts}
         return run(self.logs, [self.stage], self.out, Settings(alerts=Alerts(**given)))
 
+    def statuses(self) -> list[dict[str, Any]]:
+        """Return what status.json has of each machine."""
+        found: list[dict[str, Any]] = json.loads((self.out / "status.json").read_text())["machines"]
+        return found
+
     def delivered(self) -> list[list[dict[str, str]]]:
         """Return the changes of each call of the command."""
         lines = self.sent.read_text().splitlines() if self.sent.exists() else []
@@ -126,7 +134,7 @@ def test_ten_nights_are_reported_once_each(nights: Nights) -> None:
     assert [[row["text"] for row in call] for call in nights.delivered()] == [
         [text] for text in expected.values()
     ]
-    states = {one.stage: one.device_health for one in read_fleet(nights.out).machines}
+    states = {one["stage"]: one["DeviceHealth"] for one in nights.statuses()}
     assert states == {"A": "NORMAL", "B": "OFF_SPEC", "C": "NORMAL", "D": "CHECK_FUNCTION"}
 
 
@@ -175,10 +183,6 @@ def test_each_way_of_delivery_has_changes_of_its_own(
     assert list(found.unsent) == ["--alert-command"]
     assert nights.run(N_BEFORE + 3, notify=True).unsent == {}
     assert calls == ["command", "notify", "command"]
-    # What is pending for an option that is no longer given is forgotten.
-    calls.clear()
-    nights.run(N_BEFORE + 3, command=())
-    assert calls == [] and read_fleet(nights.out).pending == {}
 
 
 def test_growing_files_are_left_to_a_later_run(nights: Nights) -> None:
@@ -259,10 +263,166 @@ def test_no_module_of_the_working_folder_is_run(
     assert "run from the folder" not in run_command(command, b'{"changes": []}')
 
 
-def test_a_status_that_cannot_be_read_counts_as_none(tmp_path: Path) -> None:
-    """Damaged, foreign or missing: the run goes on as the first one does."""
-    for content in (b"", b"{", b'{"machines": 3}'):
-        (tmp_path / alerting.FILE).write_bytes(content)
-        assert read_fleet(tmp_path).machines == ()
-    (tmp_path / alerting.FILE).unlink()
-    assert read_fleet(tmp_path).machines == ()
+def test_a_way_of_delivery_gets_what_runs_without_it_have_found(nights: Nights) -> None:
+    """What failed, and what a run by hand found, is sent once by the next run that has the way."""
+    fails = (sys.executable, "-c", "raise SystemExit(1)")
+    nights.run(N_BEFORE + 3, command=fails)
+    nights.add("A", N_BEFORE + 3)
+    assert len(nights.run(N_BEFORE + 3, command=()).changes) == 1  # by hand: A has a log again
+    nights.run(N_BEFORE + 3, command=())
+    assert nights.delivered() == []
+    nights.run(N_BEFORE + 3)
+    (call,) = nights.delivered()
+    assert [row["stage"] + row["what"] for row in call] == [f"{m}silent" for m in "ABCD"] + [
+        "Arecovered"
+    ]
+    nights.run(N_BEFORE + 3)
+    assert len(nights.delivered()) == 1
+
+
+def test_what_was_found_before_any_way_of_delivery_is_not_sent(nights: Nights) -> None:
+    """The first run with an option is no flood of all that earlier runs have listed."""
+    assert len(nights.run(N_BEFORE + 3, command=()).changes) == 4
+    nights.run(N_BEFORE + 4)
+    assert nights.delivered() == []
+
+
+def test_what_no_way_could_deliver_is_sent_by_another(
+    nights: Nights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A messenger that is asked for the first time gets what the command could not deliver."""
+    calls = list[str]()
+
+    def deliver(command: tuple[str, ...], content: bytes) -> str:
+        calls.append("notify" if "-P" in command else "command")
+        assert len(json.loads(content)["changes"]) == 4
+        return "" if "-P" in command else "fails"
+
+    monkeypatch.setattr(alerting, "run_command", deliver)
+    nights.run(N_BEFORE + 3)
+    nights.run(N_BEFORE + 3, command=(), notify=True)
+    nights.run(N_BEFORE + 3, command=(), notify=True)
+    assert calls == ["command", "notify"]
+
+
+def test_two_runs_at_once_deliver_once(nights: Nights, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Changes that another run has found and delivers are neither found nor delivered again."""
+    deliver, delivering, ends = alerting.run_command, threading.Event(), list[RunResult]()
+
+    def slow(command: tuple[str, ...], content: bytes) -> str:
+        delivering.set()
+        time.sleep(0.5)
+        return deliver(command, content)
+
+    monkeypatch.setattr(alerting, "run_command", slow)
+    first = threading.Thread(target=lambda: ends.append(nights.run(N_BEFORE + 3)))
+    first.start()
+    assert delivering.wait(60)
+    second = nights.run(N_BEFORE + 3)
+    first.join()
+    assert (len(ends[0].changes), second.changes, len(nights.delivered())) == (4, (), 1)
+
+
+def test_a_run_of_older_logs_that_ends_later_changes_nothing(
+    nights: Nights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A long run beside a short one of later logs takes back neither alarm nor status."""
+    nights.run(N_BEFORE)
+    whole = running.announce
+    for day in range(N_BEFORE, 12):
+        nights.add("B", day, -0.03)
+    found = nights.run(12)
+    assert "B: alarm roll" in [str(one) for one in found.changes]
+    before = nights.statuses()
+    for path in nights.logs.glob("B-*.csv"):
+        if int(path.stem[2:]) >= N_BEFORE:
+            path.unlink()
+    monkeypatch.setattr(
+        running, "announce", lambda *given: whole(*given[:-1], given[-1]._replace(began=0))
+    )
+    found = nights.run(12)
+    assert (found.changes, nights.statuses()) == ((), before)
+
+
+def test_a_status_that_cannot_be_read_is_noted_and_repeats_nothing(nights: Nights) -> None:
+    """The store has what was announced; without both, what is bad is announced again."""
+    nights.run(N_BEFORE + 3)
+    whole = (nights.out / "status.json").read_bytes()
+    for content in (b"", whole[: len(whole) // 2], b'{"machines": 3}'):
+        (nights.out / "status.json").write_bytes(content)
+        found = nights.run(N_BEFORE + 3)
+        assert (found.changes, len(found.notes)) == ((), 1)
+        assert "status.json cannot be read" in found.notes[0]
+        assert (nights.out / "status.json").read_bytes() == whole
+    (nights.out / "lmshealth.sqlite").unlink()
+    assert (nights.run(N_BEFORE + 3).changes, len(nights.delivered())) == ((), 1)
+    (nights.out / "lmshealth.sqlite").unlink()
+    (nights.out / "status.json").write_bytes(b"{")
+    found = nights.run(N_BEFORE + 3)
+    assert len(found.changes) == 4 and "announced again" in found.notes[0]
+
+
+@pytest.mark.parametrize("table", ["announced", "unsent"])
+def test_damage_of_what_was_announced_announces_it_again(nights: Nights, table: str) -> None:
+    """A damaged row costs a second message about its machine, and no first one."""
+    fails = (sys.executable, "-c", "raise SystemExit(1)")
+    nights.run(N_BEFORE + 3, command=fails if table == "unsent" else nights.command)
+    name = f"{table}_{constants.SCHEMA}"
+    with closing(sqlite3.connect(nights.out / "lmshealth.sqlite")) as file, file:
+        (rowid,) = file.execute(f"SELECT min(rowid) FROM {name}").fetchone()
+        file.execute(f"UPDATE {name} SET content = x'00' WHERE rowid = ?", (rowid,))
+    found = nights.run(N_BEFORE + 3)
+    assert "1 damaged rows" in found.notes[0] and table in found.notes[0]
+    assert {row["stage"] for call in nights.delivered() for row in call} == set("ABCD")
+    assert nights.run(N_BEFORE + 3).notes == ()
+
+
+def test_a_run_that_ends_while_it_delivers_delivers_again(nights: Nights) -> None:
+    """A run that is killed between delivery and its record leaves the changes to the next run."""
+
+    class Killed(BaseException):
+        pass
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Store, "remove_unsent", lambda *_: (_ for _ in ()).throw(Killed()))
+        with pytest.raises(Killed):
+            nights.run(N_BEFORE + 3)
+    nights.run(N_BEFORE + 3)
+    first, second = nights.delivered()
+    assert first == second and len(first) == 4
+
+
+def test_a_run_whose_tables_cannot_be_written_has_announced_nothing(
+    nights: Nights, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a full disk changes are not lost: the next run finds them."""
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(running, "write_tables", full)
+        with pytest.raises(OSError, match="space"):
+            nights.run(N_BEFORE + 3)
+    assert len(nights.run(N_BEFORE + 3).changes) == 4 and len(nights.delivered()) == 1
+
+
+def test_a_clock_that_is_set_back_changes_nothing(nights: Nights) -> None:
+    """A machine that was silent is silent until its next log, and is reported once."""
+    nights.run(N_BEFORE + 3)
+    assert nights.run(N_BEFORE - 1).changes == nights.run(N_BEFORE + 4).changes == ()
+    assert len(nights.delivered()) == 1
+
+
+def test_the_output_of_a_command_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A command may print without end: its last line is a message, and memory stays as it is."""
+    block = "import os\nfor _ in range({}): os.write(1, b'x' * 1_000_000)\n"
+    write = block + "os.write(1, b'\\nend\\n'); {}"
+    resource = pytest.importorskip("resource", reason="Windows does not report memory so")
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    command = (sys.executable, "-c", write.format(200, "raise SystemExit(2)"))
+    assert run_command(command, b"") == "ended with status 2: end"
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 20_000  # kB
+    monkeypatch.setattr(constants, "ALERT_TIMEOUT_S", 0.5)
+    command = (sys.executable, "-c", write.format(10**9, ""))
+    assert "took longer" in run_command(command, b"")

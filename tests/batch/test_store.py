@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from sqlalchemy import Engine, create_engine, event, text
+from sqlalchemy.exc import OperationalError
 
 from lmshealth._serialize import pack
 from lmshealth.batch import constants
@@ -26,11 +27,13 @@ from lmshealth.batch import store as store_module
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.status import Change, Status, compare, make_status, points
 from lmshealth.batch.store import (
+    Announced,
     Identified,
     Outcome,
     OutcomeRow,
     Store,
     StoreError,
+    Unsent,
     default_url,
     unpack_or_none,
 )
@@ -311,12 +314,147 @@ def test_a_damaged_store_is_named(file_url: str, tmp_path: Path) -> None:
     data = bytearray(path.read_bytes())
     data[4096:] = b"\xff" * (len(data) - 4096)
     path.write_bytes(bytes(data))
-    with pytest.raises(StoreError, match=r"store\.sqlite"):
+    with pytest.raises(StoreError, match=r"store\.sqlite") as refusal:
         damaged = Store(file_url)
         try:
             got_from(damaged, "k7", "a.h5")
         finally:
             damaged.close()
+    assert f"delete {path}" in str(refusal.value)
+    assert "all logs" in str(refusal.value) and "run again to continue" not in str(refusal.value)
+
+
+def test_columns_that_a_damaged_file_lacks_are_damage(file_url: str, tmp_path: Path) -> None:
+    """Any fault of the file is one that no further run heals; a full disk is none of the file."""
+    Store(file_url).close()
+    path = tmp_path / "store.sqlite"
+    with closing(sqlite3.connect(path)) as file, file:
+        file.execute(f"ALTER TABLE hashed_{SCHEMA} RENAME COLUMN content TO contens")
+    with closing(Store(file_url)) as store, pytest.raises(StoreError, match="delete"):
+        store.digests(["k"])
+    full = sqlite3.OperationalError("database or disk is full")
+    full.sqlite_errorname = "SQLITE_FULL"  # type: ignore[misc]
+    store = Store(file_url)
+    with closing(store), pytest.raises(StoreError) as refusal, store._begin():
+        raise OperationalError("", {}, full)
+    assert "run again to continue" in str(refusal.value) and "delete" not in str(refusal.value)
+
+
+def fill(store: Store, folder: Path) -> dict[str, Callable[[], bool]]:
+    """Write a row of each kind; return by table whether the row can be fetched."""
+    assessment = worn(folder)
+    status = make_status(assessment, summarise(assessment, assessment.service()))
+    change = Change("A", "alarm", "", "roll", status.recorded_at)
+    put_in(store, "k", reading())
+    store.put_digests({"k": "0" * 64})
+    keep(store, "A", "k1", assessment)
+    store.put_part("A", "p", b"part")
+    store.put_announced([Announced(status, "/logs", (), 1)])
+    store.put_unsent([Unsent(change, "--notify", 1)])
+    key = store.put_refused((Refusal("a", "gap", ""),))
+    return {
+        "hashed": lambda: bool(store.digests(["k"])),
+        "identified": lambda: got_from(store, "k", "a.h5") is not None,
+        "assessed": lambda: store.has_assessment("A", "k1"),
+        "parts": lambda: store.part("A", "p") is not None,
+        "summaries": lambda: store.previous_summary("A", "k2") is not None,
+        "refused": lambda: bool(store.refused([key])),
+        "announced": lambda: bool(store.announced()),
+        "unsent": lambda: bool(store.unsent()),
+    }
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["content", "key", "kind"])
+def test_a_damaged_row_is_removed_and_counted(url: str, tmp_path: Path, damage: str) -> None:
+    """Of every kind: the record, a key, or (SQLite) a number in place of the record."""
+    if damage == "kind" and url.startswith("postgres"):
+        pytest.skip("PostgreSQL has no other type in a column")
+    with closing(Store(url)) as store:
+        found = fill(store, tmp_path)
+        assert all(ask() for ask in found.values()) and store.notes == []
+        for name, ask in found.items():
+            table, *columns = f"{name}_{SCHEMA}", "content", "key", "machine"
+            keys = {column.name for column in store_module._METADATA.tables[table].primary_key}
+            column = next(one for one in columns if (one in keys) == (damage == "key"))
+            with store._begin() as connection:
+                rows = connection.execute(text(f"SELECT {column} FROM {table}")).scalars().all()
+                for row in rows:  # a key that is another one, as a damaged index leads to it
+                    other = row[:-1] + ("0" if row[-1] != "0" else "1") if damage == "key" else b"0"
+                    value = 10**12 if damage == "kind" else other
+                    update = text(f"UPDATE {table} SET {column} = :value WHERE {column} = :row")
+                    connection.execute(update, {"value": value, "row": row})
+            assert not ask(), name
+        n = store.damaged.total()
+        # Rows under another key are not fetched, except where all rows of a table are.
+        assert set(store.damaged) >= ({"announced", "unsent"} if damage == "key" else set(found))
+        assert f" {n} damaged rows" in store.notes[0]
+        assert not any(ask() for ask in found.values())
+        assert store.damaged.total() == n
+        assert all(ask() for ask in fill(store, tmp_path).values())
+
+
+def test_a_store_that_is_only_read_keeps_its_damage(file_url: str, tmp_path: Path) -> None:
+    """A report leaves a damaged row out, notes it, and changes nothing."""
+    with closing(Store(file_url)) as store:
+        fill(store, tmp_path)
+        with store._begin() as connection:
+            connection.execute(text(f"UPDATE present_{SCHEMA} SET content = x'00'"))
+    with closing(Store(file_url, create=False)) as store:
+        with pytest.raises(StoreError, match="no assessment"):
+            store.published()
+        assert "1 of present" in store.notes[0]
+        assert _ask(store, f"SELECT count(*) FROM present_{SCHEMA}") == [(1,)]
+
+
+def test_a_lost_assessment_is_made_from_nothing(file_url: str, tmp_path: Path) -> None:
+    """Its own parts would give it other draws; the next assessment uses them."""
+    with closing(Store(file_url)) as store:
+        keep(store, "A", "k1", worn(tmp_path))
+        store.put_part("A", "p", b"part")
+        assert store.parts("A", "k2") == {"p": b"part"}
+        assert store.parts("A", "k1") == {}
+
+
+def test_one_run_at_a_time_is_alone(url: str) -> None:
+    """Another one waits until the first has ended; one that fails leaves nothing behind."""
+    order = list[str]()
+    with closing(Store(url)) as first, closing(Store(url)) as second:
+
+        def wait() -> None:
+            with second.alone():
+                order.append("second")
+                assert second.digests(["k", "l"]) == {"k": "1"}
+
+        with ThreadPoolExecutor(1) as threads:
+            with first.alone():
+                waiting = threads.submit(wait)
+                first.put_digests({"k": "1"})
+                time.sleep(0.3)
+                order.append("first")
+            waiting.result()
+        assert order == ["first", "second"]
+        with pytest.raises(KeyboardInterrupt), first.alone():
+            first.put_digests({"l": "2"})
+            raise KeyboardInterrupt
+        assert second.digests(["k", "l"]) == {"k": "1"}
+
+
+def test_a_store_in_a_read_only_folder_is_read(
+    file_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without files beside it; where a run has left results there, the message names them."""
+    with closing(Store(file_url)) as store:
+        store.put_digests({"k": "1"})
+    path = tmp_path / "store.sqlite"
+    path.chmod(0o444)
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    with closing(Store(file_url, create=False)) as store:
+        assert store.digests(["k"]) == {"k": "1"}
+        assert [one.name for one in tmp_path.iterdir()] == ["store.sqlite"]
+    with closing(Store(file_url, create=False)) as store, pytest.raises(StoreError) as refusal:
+        store.put_digests({"l": "2"})
+    assert f"copy {path} and {path}-wal" in str(refusal.value)
 
 
 # Assessments
@@ -438,7 +576,7 @@ def test_a_row_that_cannot_be_read_counts_as_absent(file_url: str, tmp_path: Pat
             file.execute(
                 f"UPDATE assessed_{SCHEMA} SET content = ? WHERE key = 'k1'", (pack({"stage": 3}),)
             )
-            file.execute(f"UPDATE reported_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
+            file.execute(f"UPDATE summaries_{SCHEMA} SET content = x'00' WHERE key = 'k1'")
         assert got_from(store, "k", "a.h5") is None
         assert recall(store, "B", "k1") is None
         assert recall(store, "A", "k2") is not None
@@ -458,7 +596,7 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
             keep(store, machine, "k1", worn(tmp_path, machine))
             store.put_part(machine, "p", pack(machine))
         with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
-            for table in ("identified", "assessed", "parts", "reported"):
+            for table in ("identified", "assessed", "parts", "summaries"):
                 other = f"SELECT content FROM {table}_{SCHEMA} ORDER BY rowid"
                 (first,), *_ = file.execute(other).fetchall()
                 file.execute(f"UPDATE {table}_{SCHEMA} SET content = ?", (first,))
@@ -489,7 +627,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
         Store(f"sqlite:///{path}").close()
     finally:
         event.remove(Engine, "before_cursor_execute", be_quicker)
-    assert len(made) == 10 + 3
+    assert len(made) == 12 + 3
 
 
 @pytest.mark.slow
@@ -643,7 +781,7 @@ def test_what_no_run_computes_again_comes_from_the_schema_before(
     with engine.begin() as connection:
         for view in ("status", "points", "changes"):
             connection.execute(text(f"DROP VIEW lmshealth_{view}"))
-        for name in ("points", "changes", "reported", "assessed"):
+        for name in ("points", "changes", "summaries", "assessed"):
             new = f"{name}_{SCHEMA - 1}"
             connection.execute(text(f"ALTER TABLE {name}_{SCHEMA} RENAME TO {new}"))
         # A column that is no more, and one that is new.

@@ -145,6 +145,73 @@ def test_names_are_fit_to_be_printed_and_differ(tmp_path):
     assert {r"a\x1b[31m.csv", r"a\\x1b[31m.csv", r"\udcff.csv", r"\u202eb.csv"} <= set(shown)
 
 
+def write_samples(path, n=200):
+    """Write rows of numbers below a header."""
+    path.parent.mkdir(exist_ok=True)
+    path.write_text("time_s;acc_x_m_s2\n" + "".join(f"{k * 1e-3};-1,5e-3\n" for k in range(n)))
+    return path
+
+
+def test_texts_that_hold_samples_are_logs(tmp_path):
+    """Rows of numbers decide, not the suffix; notes, short tables, JSON and copies are no logs."""
+    write_samples(tmp_path / "a.txt")
+    write_samples(tmp_path / "b.dat", 10_000)
+    (tmp_path / "c.asc").write_text((tmp_path / "a.txt").read_text(), encoding="utf-16")
+    write_samples(tmp_path / "short.txt", 99)
+    (tmp_path / "notes.txt").write_text("2026-01-05 the belt was loose\n" * 500)
+    (tmp_path / "events.dat").write_text("2026-01-05 08:00:00 started\n" * 5000)
+    (tmp_path / "x.json").write_text("[\n" + "1.5,\n" * 500)
+    (tmp_path / "photo.dat").write_bytes(bytes(range(256)) * 500)
+    for name in ("a.txt.bak", "a.txt~"):
+        write_samples(tmp_path / name)
+    os.mkfifo(tmp_path / "pipe.txt")
+    found = find_logs(tmp_path)
+    assert [path.name for path in found.logs] == ["a.txt", "b.dat", "c.asc"]
+    assert found.refused == ()
+
+
+def test_samples_under_another_suffix_are_refused(tmp_path):
+    """They are no notes, and their format is not known."""
+    write_samples(tmp_path / "a.prn")
+    found = find_logs(tmp_path)
+    assert [(r.log, r.reason) for r in found.refused] == [("a.prn", "skipped")] and not found.logs
+
+
+def test_every_row_of_a_manifest_is_a_log_or_a_refusal(tmp_path):
+    """A listed file is read whatever its suffix; one that is hidden, a table or gone is refused."""
+    (tmp_path / "in").mkdir()
+    names = ["a.txt", "in/b.prn", ".hidden.csv", "truth.csv"]
+    for name in names:
+        (tmp_path / name).write_text("notes\n")
+    rows = [f"{name},A,1," for name in (*names, "in/gone.csv")]
+    (tmp_path / "manifest.csv").write_text(HEADER + "\n".join(rows) + "\n")
+    (tmp_path / "in" / "manifest.csv").write_text(HEADER + "gone too.csv,A,1,\n")
+    manifest = read_manifest(tmp_path)
+    found = find_logs(tmp_path, manifest=manifest)
+    assert [name_of(path, tmp_path) for path in found.logs] == ["a.txt", "in/b.prn"]
+    assert {r.log: r.reason for r in (*found.refused, *manifest.refused)} == {
+        ".hidden.csv": "bad-row",
+        "truth.csv": "bad-row",
+        "in/gone.csv": "missing-file",
+        "in/gone too.csv": "missing-file",
+    }
+
+
+def test_only_a_register_of_logs_omits_logs(tmp_path):
+    """A table of corrections lists what it corrects; one of machines and dates lists all logs."""
+    (tmp_path / "in").mkdir()
+    (tmp_path / "manifest.csv").write_text("file,travel_km\nin/a.csv,1\n")
+    for name in ("a.csv", "b.csv"):
+        (tmp_path / "in" / name).write_bytes(b"")
+    assert not read_manifest(tmp_path).omits(tmp_path / "in" / "b.csv")
+    register = "file,stage,recorded_at\na.csv,A,2026-01-05T08:00:00Z\n"
+    (tmp_path / "in" / "manifest.csv").write_text(register)
+    manifest = read_manifest(tmp_path)
+    assert manifest.omits(tmp_path / "in" / "b.csv")
+    assert not manifest.omits(tmp_path / "in" / "a.csv")
+    assert not manifest.omits(tmp_path / "c.csv")
+
+
 def test_no_folder(tmp_path):
     """Anything but a folder is an error."""
     for verb in (find_logs, read_manifest):

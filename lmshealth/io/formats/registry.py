@@ -4,8 +4,10 @@ A plug-in is a `Format` under the entry-point group ``lmshealth.formats`` of an 
 """
 
 import logging
+import re
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points
+from itertools import takewhile
 from pathlib import Path
 
 import numpy as np
@@ -25,7 +27,7 @@ from lmshealth.io.formats.vendor_files import RTX, TRACE
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Exporters use them for delimited text, and people for notes: such files are read where they are
-# named, and not collected from folders, unless they are compressed.
+# named, and collected from folders if they are compressed or `holds_samples`.
 TEXT_SUFFIXES = (".txt", ".tsv", ".dat", ".asc")
 # Binary formats first: text is recognised by the absence of other signatures.
 FORMATS: tuple[Format, ...] = (
@@ -37,6 +39,7 @@ SUFFIXES = tuple(sorted(suffix for form in FORMATS for suffix in form.suffixes))
 GROUP = "lmshealth.formats"
 
 _HEAD = 4096
+_NUMBERS = re.compile(rb'(?i)(?=.*\d|.*nan)(?:[\d\s.,;:|/+\-eTZ"]|nan|inf)+')
 _log = logging.getLogger(__name__)
 
 
@@ -71,6 +74,25 @@ def _loaded(point: EntryPoint, others: list[Format]) -> Format:
 def is_log(path: Path) -> bool:
     """Return whether a file of a folder has the suffix of a log."""
     return not path.name.lower().endswith(TEXT_SUFFIXES) and format_of(path) is not None
+
+
+def holds_samples(path: Path) -> bool:
+    """Return whether a file, of any suffix, begins as a text that continues as rows of numbers.
+
+    Notes, reports and short tables do not; numbers include moments, NaN and infinity.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(constants.SAMPLED_BYTES)
+    except OSError:
+        return False
+    if head.lstrip()[:1] in (b"{", b"[", b"<"):  # JSON, XML, HTML
+        return False
+    lines = head.replace(b"\0", b"").splitlines()  # UTF-16 has a zero beside each character
+    is_cut = len(head) == constants.SAMPLED_BYTES
+    rows = takewhile(_NUMBERS.fullmatch, reversed(lines[:-1] if is_cut else lines))
+    needed = constants.SAMPLED_ROWS_CUT if is_cut else constants.SAMPLED_ROWS
+    return sum(1 for _ in rows) >= needed
 
 
 def format_of(path: Path) -> Format | None:
