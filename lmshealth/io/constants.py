@@ -76,6 +76,27 @@ LONGEST_REACH = 0.02
 """Longest distance in s to either side of that difference: the set point of a stroke changes in
 it."""
 
+# Consistency
+
+RATE_FLAGGED, RATE_REFUSED = 5e-4, 5e-3
+"""Relative differences between the sample rate and that by set position and set velocity, beyond
+five standard errors: a frequency has the first as its standard deviation in a record of 60 s
+(README.md, "Time"); the second is the rounding of a velocity to three digits."""
+MOVING = 0.2
+"""Share of the usual speed from which a block of samples is in motion."""
+FINE_STEPS = 2.5
+"""Steps of the stored position per sample from which an increment is compared with its neighbours:
+by rounding alone it may exceed them by one step."""
+JUMP = 1.4
+"""Ratio of an increment to the mean of its four neighbours, beyond 0.9 steps, from which samples
+were dropped: one dropped sample doubles it."""
+SHORTEST_REPEAT = 16
+"""Fewest samples that repeat earlier ones in all channels: of a channel with an effective range of
+4 levels that happens once in 4^16 = 4e9."""
+CHANCE = 40.0
+"""A repeated stretch is none by chance if that has a probability below exp(-40), by the share of its
+samples that equal their neighbours."""
+
 # Metadata
 
 LONGEST_NAME = 200
