@@ -15,16 +15,17 @@ from lmshealth.io.buffers import BLOCK, Samples, blocks
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray, resolution, too_many
 
-# Samples per block of displacement; blocks that are joined where steps of the position are coarse;
-# fewest blocks in motion that a rate is computed from; standard error at which it is exact enough.
+# Samples per block of displacement; blocks that are joined; fewest of them in motion that a rate is
+# computed from; standard error at which it is exact enough.
 _LENGTH, _JOINED, _FEWEST, _EXACT = 32, (64, 8, 1), 8, 1e-4
-# Samples from which the step of a position is found.
-_STRETCH = 4096
+# Samples from which the step of a position is found, and blocks from which that of a velocity is.
+_STRETCH, _MOST_RAMPS = 4096, 64
 # Samples whose hash selects one of so many, samples of a key, and odd factors of the hashes.
 _SELECTED, _KEY = 32, 8
 _FACTORS = 2 * np.random.default_rng(7).integers(1 << 62, 1 << 63, _KEY, dtype=np.uint64) + 1
 # Lags at which a repeated stretch must differ from itself.
 _LAGS = (1, 2, 3, 5, 7, 8, 16)
+_NEEDED = "record again, or map no set position if it is sampled by another clock"
 _NONE = np.empty(0, dtype=np.int64)
 
 
@@ -48,10 +49,15 @@ class Findings(NamedTuple):
 
 
 class _Blocks(NamedTuple):
-    """Displacements in m over consecutive blocks, by position and by velocity, ``(n_blocks,)``."""
+    """Displacements in m over consecutive blocks, by position and by velocity, ``(n_blocks,)``.
+
+    In m: the step in which the position is stored, and its usual increment; zero without motion.
+    """
 
     way: FloatArray
     expected: FloatArray
+    step: float = 0.0
+    usual: float = 0.0
 
 
 def compare(
@@ -76,59 +82,77 @@ def compare(
         ``rate`` where the set velocity contradicts the sample rate; ``dropped`` or ``repeated``
         where that happens too often to cut the record.
     """
-    notes = []
+    size = measured[0].size
     copies = _repeats(measured)
-    if copies.size:
-        n_lost = int(np.sum(copies[:, 1] - copies[:, 0]))
+    n_lost = int(np.sum(copies[:, 1] - copies[:, 0]))
+    notes = []
+    if n_lost:
         found = f"{n_lost} samples repeat earlier ones in all channels, in {len(copies)} ranges"
-        if n_lost > constants.LARGEST_MISSING * measured[0].size or too_many(
-            len(copies), measured[0].size
-        ):
-            raise Unusable("repeated", f"{found}; export the record again, buffer by buffer")
+        if n_lost > constants.LARGEST_MISSING * size or too_many(len(copies), size):
+            raise Unusable("repeated", f"{found}; export the record again, each buffer once")
         notes.append(("repeated", "", f"{found}: left out"))
-    if motion.position is None:
-        return Findings(_NONE, copies, tuple(notes))
-    own = _displacements(motion.position, motion.velocity, sample_rate)
-    step, typical = _steps_of(motion.position, own.way)
-    fine = typical >= constants.FINE_STEPS * step
-    dropped = _isolated(motion.position, own.way, step) if fine else _NONE
-    own.way[np.minimum(dropped // _LENGTH, own.way.size - 1)] = np.nan
-    if motion.velocity is not None:
-        notes += _rate_notes(own, motion.velocity, sample_rate, dropped)
-        if not fine:
-            dropped = _jumps(motion.position, own, step)
-    elif motion.nominal:
-        notes += _speed_notes(own.way, abs(motion.nominal), sample_rate)
-    known = np.concatenate([breaks, copies.ravel()])
-    dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)] if known.size else dropped
-    if dropped.size:
-        found = f"the set position jumps {dropped.size} times: samples were dropped there"
-        if too_many(dropped.size, motion.position.size):
-            raise Unusable("dropped", f"{found}; record again, or with time stamps")
-        notes.append(("dropped", "reference_position", f"{found}, the record is cut"))
+    dropped = _NONE
+    if motion.position is not None:
+        own = _displacements(motion.position, motion.velocity, sample_rate)
+        if own.step > 0:
+            known = np.concatenate([breaks, copies.ravel()])
+            dropped, found = _moved(motion, own, sample_rate, known)
+            notes += found
     return Findings(dropped, copies, tuple(notes))
 
 
+def _moved(
+    motion: Motion, own: _Blocks, rate: float, known: IntArray
+) -> tuple[IntArray, list[tuple[str, str, str]]]:
+    """Compare a set position with itself, and the sample rate with it; return jumps and notes.
+
+    Interruptions that are ``known``, before or after a sample, are no jumps.
+    """
+    position, velocity, nominal = motion
+    assert position is not None
+    fine = own.usual >= constants.FINE_STEPS * own.step
+    dropped = _isolated(position, own) if fine else _NONE
+    notes = []
+    if velocity is not None:
+        dropped, fit = _without_beat(own, dropped)
+        notes += [] if fit is None else _rate_notes(own, velocity, rate, fit)
+        dropped = dropped if fine else _jumps(position, own)
+    elif nominal:
+        notes += _speed_notes(own, abs(nominal), rate)
+    if known.size:
+        dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
+    if dropped.size:
+        found = f"the set position jumps {dropped.size} times: samples were dropped there"
+        # At rest they are not seen.
+        if too_many(dropped.size, _LENGTH * int(np.count_nonzero(own.way))):
+            raise Unusable("dropped", f"{found}; {_NEEDED}")
+        notes.append(("dropped", "reference_position", f"{found}, the record is cut"))
+    return dropped, notes
+
+
 def _displacements(position: Samples, velocity: Samples | None, rate: float) -> _Blocks:
-    """Sum the increments of a position and, by trapezoids, a velocity over blocks."""
+    """Sum the increments of a position and integrate a velocity over blocks."""
     ways, sums = [], []
     for at in range(0, position.size - _LENGTH, BLOCK):
         place = position[at : at + BLOCK + 1]
         whole = (place.size - 1) // _LENGTH * _LENGTH
         ways.append(np.diff(place[: whole + 1 : _LENGTH]))
         if velocity is not None:
-            speed = velocity[at : at + whole + 1]
-            ends = np.diff(speed[::_LENGTH]) / 2
-            sums.append((speed[:whole].reshape(-1, _LENGTH) @ np.ones(_LENGTH) + ends) / rate)
+            begin = max(at - 1, 0)
+            speed = velocity[begin : at + whole + 2]
+            ends = at - begin + np.arange(0, whole + 1, _LENGTH)
+            # Trapezoids, and their error by the slopes at the ends (Euler and Maclaurin).
+            slope = speed[np.minimum(ends + 1, speed.size - 1)] - speed[np.maximum(ends - 1, 0)]
+            rows = speed[ends[0] : ends[-1]].reshape(-1, _LENGTH)
+            total = rows @ np.ones(_LENGTH) + np.diff(speed[ends] / 2 - slope / 24)
+            sums.append(total / rate)
     way = np.concatenate([np.empty(0), *ways])
-    return _Blocks(way, np.concatenate(sums) if sums else np.full(way.size, np.nan))
+    expected = np.concatenate(sums) if sums else np.full(way.size, np.nan)
+    return _Blocks(way, expected, *_steps_of(position, way))
 
 
 def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
-    """Return the step in which a position is stored, and its usual increment, both in m.
-
-    They are those of the longest motion; zero without one.
-    """
+    """Return the step and the usual increment in m of a position in its longest motion."""
     size = np.nan_to_num(np.abs(way))
     if not size.any():
         return 0.0, 0.0
@@ -147,54 +171,83 @@ def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
     return max(steps), float(np.mean(apart))
 
 
-def _isolated(position: Samples, way: FloatArray, step: float) -> IntArray:
+def _isolated(position: Samples, own: _Blocks) -> IntArray:
     """Find samples whose increment is a multiple of those around it, ``(n,)``."""
     found = [_NONE]
     # Only blocks that are longer than their neighbours by a part of an increment are examined.
-    size = np.pad(np.abs(way), 1, mode="edge")
-    longer = size[1:-1] - (size[:-2] + size[2:]) / 2
-    blocks_ = np.flatnonzero(longer > size[1:-1] / (4 * _LENGTH)) * _LENGTH
+    size = np.pad(np.abs(own.way), 1, mode="edge")
+    longer = size[1:-1] - (size[:-2] + size[2:]) / 2 > size[1:-1] / (4 * _LENGTH)
+    starts = np.flatnonzero(longer) * _LENGTH
     for at in range(0, position.size, BLOCK):
-        own = blocks_[slice(*np.searchsorted(blocks_, (at, at + BLOCK)))]
-        if not own.size:
+        chosen = starts[slice(*np.searchsorted(starts, (at, at + BLOCK)))]
+        if not chosen.size:
             continue
         begin = max(0, at - 2)
-        step_ = np.diff(position[begin : at + BLOCK + 3])
-        k = (own[:, None] + np.arange(_LENGTH)).ravel() - begin
-        k = k[(k >= 2) & (k < step_.size - 2)]
-        near = np.stack([step_[k + i] for i in (-2, -1, 1, 2)]) * np.sign(step_[k])
+        ways = np.diff(position[begin : at + BLOCK + 3])
+        k = (chosen[:, None] + np.arange(_LENGTH)).ravel() - begin
+        k = k[(k >= 2) & (k < ways.size - 2)]
+        near = np.stack([ways[k + i] for i in (-2, -1, 1, 2)]) * np.sign(ways[k])
         around = near.mean(axis=0)
-        larger = np.abs(step_[k]) > constants.JUMP * around + 0.9 * step
+        larger = np.abs(ways[k]) > constants.JUMP * around + 0.9 * own.step
         found.append(begin + 1 + k[larger & (near.min(axis=0) > 0.5 * around)])
     return np.concatenate(found)
 
 
-def _jumps(position: Samples, own: _Blocks, step: float) -> IntArray:
-    """Find jumps of a coarse position beyond what its step explains, at constant velocity."""
+def _jumps(position: Samples, own: _Blocks) -> IntArray:
+    """Find jumps of a coarse position at constant velocity, beyond what its step explains.
+
+    It explains nothing where blocks are whole numbers of steps, at the usual velocity.
+    """
     ahead = np.abs(own.expected)
-    excess = np.sign(own.expected) * own.way - ahead * np.nanmedian(own.way / own.expected)
+    moving = np.sort(ahead[ahead > 0])
+    if not moving.size:
+        return _NONE
+    usual = moving[moving.size // 2]
+    even = np.abs(ahead - usual) < 1e-6 * usual
+    way = np.sign(own.expected) * own.way
+    slope = float(np.nanmedian(way[even])) / usual
+    excess, increment = way - slope * ahead, ahead / _LENGTH
     padded = np.pad(ahead, 1, mode="edge")
-    steady = np.abs(padded[2:] - padded[:-2]) <= 0.01 * ahead
-    odd = steady & (excess > 0.6 * ahead / _LENGTH + 1.1 * step)
+    steady = (np.abs(padded[2:] - padded[:-2]) <= 0.01 * ahead) & (ahead > 0) & np.isfinite(way)
+    uneven = np.mean(np.abs(excess[even]) > 0.3 * increment[even])
+    exact = even & (abs(slope - 1) * np.nansum(ahead) < own.step / 2) & (uneven < 0.05)
+    usual_error = 3 * np.quantile(np.abs(excess[steady]), 0.9) if steady.any() else 0.0
+    explained = np.maximum(1.02 * own.step + 0.1 * increment, usual_error)
+    odd = excess > np.maximum(np.where(exact, 0.0, explained), 0.6 * increment)
     found = []
-    for start in np.flatnonzero(odd) * _LENGTH:
+    for start in np.flatnonzero(odd & steady) * _LENGTH:
         place = position[start : start + _LENGTH + 1]
         found.append(start + 1 + int(np.argmax(np.abs(np.diff(place)))))
     return np.array(found, dtype=np.int64)
 
 
+def _without_beat(
+    own: _Blocks, dropped: IntArray
+) -> tuple[IntArray, tuple[float, float] | None]:
+    """Fit the displacements without the blocks of jumps; return jumps and `_slope`.
+
+    A set position of another clock jumps where the clocks are a sample apart, and so does one in
+    steps slightly below its increment: with the jumps it moves by the velocity, without them not.
+    """
+    way = own.way.copy()
+    way[dropped // _LENGTH] = np.nan
+    fit = _slope(own._replace(way=way))
+    if dropped.size and fit is not None and (whole := _slope(own)) is not None:
+        off = abs(fit[0] - 1)
+        if off > constants.AGREEMENT + 5 * fit[1] and abs(whole[0] - 1) < off / 2:
+            return _NONE, whole
+    return dropped, fit
+
+
 def _rate_notes(
-    own: _Blocks, velocity: Samples, rate: float, dropped: IntArray
+    own: _Blocks, velocity: Samples, rate: float, fit: tuple[float, float]
 ) -> Iterator[tuple[str, str, str]]:
     """Compare the sample rate with that at which the position moves by the velocity."""
-    fit = _slope(own)
-    if fit is None:
-        return
     slope, std = fit
     off, allowed = abs(slope - 1), 5 * std + _rounding(velocity, own.expected)
     found = (
         f"the sample rate is {rate:.8g} Hz, but the set position moves by the set velocity at "
-        f"{rate / slope:.6g} ± {rate * std / slope**2:.2g} Hz"
+        f"{rate / slope:.6g} Hz"
     )
     if off > constants.RATE_REFUSED + allowed:
         needed = "correct the rate or a unit, or map only one of the two columns"
@@ -203,31 +256,36 @@ def _rate_notes(
         yield "rate", "reference_velocity", f"{found}; check which is right"
 
 
-def _speed_notes(way: FloatArray, nominal: float, rate: float) -> Iterator[tuple[str, str, str]]:
+def _speed_notes(own: _Blocks, nominal: float, rate: float) -> Iterator[tuple[str, str, str]]:
     """Compare the speed of the metadata with that of the set position, where it has one speed."""
-    size = np.abs(way[: way.size // 8 * 8].reshape(-1, 8).sum(axis=1))
-    size = size[np.isfinite(size)]
-    if size.size < _FEWEST or not size.any():
-        return
-    size = size[size > 0.5 * np.quantile(size, 0.99)]
-    low, speed, high = np.quantile(size, [0.1, 0.5, 0.9]) * rate / (8 * _LENGTH)
-    even = high - low <= 0.1 * speed
-    if even and abs(speed / nominal - 1) > constants.RATE_REFUSED + (high - low) / speed:
-        found = f"the set position moves at {1e3 * speed:.6g} mm/s at {rate:.8g} Hz"
-        stated = f"velocity_mm_s is {1e3 * nominal:.6g}"
-        yield "rate", "reference_position", f"{found}, {stated}; check the rate and the velocity"
+    for n in _JOINED:
+        size = np.abs(own.way[: own.way.size // n * n].reshape(-1, n).sum(axis=1))
+        size = size[np.isfinite(size)]
+        if size.size < _FEWEST or not size.any():
+            continue
+        size = size[size > 0.5 * np.quantile(size, 0.99)]
+        low, middle, high = np.quantile(size, [0.1, 0.5, 0.9])
+        speed, spread = middle * rate / (n * _LENGTH), (high - low + own.step) / middle
+        off = abs(speed / nominal - 1)
+        if spread < 0.1 and off > constants.RATE_REFUSED + spread:
+            found = f"the set position moves at {1e3 * speed:.6g} mm/s at {rate:.8g} Hz"
+            stated = f"velocity_mm_s is {1e3 * nominal:.6g}"
+            yield "rate", "reference_position", f"{found}, {stated}; check which is right"
+        if spread < 0.1:
+            return
 
 
 def _slope(own: _Blocks) -> tuple[float, float] | None:
     """Fit displacements by position to those by velocity; return slope and standard error.
 
-    Blocks are joined until that is small. None where too few of them are in motion.
+    Blocks are joined, the more the better where that leaves enough of them. None where too few are
+    in motion.
     """
     best = None
     for n in _JOINED:
         whole = own.way.size // n * n
-        way, expected = (one[:whole].reshape(-1, n).sum(axis=1) for one in own)
-        fit = _fit(np.abs(way), np.abs(expected))
+        way, expected = (one[:whole].reshape(-1, n).sum(axis=1) for one in own[:2])
+        fit = _fit(np.abs(way), np.abs(expected), own.step)
         if fit is not None and (best is None or fit[1] < best[1]):
             best = fit
         if best is not None and best[1] < _EXACT:
@@ -235,12 +293,12 @@ def _slope(own: _Blocks) -> tuple[float, float] | None:
     return best
 
 
-def _fit(way: FloatArray, expected: FloatArray) -> tuple[float, float] | None:
+def _fit(way: FloatArray, expected: FloatArray, step: float) -> tuple[float, float] | None:
     """Regress sizes of displacements on expected ones and on their change, outliers left out.
 
     A velocity that a filter delays is off by a multiple of its change.
     """
-    there = np.isfinite(way + expected) & (way > 0)
+    there = np.isfinite(way + expected) & (expected > 0)
     if there.sum() < _FEWEST:
         return None
     there &= expected > constants.MOVING * np.quantile(expected[there], 0.9)
@@ -248,29 +306,26 @@ def _fit(way: FloatArray, expected: FloatArray) -> tuple[float, float] | None:
         return None
     change = np.nan_to_num(np.gradient(expected)[there])
     x, y = np.stack([expected[there], change], axis=1), way[there]
-    error, n = y - x[:, 0] * np.median(y / x[:, 0]), y.size
+    error = y - x[:, 0] * np.median(y / x[:, 0])
     for _ in range(3):
-        # Half of the blocks may be ramps or interrupted; coarse positions have few levels.
-        keep = np.abs(error) <= 2 * np.quantile(np.abs(error), 0.9)
+        keep = np.abs(error) <= max(2 * np.quantile(np.abs(error), 0.9), 1.1 * step)
         inverse = np.linalg.pinv(x[keep].T @ x[keep], rcond=1e-6, hermitian=True)
         slope = inverse @ (x[keep].T @ y[keep])
         error = y - x @ slope
-        n = int(keep.sum())
-    variance = float(np.sum(error[keep] ** 2)) / max(n - 2, 1)
+    n = int(keep.sum())
+    if np.mean(np.abs(error)) > 0.5 * np.mean(y):
+        return None  # the one does not follow the other
+    variance = max(float(np.sum(error[keep] ** 2)) / max(n - 2, 1), step**2 / 6 / n)
     return float(slope[0]), float(np.sqrt(variance * inverse[0, 0]))
 
 
 def _rounding(velocity: Samples, expected: FloatArray) -> float:
-    """Return the largest relative error of a velocity whose rounding its levels show."""
-    levels = np.unique(np.abs(velocity[: _LENGTH * expected.size][::_LENGTH]))
-    levels = levels[np.isfinite(levels)]
-    gaps = np.diff(levels)
-    gaps = gaps[gaps > 1e-6 * levels.max(initial=0)]
-    if levels.size < 5 or not gaps.size:
+    """Return the largest relative error by the decimals of a velocity, which its ramps show."""
+    ramps = np.flatnonzero(np.diff(expected))[:_MOST_RAMPS] * _LENGTH
+    if ramps.size < _FEWEST:
         return 0.0
-    step = float(gaps.min())
-    is_rounded = np.abs(levels / step - np.rint(levels / step)).max() < 0.01
-    return step / 2 / float(np.median(levels[levels > 0])) if is_rounded else 0.0
+    levels = np.abs(np.concatenate([velocity[k : k + 2 * _LENGTH] for k in ramps]))
+    return float(resolution(levels) / 2 / np.quantile(levels, 0.9))
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:

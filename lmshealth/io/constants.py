@@ -84,12 +84,12 @@ five standard errors: a frequency has the first as its standard deviation in a r
 (README.md, "Time"); the second is the rounding of a velocity to three digits."""
 MOVING = 0.2
 """Share of the usual speed from which a block of samples is in motion."""
-FINE_STEPS = 2.5
+FINE_STEPS = 4.0
 """Steps of the stored position per sample from which an increment is compared with its neighbours:
-by rounding alone it may exceed them by one step."""
-JUMP = 1.4
+by rounding alone it may exceed them by one step, by noise of the same size by four times that."""
+JUMP = 1.55
 """Ratio of an increment to the mean of its four neighbours, beyond 0.9 steps, from which samples
-were dropped: one dropped sample doubles it."""
+were dropped: one dropped sample doubles it, counts of two and three in turn reach 1.5."""
 SHORTEST_REPEAT = 16
 """Fewest samples that repeat earlier ones in all channels: of a channel with an effective range of
 4 levels that happens once in 4^16 = 4e9."""
