@@ -1,7 +1,7 @@
 """Consistency: what a log states more than once is compared (README.md, "Consistency").
 
-The sample rate with the set position and the set velocity; the set position with itself, which jumps
-where samples were dropped; the samples with themselves, where a buffer was recorded twice.
+The sample rate with the set position and the set velocity; the set position with itself, which
+jumps where samples were dropped; the samples with themselves, where a buffer was recorded twice.
 """
 
 from collections.abc import Iterator, Sequence
@@ -85,19 +85,19 @@ def compare(
     size = measured[0].size
     copies = _repeats(measured)
     n_lost = int(np.sum(copies[:, 1] - copies[:, 0]))
-    notes = []
+    notes: list[tuple[str, str, str]] = []
     if n_lost:
         found = f"{n_lost} samples repeat earlier ones in all channels, in {len(copies)} ranges"
         if n_lost > constants.LARGEST_MISSING * size or too_many(len(copies), size):
             raise Unusable("repeated", f"{found}; export the record again, each buffer once")
-        notes.append(("repeated", "", f"{found}: left out"))
+        notes.append(("repeated", "time_s", f"{found}: left out"))
     dropped = _NONE
     if motion.position is not None:
         own = _displacements(motion.position, motion.velocity, sample_rate)
         if own.step > 0:
             known = np.concatenate([breaks, copies.ravel()])
-            dropped, found = _moved(motion, own, sample_rate, known)
-            notes += found
+            dropped, more = _moved(motion, own, sample_rate, known)
+            notes += more
     return Findings(dropped, copies, tuple(notes))
 
 
@@ -112,7 +112,7 @@ def _moved(
     assert position is not None
     fine = own.usual >= constants.FINE_STEPS * own.step
     dropped = _isolated(position, own) if fine else _NONE
-    notes = []
+    notes: list[tuple[str, str, str]] = []
     if velocity is not None:
         dropped, fit = _without_beat(own, dropped)
         notes += [] if fit is None else _rate_notes(own, velocity, rate, fit)
@@ -221,9 +221,7 @@ def _jumps(position: Samples, own: _Blocks) -> IntArray:
     return np.array(found, dtype=np.int64)
 
 
-def _without_beat(
-    own: _Blocks, dropped: IntArray
-) -> tuple[IntArray, tuple[float, float] | None]:
+def _without_beat(own: _Blocks, dropped: IntArray) -> tuple[IntArray, tuple[float, float] | None]:
     """Fit the displacements without the blocks of jumps; return jumps and `_slope`.
 
     A set position of another clock jumps where the clocks are a sample apart, and so does one in

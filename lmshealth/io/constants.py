@@ -94,8 +94,8 @@ SHORTEST_REPEAT = 16
 """Fewest samples that repeat earlier ones in all channels: of a channel with an effective range of
 4 levels that happens once in 4^16 = 4e9."""
 CHANCE = 40.0
-"""A repeated stretch is none by chance if that has a probability below exp(-40), by the share of its
-samples that equal their neighbours."""
+"""A repeated stretch is none by chance where that has a probability below exp(-40), by the share of
+its samples that equal their neighbours."""
 
 # Metadata
 

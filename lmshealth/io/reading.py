@@ -29,7 +29,7 @@ _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
 Ranges = tuple[tuple[int, int], ...]
-_REFERENCES = ("reference_velocity", "reference_position")
+_REFERENCES: tuple[Role, ...] = ("reference_velocity", "reference_position")
 
 
 def read_log(
