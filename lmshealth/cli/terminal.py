@@ -102,7 +102,8 @@ def print_refused(rows: Sequence[Row]) -> None:
 
 
 def _is_warning(row: Row) -> bool:
-    return row["reason"] in WARNINGS and bool(row["channel"])
+    # Whole logs are refused for the same reasons.
+    return row["reason"] == "gaps" or (row["reason"] in WARNINGS and bool(row["channel"]))
 
 
 class _Numbers(Formatter):

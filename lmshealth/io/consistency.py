@@ -261,8 +261,8 @@ def _speed_notes(own: _Blocks, nominal: float, rate: float) -> Iterator[tuple[st
         size = size[np.isfinite(size)]
         if size.size < _FEWEST or not size.any():
             continue
-        size = size[size > 0.5 * np.quantile(size, 0.99)]
-        low, middle, high = np.quantile(size, [0.1, 0.5, 0.9])
+        size = size[size > constants.MOVING * np.quantile(size, 0.99)]
+        low, middle, high = np.quantile(size, [0.2, 0.5, 0.9])
         speed, spread = middle * rate / (n * _LENGTH), (high - low + own.step) / middle
         off = abs(speed / nominal - 1)
         if spread < 0.1 and off > constants.RATE_REFUSED + spread:

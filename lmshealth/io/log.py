@@ -31,7 +31,7 @@ class Refusal:
     frequency: float | None = field(default=None, compare=False, kw_only=True)
 
 
-# Reasons of warnings among the refusals of a log, which name a channel: it is used nevertheless.
+# Reasons of refusals that name a channel and are warnings: it is used nevertheless.
 WARNINGS = ("gaps", "rate", "dropped", "repeated")
 
 

@@ -449,11 +449,12 @@ def _without_odd_rates(
     if usual is None or usual.sum() < constants.FEWEST_RATE_LOGS:
         return ordered, []
     ticks = np.array([(r.metadata.recorded_at or _NO_MOMENT).timestamp() for r in ordered])
-    is_usual = usual.mean() >= constants.RATE_SHARE
+    others, is_usual = np.flatnonzero(usual), usual.mean() >= constants.RATE_SHARE
     found = []
     for k in np.flatnonzero(np.isfinite(rates) & ~usual).tolist():
-        others = np.flatnonzero(usual)
-        near = others[np.argsort(np.abs(others - k), kind="stable")[: constants.RATE_LOGS]]
+        at = int(np.searchsorted(others, k))
+        near = others[max(0, at - constants.RATE_LOGS) : at + constants.RATE_LOGS]
+        near = near[np.argsort(np.abs(near - k), kind="stable")[: constants.RATE_LOGS]]
         right = float(np.median(rates[near]))
         own, ratio = ordered[k].modes, float(np.log(rates[k] / right))
         share = _share(own, [ordered[i].modes for i in near], ticks[near] - ticks[k], ratio)
@@ -481,11 +482,12 @@ def _shifts(own: Modes, others: Sequence[Modes]) -> FloatArray:
 
 def _usual_rate(rates: FloatArray) -> BoolArray | None:
     """Return which logs have the most frequent rate, at a tie the first; None if all have one."""
-    alike = np.abs(rates[:, None] / rates - 1) < 2 * AGREEMENT
-    n = alike.sum(axis=1)
-    if n.max() == np.isfinite(rates).sum():
+    known = np.sort(rates[np.isfinite(rates)])
+    low, high = (np.searchsorted(known, rates * (1 + sign * 2 * AGREEMENT)) for sign in (-1, 1))
+    n = np.where(np.isfinite(rates), high - low, 0)
+    if n.max() == known.size:
         return None
-    found: BoolArray = alike[int(np.argmax(n))]
+    found: BoolArray = np.abs(rates / rates[int(np.argmax(n))] - 1) < 2 * AGREEMENT
     return found
 
 
