@@ -174,7 +174,7 @@ def test_one_sample_of_hundred_is_refused(step):
     position, velocity = constant()
     position = rounded(position, step) if step else position
     gone = range(50, position.size, 100)
-    with pytest.raises(Unusable, match="dropped|rate"):
+    with pytest.raises(Unusable, match=r"dropped|rate"):
         found(without(position, gone), without(velocity, gone))
 
 
