@@ -76,7 +76,8 @@ def analyse(
             overrides = manifests[path].overrides(path)
             log = read_log(path, columns=columns, overrides=overrides, latest=latest)
             modes = identify(log, stage)
-            found.append(LogEstimates(log.name, log.digest, log.metadata, modes, loop_error(log)))
+            own = log.name, log.digest, log.metadata, modes, loop_error(log)
+            found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
             refused.append(Refusal(str(path), error.reason, error.detail))
     if not found:

@@ -41,6 +41,7 @@ from lmshealth.tracking.history import (
     LogEstimates,
     build_history,
     missing_mode_notices,
+    rate_notices,
     sort_by_time,
 )
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
@@ -117,7 +118,7 @@ def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) ->
     stage, work = machine.stage, machine.work
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
-    notices += missing_mode_notices(history, refused)
+    notices += missing_mode_notices(history, refused) + rate_notices(refused)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]

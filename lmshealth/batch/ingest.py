@@ -440,7 +440,8 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any])
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
         rms, shapes = loop_error(log), mode_shapes(modes, reading.fitted)
-        found = LogEstimates(log.name, log.digest, log.metadata, modes, rms, spectra, shapes)
+        own = log.name, log.digest, log.metadata, modes, rms, spectra, shapes
+        found = LogEstimates(*own, sample_rate=log.sample_rate)
         return Identified(found, by, stage, asked)
     except BadLog as error:
         refusal = Refusal(task.name, error.reason, error.detail)

@@ -19,6 +19,7 @@ from lmshealth.batch.workers import Pool
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import COLUMNS, Row, csv_text, join_csv, machine_tables
+from lmshealth.tracking.history import LEFT_OUT
 
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
@@ -69,7 +70,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page=page,
         summary=summary,
         tables={name: pack(text) for name, text in tables.items()},
-        excluded=tuple(r.log for r in found.refused if r.reason in ("odometer", "date")),
+        excluded=tuple(r.log for r in found.refused if r.reason in LEFT_OUT),
         status=status,
         points=tuple(points(rows)),
     )

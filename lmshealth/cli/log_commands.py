@@ -210,7 +210,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         if given["plot"]:
             figure = log_figures.modes_figure(log, reading, stage, band=band)
             log_figures.write_figure(given["plot"], figure)
-        return LogEstimates(log.name, log.digest, log.metadata, reading.modes, loop_error(log))
+        own = log.name, log.digest, log.metadata, reading.modes, loop_error(log)
+        return LogEstimates(*own, sample_rate=log.sample_rate)
 
     found, lost = _each(ctx, estimate)
     rows = [row for one in found for row in tables.modes_rows(one)]

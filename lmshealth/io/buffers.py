@@ -124,6 +124,8 @@ def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):
             scaled = values * factor
-            scaled[~(np.abs(scaled) < limit)] = np.nan
+            missing = ~(np.abs(scaled) < limit)
+        if missing.any():
+            scaled[missing] = np.nan
         spool.append(scaled)
     return spool.samples()

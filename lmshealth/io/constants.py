@@ -89,6 +89,27 @@ sensors and results beside logs have fewer."""
 BACKUPS = ("~", ".bak", ".old", ".orig", ".tmp", ".part", ".filepart", ".crdownload")
 """Ends of names of copies that editors and transfers make: they are no further logs."""
 
+# Consistency
+
+RATE_FLAGGED, RATE_REFUSED = 5e-4, 5e-3
+"""Relative differences between the sample rate and that by set position and set velocity, beyond
+five standard errors: a frequency has the first as its standard deviation in a record of 60 s
+(README.md, "Time"); the second is the rounding of a velocity to three digits."""
+MOVING = 0.2
+"""Share of the usual speed from which a block of samples is in motion."""
+FINE_STEPS = 4.0
+"""Steps of the stored position per sample from which an increment is compared with its neighbours:
+by rounding alone it may exceed them by one step, by noise of the same size by four times that."""
+JUMP = 1.55
+"""Ratio of an increment to the mean of its four neighbours, beyond 0.9 steps, from which samples
+were dropped: one dropped sample doubles it, counts of two and three in turn reach 1.5."""
+SHORTEST_REPEAT = 16
+"""Fewest samples that repeat earlier ones in all channels: of a channel with an effective range of
+4 levels that happens once in 4^16 = 4e9."""
+CHANCE = 40.0
+"""A repeated stretch is none by chance where that has a probability below exp(-40), by the share of
+its samples that equal their neighbours."""
+
 # Metadata
 
 LONGEST_NAME = 200

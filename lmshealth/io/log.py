@@ -57,6 +57,10 @@ class Refusal:
     frequency: float | None = field(default=None, compare=False, kw_only=True)
 
 
+# Reasons of refusals that name a channel and are warnings: it is used nevertheless.
+WARNINGS = ("gaps", "rate", "dropped", "repeated")
+
+
 @dataclass(frozen=True, slots=True)
 class Notice:
     """What the reader of a result must take into account: one row of ``warnings.csv``.

@@ -15,6 +15,7 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
 from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
+from lmshealth.io.consistency import Findings, Motion, compare
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
@@ -26,7 +27,7 @@ _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
 Ranges = tuple[tuple[int, int], ...]
-_REFERENCES = ("reference_velocity", "reference_position")
+_REFERENCES: tuple[Role, ...] = ("reference_velocity", "reference_position")
 
 
 def read_log(
@@ -172,7 +173,10 @@ def _to_log(
     gone = _missing(references[0], name, refused) if references else None
     if gone is not None:
         missing.append(gone)
-    ranges = pieces(series[0].values.size, missing, axis.breaks)
+    found = _compared(series, channels, metadata.velocity, axis)
+    refused += [Refusal(name, why, note, channel=channel) for why, channel, note in found.notes]
+    breaks = np.union1d(axis.breaks, found.dropped)
+    ranges = pieces(series[0].values.size, [*missing, found.repeated], breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     channels = _without_copies(channels, ranges, name, refused)
@@ -192,6 +196,17 @@ def _to_log(
         refused=tuple(refused),
         guessed=content.guessed,
     )
+
+
+def _compared(
+    series: Sequence[_Series], channels: Sequence[Channel], nominal: float | None, axis: TimeAxis
+) -> Findings:
+    """Compare what a log states more than once about its samples and their rate."""
+    own = {item.signal.role: item.values for item in series}
+    # A set point over a rate that varies is no witness of one rate.
+    velocity, position = (None if axis.clocks else own.get(role) for role in _REFERENCES)
+    values = [channel.values for channel in channels]
+    return compare(Motion(position, velocity, nominal), values, axis.sample_rate, axis.breaks)
 
 
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:

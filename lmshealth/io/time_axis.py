@@ -65,7 +65,7 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
             raise Unusable("time", detail)
         return TimeAxis(rate, np.empty(0, dtype=np.int64), "")
     n_repeated = _check_order(time)
-    step = _resolution(time)
+    step = resolution(time)
     span = float(time[time.size - 1 :][0] - time[:1][0])
     coarse = 0 < 0.2 * span < (time.size - 1) * step
     try:
@@ -305,7 +305,7 @@ def _check_order(time: Samples) -> int:
     return repeated
 
 
-def _resolution(time: Samples) -> float:
+def resolution(time: Samples) -> float:
     """Return the step in s to which time stamps are rounded, of decimals or of floats."""
     stamps = time[:BLOCK]
     largest = float(np.abs(stamps).max())

@@ -36,7 +36,7 @@ _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
     "delta_e_below_40hz_um mode source channel frequency_hz frequency_std_hz damping_ratio "
-    "damping_ratio_std correlation_f_zeta snr dispersion excitation_mm_s2 flags",
+    "damping_ratio_std correlation_f_zeta snr dispersion excitation_mm_s2 flags sample_rate_hz",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
     "damping_ratio_std drift drift_std nis nis_dof noise_scale widening",
@@ -195,7 +195,7 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         None if error is None else error / _MICRO,
     )
     columns = [np.asarray(one).tolist() for one in modes.to_columns().values()]
-    rows = _rows("modes", [(*log, *one) for one in zip(*columns, strict=True)])
+    rows = _rows("modes", [(*log, *one, reading.sample_rate) for one in zip(*columns, strict=True)])
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}

@@ -45,6 +45,15 @@ OVERCONFIDENT_P_VALUE, CAUTIOUS_P_VALUE = 1e-3, 1e-6
 # Two-sided p-value outside of which NIS counts as "above" or "below" its 95 % band.
 NIS_P_VALUE = 0.05
 
+# --- Sample rates -------------------------------------------------------------------------------
+# Most and fewest logs of the usual rate, the nearest, that a log of another rate is compared with.
+# Its frequencies follow the ratio of the rates where that is so many standard deviations of their
+# prediction; these are at least that of a frequency in a minute (io/README.md, "Time").
+RATE_LOGS, FEWEST_RATE_LOGS, RATE_GATE, RATE_SPREAD = 6, 3, 4.0, 5e-4
+# Where they cannot decide, a rate is noted that differs by less than this (a slip, not another
+# setting) from that of the share of logs below.
+RATE_NEAR, RATE_SHARE = 0.1, 0.75
+
 # --- Priors of the state ------------------------------------------------------------------------
 # Standard deviations of ln f and ln ζ about a mode's first estimate.
 LN_F_STD = 0.1

@@ -12,6 +12,7 @@ import numpy as np
 from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth._result import Result
 from lmshealth.errors import NotEnoughData
+from lmshealth.io.constants import AGREEMENT
 from lmshealth.io.log import Metadata, Notice, Refusal
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes
@@ -27,6 +28,22 @@ StepKind = Literal["step", "regreasing", "servo", "sensor", "reset"]
 # Order of the series of one mode.
 _SOURCES = ("joint", "acc", "frf", "delta_e")
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
+LEFT_OUT = ("odometer", "date", "odd-rate")
+"""Reasons for which a log as a whole is left out of a history."""
+_RATE_NOTICES: tuple[tuple[str, Literal["note", "caution"], str, str], ...] = (
+    (
+        "odd-rate",
+        "caution",
+        "logs have another sample rate, which their frequencies follow: they are left out.",
+        "Find out which rate is right (refused.csv has both), and correct manifest.csv.",
+    ),
+    (
+        "rate",
+        "note",
+        "logs have another sample rate than the others, by little.",
+        "Check whether it is right (refused.csv has both).",
+    ),
+)
 EXCITATION = "excitation_db"
 """Covariate that the identification measures: needed where frequencies depend on the amplitude."""
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
@@ -227,6 +244,8 @@ class LogEstimates:
         Spectrum of each channel with the fit of the modes, for plots; None if it was not kept.
     shapes : ModeShapes or None
         Complex shapes of the modes, for plots; None if they were not kept.
+    sample_rate : float or None
+        Of the log in Hz; None where unknown, which compares it with no other.
 
     Examples
     --------
@@ -253,6 +272,7 @@ class LogEstimates:
     loop_error: float | None = None
     spectra: SpectraSummary | None = None
     shapes: ModeShapes | None = None
+    sample_rate: float | None = None
 
 
 def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:
@@ -282,8 +302,8 @@ def build_history(
     history : History
         Its first baseline is the first log that the manifest declares one, else the first log.
     refused : list of Refusal
-        Logs whose odometer or date contradicts the others, which are left out, and estimates that
-        are assigned to no mode, which are missing.
+        Logs whose odometer, date or sample rate contradicts the others, which are left out, and
+        estimates that are assigned to no mode, which are missing.
 
     Raises
     ------
@@ -306,7 +326,8 @@ def build_history(
         raise NotEnoughData(f"{name}no usable log")
     ordered, refused = _without_contradictions(sort_by_time(readings))
     ordered, misdated = _without_lone_dates(ordered)
-    refused += misdated
+    ordered, odd = _without_odd_rates(ordered)
+    refused += [*misdated, *odd]
     # Missing values are None here and NaN in arrays.
     travel = np.array([r.metadata.travel for r in ordered], dtype=float)
     moments = tuple(r.metadata.recorded_at or _NO_MOMENT for r in ordered)
@@ -456,6 +477,80 @@ def _without_lone_dates(
     return ordered, refused
 
 
+def _without_odd_rates(
+    ordered: tuple[LogEstimates, ...],
+) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
+    """Keep the logs of the usual sample rate, and those whose frequencies do not follow another.
+
+    A wrong rate changes all frequencies by its ratio to the right one; another setting does not.
+    """
+    rates = np.array([reading.sample_rate or np.nan for reading in ordered])
+    usual = _usual_rate(rates)
+    if usual is None or usual.sum() < constants.FEWEST_RATE_LOGS:
+        return ordered, []
+    ticks = np.array([(r.metadata.recorded_at or _NO_MOMENT).timestamp() for r in ordered])
+    others, is_usual = np.flatnonzero(usual), usual.mean() >= constants.RATE_SHARE
+    found = []
+    for k in np.flatnonzero(np.isfinite(rates) & ~usual).tolist():
+        at = int(np.searchsorted(others, k))
+        near = others[max(0, at - constants.RATE_LOGS) : at + constants.RATE_LOGS]
+        near = near[np.argsort(np.abs(near - k), kind="stable")[: constants.RATE_LOGS]]
+        right = float(np.median(rates[near]))
+        own, ratio = ordered[k].modes, float(np.log(rates[k] / right))
+        share = _share(own, [ordered[i].modes for i in near], ticks[near] - ticks[k], ratio)
+        rest = f"the sample rate is {rates[k]:.8g} Hz, that of {usual.sum()} logs {right:.8g} Hz"
+        if share is not None and share > 2 / 3:
+            rest += ", and the frequencies are off by this ratio: one of the two rates is wrong"
+            rest += "; correct sample_rate_hz in manifest.csv"
+            found.append(Refusal(ordered[k].log, "odd-rate", rest))
+        elif (share is None or share > 1 / 3) and abs(ratio) < constants.RATE_NEAR and is_usual:
+            rest += ", too little for the frequencies to decide which is right; check both"
+            found.append(Refusal(ordered[k].log, "rate", rest, channel="sample_rate_hz"))
+    left_out = {one.log for one in found if one.reason in LEFT_OUT}
+    return tuple(one for one in ordered if one.log not in left_out), found
+
+
+def _shifts(own: Modes, others: Sequence[Modes]) -> FloatArray:
+    """Return ln f of the modes that all logs have, minus that of the others, ``(m, n_others)``."""
+    first, *rest = (
+        dict(zip(zip(one.names, one.sources, strict=True), one.ln_frequency, strict=True))
+        for one in (own, *others)
+    )
+    common = [mode for mode in first if mode[0] and all(mode in one for one in rest)]
+    return np.array([[first[mode] - one[mode] for one in rest] for mode in common])
+
+
+def _usual_rate(rates: FloatArray) -> BoolArray | None:
+    """Return which logs have the most frequent rate, at a tie the first; None if all have one."""
+    known = np.sort(rates[np.isfinite(rates)])
+    low, high = (np.searchsorted(known, rates * (1 + sign * 2 * AGREEMENT)) for sign in (-1, 1))
+    n = np.where(np.isfinite(rates), high - low, 0)
+    if n.max() == known.size:
+        return None
+    found: BoolArray = np.abs(rates / rates[int(np.argmax(n))] - 1) < 2 * AGREEMENT
+    return found
+
+
+def _share(own: Modes, others: Sequence[Modes], ticks: FloatArray, ratio: float) -> float | None:
+    """Return the share of ln of the ratio of two rates by which ln f of a log is off from others.
+
+    From what a line through the other logs (``ticks`` in s before or after, ``(n_others,)``)
+    predicts of the median mode: wear moves modes steadily, and some more. None where the ratio does
+    not exceed the error of that.
+    """
+    shifts = _shifts(own, others)
+    if not shifts.size:
+        return None
+    line = np.stack([np.ones(ticks.size), ticks / np.abs(ticks).max()], axis=1)
+    inverse = np.linalg.pinv(line.T @ line)
+    moved = np.median(shifts, axis=0)
+    trend = inverse @ line.T @ moved
+    rest = float(np.sum((moved - line @ trend) ** 2)) / max(1, ticks.size - 2)
+    std = max(float(np.median(own.frequency_std / own.frequency)), constants.RATE_SPREAD)
+    spread = float(np.sqrt(max(rest, std**2) * (1 + inverse[0, 0])))
+    return float(trend[0]) / ratio if abs(ratio) > constants.RATE_GATE * spread else None
+
+
 def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[Step, ...]:
     """Return the declared steps between the logs."""
     moments = [reading.metadata.recorded_at for reading in ordered]
@@ -563,6 +658,16 @@ def _line_up(
         part = np.array([one.cov for one in some])[:, of[:, None], of]
         cov[at[:, :, None], to[:, None], to] = part
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
+
+
+def rate_notices(refused: Sequence[Refusal]) -> list[Notice]:
+    """List the logs of another sample rate that were left out, or may have to be."""
+    notices = []
+    for reason, severity, what, to_do in _RATE_NOTICES:
+        logs = [one.log for one in refused if one.reason == reason and not one.mode]
+        if logs:
+            notices.append(Notice("odd-rate", severity, logs[0], f"{len(logs)} {what}", to_do))
+    return notices
 
 
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:

@@ -29,9 +29,10 @@ _KM, _MILLI, _MICRO = 1000.0, 1e-3, 1e-6
 _NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
 _DAMPING = ("damping_ratio", "damping_ratio_std")
 _NUMBERS = (*_NEEDED[1:], *_DAMPING, "travel_km", "correlation_f_zeta", "snr", "excitation_mm_s2")
+_RATE = "sample_rate_hz"
 _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
-_OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, "baseline")
+_OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, _RATE, "baseline")
 # Columns of text that may be missing, and what is assumed instead.
 _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
@@ -78,8 +79,10 @@ def read_estimates(
     if stage is not None:
         covariates += [c.name for c in stage.description.covariate if c.name not in covariates]
     shapes = [name for name in table.columns if name.startswith(_SHAPE)]
-    to_numbers(path, table, (*_NUMBERS, _LOOP, *covariates, *shapes))
-    fallbacks = dict.fromkeys((*_NUMBERS, _LOOP), np.nan) | _TEXTS | {"log": table["recorded_at"]}
+    to_numbers(path, table, (*_NUMBERS, _LOOP, _RATE, *covariates, *shapes))
+    fallbacks = (
+        dict.fromkeys((*_NUMBERS, _LOOP, _RATE), np.nan) | _TEXTS | {"log": table["recorded_at"]}
+    )
     for name, value in fallbacks.items():
         if name not in table.columns:
             table[name] = value
@@ -308,7 +311,10 @@ def _log(
         refused=(),
     )
     loop_error = loop * _MICRO if loop > 0 else None
-    return LogEstimates(log, "", metadata, modes, loop_error)
+    rate = float(first[_RATE])
+    return LogEstimates(
+        log, "", metadata, modes, loop_error, sample_rate=rate if rate > 0 else None
+    )
 
 
 def _covariance(path: Path, log: str, rows: pd.DataFrame, terms: pd.DataFrame | None) -> FloatArray:

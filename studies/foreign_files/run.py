@@ -32,6 +32,7 @@ import numpy as np
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.log import WARNINGS
 from lmshealth.io.reading import read_log
 from lmshealth.modal.frf.measured import read_responses
 from studies.foreign_files import dialects, writers
@@ -131,7 +132,7 @@ def judge(path: Path, columns: ColumnMap | None, held: Held, rate: float) -> str
         log = read_log(path, columns=columns)
     except BadLog as why:
         return f"refused: {why.reason}: {why.detail}"
-    left_out = {one.channel for one in log.refused if one.reason != "gaps"}
+    left_out = {one.channel for one in log.refused if one.reason not in WARNINGS}
     read = {channel.name: channel.values[:] for channel in log.channels}
     return compare(read, held, log.sample_rate, rate, left_out)
 

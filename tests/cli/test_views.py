@@ -161,6 +161,14 @@ def test_channels_used_in_part_are_no_refusals(capsys: pytest.CaptureFixture[str
     assert "3 missing" in second and "no bytes" not in second
 
 
+def test_a_flagged_rate_is_no_refusal(capsys: pytest.CaptureFixture[str]) -> None:
+    """A log is refused for its rate as a whole, or used with a warning that names the column."""
+    flag = {"reason": "rate", "channel": "reference_velocity", "detail": "20040 Hz"}
+    print_modes([], [refused() | flag, refused() | {"reason": "rate", "detail": "21000 Hz"}])
+    first, second = capsys.readouterr().out.split("Used in part\n")
+    assert "21000 Hz" in first and "20040 Hz" in second
+
+
 def response_line(frequency: float) -> dict[str, object]:
     """Make a row of a frequency response."""
     return {

@@ -151,7 +151,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
     """Hz, km and °C stand in the table; the std of f is f times the std of ln f."""
     covariates = {"temperature_c": 21.5, "payload_kg": 4.0, "position_mm": -20.0}
     metadata = Metadata("test-A", WHEN, 123_400.0, covariates, servo_id="stiff")
-    reading = LogEstimates("a.h5", "d", metadata, two_modes(), 1.5e-6)
+    reading = LogEstimates("a.h5", "d", metadata, two_modes(), 1.5e-6, sample_rate=2e4)
     table = frame(COLUMNS["modes"], modes_rows(reading))
     row = table.iloc[0]
     assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
@@ -161,6 +161,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
     assert (row["payload_kg"], row["position_mm"], row["servo_id"]) == (4.0, -20.0, "stiff")
     assert row["delta_e_below_40hz_um"] == pytest.approx(1.5)
     assert row["frequency_std_hz"] == pytest.approx(62.0e-3)
+    assert row["sample_rate_hz"] == 20_000
     assert row["damping_ratio_std"] == pytest.approx(0.02 * 0.1)
 
 

@@ -19,6 +19,7 @@ from lmshealth.tracking.history import (
     Series,
     build_history,
     missing_mode_notices,
+    rate_notices,
     sort_by_time,
 )
 from lmshealth.tracking.maintenance import Action
@@ -428,3 +429,66 @@ def test_arrays_are_read_only(history: History) -> None:
     for array in (history.cov, history.steps[0].there, followed.drift, followed.innovations):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1
+
+
+def rated(rates: Sequence[float | None], drift: float = -5e-3, follow: float = 1.0) -> list:
+    """Make readings of two modes that wear; frequencies follow rates other than 20 kHz."""
+    rng = np.random.default_rng(3)
+    readings = []
+    for k, rate in enumerate(rates):
+        off = follow * np.log((rate or 20e3) / 20e3) + k * drift
+        one = make_reading(str(k), k, k * 1e5, {"roll": 4.8 + off, "pitch": 4.9 + 1.1 * off})
+        moved = one.modes.ln_frequency + rng.normal(0, 5e-4, 2)
+        cov = one.modes.cov * 1e-4
+        modes = replace(one.modes, ln_frequency=moved, cov=cov)
+        readings.append(replace(one, modes=modes, sample_rate=rate))
+    return readings
+
+
+@pytest.mark.parametrize("at", [0, 7, 11])
+@pytest.mark.parametrize("odd", [19.6e3, 20.4e3, 19e3])
+def test_a_log_whose_frequencies_follow_another_rate_is_left_out(stage, at, odd):
+    """One header of twelve that is off moves all frequencies of its log; both rates are stated."""
+    rates = [20e3 if k != at else odd for k in range(12)]
+    history, refused = build_history(rated(rates), stage)
+    assert history.logs == tuple(str(k) for k in range(12) if k != at)
+    [one] = [own for own in refused if own.reason == "odd-rate"]
+    assert one.log == str(at) and f"{odd:g} Hz" in one.detail and "20000 Hz" in one.detail
+    [notice] = rate_notices(refused)
+    assert (notice.code, notice.severity, notice.where) == ("odd-rate", "caution", str(at))
+
+
+def test_headers_that_alternate_keep_the_first_rate(stage):
+    """Where both rates are as frequent, the logs that differ from the first are left out."""
+    history, refused = build_history(rated([20e3, 19.6e3] * 6), stage)
+    assert history.logs == tuple(str(k) for k in range(0, 12, 2))
+    assert {one.reason for one in refused} == {"odd-rate"} and len(refused) == 6
+
+
+@pytest.mark.parametrize(
+    "rates",
+    [
+        [20e3] * 12,
+        [None] * 6 + [20e3] * 6,
+        [20e3] * 8 + [10e3] * 4,  # another setting
+        [20e3, 19.6e3] * 6,
+        [51.2e3] * 10 + [50e3] * 2,
+        [20e3 * (1 + 1e-4 * (k % 2)) for k in range(12)],  # two crystals
+        [3200 * (1 + 3e-3 * np.sin(k)) for k in range(12)],  # an oscillator that drifts
+        [20e3, 19.6e3],
+    ],
+)
+def test_other_rates_whose_frequencies_agree_are_kept(stage, rates):
+    """A rate that was set otherwise moves no frequency."""
+    history, refused = build_history(rated(rates, follow=0.0), stage)
+    assert len(history.logs) == len(rates) and rate_notices(refused) == []
+
+
+def test_a_rate_that_is_off_by_less_than_modes_resolve_is_noted(stage):
+    """The log is kept, with both rates in its row and a note."""
+    history, refused = build_history(rated([20e3] * 11 + [19.99e3]), stage)
+    assert len(history.logs) == 12
+    [one] = refused
+    assert (one.log, one.reason, one.channel) == ("11", "rate", "sample_rate_hz")
+    assert "19990 Hz" in one.detail and "20000 Hz" in one.detail
+    assert [notice.severity for notice in rate_notices(refused)] == ["note"]

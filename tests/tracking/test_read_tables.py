@@ -61,6 +61,13 @@ def notes(tmp_path: Path, text: str, terms: str = "") -> str:
     return "\n".join(read_estimates(path, cross_terms=cross)[1])
 
 
+def test_the_sample_rate_of_a_log_is_read(tmp_path: Path) -> None:
+    """A table may state the sample rate of its logs, which then are compared with each other."""
+    text = HEAD.strip() + ",sample_rate_hz\n" + row().strip() + ",20000\n"
+    assert [log.sample_rate for log in read(tmp_path, text)] == [20_000.0]
+    assert [log.sample_rate for log in read(tmp_path, HEAD + row())] == [None]
+
+
 def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
     """Hz become ln f with its relative standard deviation; km become m."""
     (reading,) = read(tmp_path, HEAD + row() + row(mode="pitch", f=136.6, std=0.2, rho=0))
