@@ -291,7 +291,7 @@ def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     """
     n, n_moments, n_parameters = x.shape
     drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
-    return np.moveaxis(drift.reshape(-1, n, n_moments, len(data.modes)), 3, 0)
+    return np.moveaxis(drift.reshape(1 + n_parameters, n, n_moments, len(data.modes)), 3, 0)
 
 
 def _reduced(

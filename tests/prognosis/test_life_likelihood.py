@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
@@ -570,3 +571,18 @@ def test_a_scenario_without_coordinates_has_draws_of_one_life(
     assert off.shape == (2000, 1, 1)
     assert np.unique(off).size == 2000
     assert (rate > 0).all()
+
+
+def test_a_law_that_ends_before_the_first_log_is_no_error(tmp_path: Path) -> None:
+    """A prior of lives of a metre leaves the map: that scenario is empty, or all are refused."""
+    history = rough_history(np.random.default_rng(10))
+    law = '{ kind = "hertz-wear", life_km = { kind = "lognormal", median = 1e-3, sigma = 0.1 } }'
+    others = {f"[{law}, {{ kind = 'none' }}]": False, law: True}
+    for k, (laws, is_refused) in enumerate(others.items()):
+        text = re.sub(r"law = .*", f"law = {laws}", FADING)
+        stage = make_stage(tmp_path / str(k), (text,))
+        if is_refused:
+            with pytest.raises(NotEnoughData, match="no life of the prior stays inside the map"):
+                LifeLikelihood.of(history, stage)
+        else:
+            assert LifeLikelihood.of(history, stage).grid.walk.size
