@@ -31,7 +31,7 @@ class Program:
     def environment(self) -> dict[str, str]:
         """Return the environment of this process, with the modules of the revision in front."""
         own = {"PYTHONPATH": str(self.code), "COLUMNS": "100", "OPENBLAS_NUM_THREADS": "1"}
-        own["PYTHONSAFEPATH"] = "1"  # else -m prefers the code of the present folder
+        own["PYTHONSAFEPATH"] = "1"  # else the working directory is in front of it
         return {**os.environ, **own}
 
     def command(self, *arguments: str | Path) -> list[str]:
