@@ -129,7 +129,8 @@ def read_sep005(
     used = ColumnMap() if columns is None else columns
     try:
         given = [_sep005(one, k) for k, one in enumerate(channels)]
-        chosen, content = choose([one.channel for one in given], used)
+        first = min((datetime.fromisoformat(one.start) for one in given if one.start), default=None)
+        chosen, content = choose([one.described(first) for one in given], used)
         read = [given[k] for k in chosen.values()]
         samples = {key: as_samples(given[k].data) for key, k in chosen.items()}
         times = [one.time for one in read if one.time is not None]
@@ -138,9 +139,7 @@ def read_sep005(
         if times:
             samples["time_s"] = as_samples(times[0])
         starts = sorted({one.start for one in read} - {""})
-        if len(starts) > 1:
-            raise Unusable("time", f"start_timestamp differs: {listed(starts)}; needed the same")
-        metadata = content.metadata | {"recorded_at": "".join(starts)}
+        metadata = content.metadata | {"recorded_at": "".join(starts[:1])}
         content = replace(content, columns=samples, metadata=metadata)
         digest = hashlib.sha256(repr([(one.channel, one.start) for one in given]).encode())
         for one in given:
@@ -158,6 +157,12 @@ class _Sep005(NamedTuple):
     data: FloatArray
     time: FloatArray | None
     start: str
+
+    def described(self, first: datetime | None) -> Described:
+        """Return the channel with its start since that of the earliest, in s."""
+        own = datetime.fromisoformat(self.start) if self.start else None
+        since = None if own is None or first is None else (own - first).total_seconds()
+        return replace(self.channel, start=since, size=self.data.size)
 
 
 def _sep005(channel: Mapping[str, Any], k: int) -> _Sep005:
@@ -279,6 +284,9 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         near = nearest(absent, content.present)
         raise Unusable("columns", f"the column map needs {listed(absent)}; there: {near}{hint}")
     series = []
+    begin = max((content.late.get(source, 0) for source in content.columns), default=0)
+    stops = (content.late.get(name, 0) + own.size for name, own in content.columns.items())
+    end = min(stops, default=0)
     for source in tuple(content.columns):
         # Taken out: a log of hundreds of channels is in memory once.
         values = content.columns.pop(source)
@@ -290,7 +298,10 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
         limit = np.inf if signal.role == "time" else constants.LARGEST_MAGNITUDE
-        series.append(_Series(signal, in_unit(values, signal.factor, limit)))
+        # Channels that start later than others are used where all have samples.
+        first = content.late.get(source, 0)
+        common = (begin - first, max(end - first, begin - first)) if content.late else None
+        series.append(_Series(signal, in_unit(values, signal.factor, limit, common)))
     if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
     if not any(item.signal.role in _DYNAMIC for item in series):

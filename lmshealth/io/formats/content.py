@@ -3,7 +3,7 @@
 import gzip
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -25,7 +25,8 @@ class Content:
     ``columns`` are the wanted ones under their names in the file, ``(n_samples,)`` each; metadata
     are text as in the file; ``present`` are the names of all columns, for messages. Refused are
     wanted channels that cannot go with the others; the name of the log is added later. ``guessed``
-    lists what neither the file nor the column map states.
+    lists what neither the file nor the column map states; ``late`` has the number of samples by
+    which a column starts after those that are not in it.
     """
 
     columns: dict[str, Samples]
@@ -33,6 +34,7 @@ class Content:
     present: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
     guessed: tuple[str, ...] = ()
+    late: dict[str, int] = field(default_factory=dict)
 
 
 Load = Callable[[Path, ColumnMap, float], Content]

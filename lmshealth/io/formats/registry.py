@@ -18,6 +18,7 @@ from lmshealth.io.formats.csv import CSV
 from lmshealth.io.formats.hdf5 import HDF5
 from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.mat import MAT
+from lmshealth.io.formats.moments import without_epoch
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
@@ -101,7 +102,7 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
         content = load_by(form.name, form.load, path, columns, max_memory)
     if form not in FORMATS and (fault := fault_of(content)):
         raise Unusable("format", f"the plug-in for {form.name} returns {fault}; update it")
-    return content
+    return without_epoch(content, columns)
 
 
 def fault_of(content: object) -> str:
