@@ -22,7 +22,13 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
-from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
+from lmshealth.io.formats.dialect import (
+    Dialect,
+    encoding_of,
+    fields_of,
+    find_dialect,
+    is_number_or_moment,
+)
 from lmshealth.io.formats.moments import SinceFirst, parse_moments
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose
@@ -46,8 +52,9 @@ _SEGMENT = re.compile(
 )
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
-# The last row of some exports.
-_END = re.compile(rb"(?<=\n)EOF[^\r\n]*\s*$")
+# Most bytes of text behind the rows: rates, counts and ends that exporters write there.
+_TRAILER = 1 << 12
+_WORD = re.compile(r"[^\W\d_]{3}")
 
 
 class Text:
@@ -67,6 +74,7 @@ class Text:
         """Go behind the first lines, from where on rows are expected."""
         self._stream.seek(0)
         self.position = self.pending = self.n_fields = 0
+        self.trailer = ""  # what is left out behind the rows
         self._tail = b""  # bytes after the last line feed
         self._ahead = b""  # the block that is read next
         for _ in range(n_lines):
@@ -84,8 +92,11 @@ class Text:
         a row, ``too-large`` for more than the file can honestly hold.
         """
         block, self._ahead = self._ahead or self._stream.read(size), self._stream.read(size)
-        if not self._ahead:
-            block = _END.sub(b"", block)
+        while 0 < len(self._ahead) < _TRAILER and (more := self._stream.read(size)):
+            self._ahead += more
+        if len(self._ahead) < _TRAILER:  # the last block
+            block, self._ahead = block + self._ahead, b""
+            block = self._rows(block)
         block = self._checked(block)
         if not block and self._tail and not self._tail.endswith(b"\r"):
             # The last number of a file that ends inside a row may be incomplete.
@@ -98,6 +109,31 @@ class Text:
             needed = "needed shorter rows, and a second quote to every quote"
             raise Unusable("corrupt", f"{found}; {needed}")
         return block
+
+    def _rows(self, block: bytes) -> bytes:
+        """Leave out the lines of text behind the last row."""
+        start = max(0, len(block) - _TRAILER)
+        lines = block[start:].splitlines(keepends=True)
+        kept = len(lines)
+        while kept and (not lines[kept - 1].strip() or self._is_text(lines[kept - 1])):
+            kept -= 1
+        n_left_out = sum(bool(line.strip()) for line in lines[kept:])
+        row = lines[kept - 1].decode("latin-1").strip() if kept else ""
+        # A block that is text to its beginning has no rows; rows may begin with text, too.
+        if not self.n_fields or not n_left_out or _WORD.match(row) or (start and kept < 2):
+            return block
+        self.trailer = f"{n_left_out} lines of text behind the rows left out"
+        return block[: len(block) - sum(map(len, lines[kept:]))]
+
+    def _is_text(self, line: bytes) -> bool:
+        """Return whether a line is a remark or begins with a word; a word alone may be damage."""
+        text = line.decode("latin-1").strip()
+        if text.startswith(("#", "EOF")):
+            return True
+        first = (fields_of(text, self._delimiter) or [""])[0]
+        several = self.n_fields > 1 or len(text.split()) > 1
+        is_word = _WORD.match(first) and not is_number_or_moment(first)
+        return bool(is_word) and several and "\0" not in text
 
     def __iter__(self) -> Iterator[bytes]:
         """Iterate over lines; pandas requires it of a file."""
@@ -150,6 +186,7 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
         times = {c: columns.signal(target).factor for c in chosen
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
         samples = _numbers(text, chosen, dialect, times)
+        guessed += [text.trailer] if text.trailer else []
     elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
         text.begin(dialect.start)
         while stream.read(_HEAD_BYTES):

@@ -142,6 +142,12 @@ def fields_of(line: str, delimiter: str) -> list[str]:
         raise corrupt(f"a line cannot be split: {error}") from error
 
 
+def is_number_or_moment(word: str) -> bool:
+    """Return whether a field of a row may be one, also an empty field."""
+    kinds = (*_NUMBER.values(), _MOMENT, _THOUSANDS)
+    return any(kind.fullmatch(word) for kind in kinds)
+
+
 def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
     """Read the leading lines ``# key: value``, and return the line at which they end."""
     metadata: dict[str, str] = {}

@@ -13,6 +13,8 @@ from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import Content
 from lmshealth.io.refusal import Unusable
 
+# End of the note of what was taken for what.
+SINCE_EPOCH = "since an epoch"
 # Least magnitude of time stamps that count ticks since an epoch, ticks of a second, and that epoch
 # as Unix time in s; the last time in s, of the year 2286, that is read in the unit of its column;
 # and Unix times from 2001 to 2039 (those of LabVIEW, since 1904, are later).
@@ -94,7 +96,7 @@ def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], 
     spool = Spool()
     for _, block in blocks(time):
         spool.append((block - start) / (scale * unit))
-    guessed = (f"times in {what} since an epoch",) if what else ()
+    guessed = (f"times in {what} {SINCE_EPOCH}",) if what else ()
     if epoch is None:
         return spool.samples(), guessed, {}
     moment = _UNIX + timedelta(seconds=start / scale + epoch)

@@ -44,14 +44,11 @@ _HEADER, _FILL = 4096, b"\0 \r\n\x1a"
 # Columns of the values in a row by type of the ordinate and spacing of the abscissa; those of
 # single precision take 13 each.
 _SINGLE = (2, 5)
-_WIDTHS = {(4, _EVEN): (20,) * 4, (6, _EVEN): (20,) * 4}
+_WIDTHS: dict[tuple[int, int], tuple[int, ...]] = {(4, _EVEN): (20,) * 4, (6, _EVEN): (20,) * 4}
 _WIDTHS |= {(4, _UNEVEN): (13, 20) * 2, (6, _UNEVEN): (13, 20, 20)}
 
 # Date in the third line of a header.
-_DATE = re.compile(
-    r"(?P<d>\d\d?)-(?P<m>[A-Za-z]{3})-(?P<y>\d{2,4})\s+(?P<h>\d\d?):(?P<min>\d\d):(?P<s>\d\d)"
-)
-_MONTHS = "JANFEBMARAPRMAYJUNJULAUGSEPOCTNOVDEC"
+_DATE = re.compile(r"(\d\d?)-([A-Za-z]{3})-(?:\d\d)?(\d\d)\s+(\d\d?):(\d\d):(\d\d)")
 
 # Bytes of memory for a byte of the file and of the data set that is read.
 _FILE_MEMORY, _SET_MEMORY = 3, 16
@@ -286,12 +283,11 @@ def _dates(headers: Sequence[Header]) -> list[float]:
     lengths = [header["num_pts"] * header["abscissa_inc"] for header in headers]
     if not all(found) or not headers:
         return [0.0] * len(headers)
-    parts = [(int(m["y"]) % 100 + 2000, _MONTHS.find(m["m"].upper()) // 3 + 1,
-              *(int(m[key]) for key in ("d", "h", "min", "s"))) for m in found if m]  # fmt: skip
     try:
-        since = [(datetime(*part) - datetime(*parts[0])).total_seconds() for part in parts]
+        moments = [datetime.strptime(" ".join(m.groups()), "%d %b %y %H %M %S") for m in found if m]
     except ValueError:
         return [0.0] * len(headers)
+    since = [(moment - moments[0]).total_seconds() for moment in moments]
     apart = max(since) - min(since) > max(lengths)
     return since if apart else [0.0] * len(headers)
 
