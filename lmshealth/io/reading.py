@@ -17,6 +17,7 @@ from lmshealth.io.buffers import Samples, as_samples, in_unit
 from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.foreign import frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.formats.unit_channels import Described, choose
 from lmshealth.io.log import Channel, ChannelKind, Log, Refusal
@@ -232,7 +233,7 @@ def _to_log(
     """Apply the log contract to the content of a file."""
     filled = {key: value for key, value in overrides.items() if value.strip()}
     metadata, rate = parse_metadata(content.metadata | layout.constants() | filled)
-    series = _series(content, layout)
+    series = _series(content, layout, rate)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)
     refused = [replace(refusal, log=name) for refusal in content.refused]
@@ -275,8 +276,11 @@ def _to_log(
     )
 
 
-def _series(content: Content, columns: ColumnMap) -> list[_Series]:
-    """Name the columns, convert them to SI and compare their lengths."""
+def _series(content: Content, columns: ColumnMap, rate: float | None) -> list[_Series]:
+    """Name the columns, convert them to SI and compare their lengths.
+
+    The rate in Hz of the metadata places samples in time, as a column of times does.
+    """
     there = f"there: {listed(content.present)}"
     hint = f"; read with {', '.join(content.guessed)}" if content.guessed else ""
     left_out = {refusal.channel for refusal in content.refused}
@@ -304,7 +308,12 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         series.append(_Series(signal, in_unit(values, signal.factor, limit, common)))
     if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
-    if not any(item.signal.role in _DYNAMIC for item in series):
+    roles = {item.signal.role for item in series}
+    is_timed = "time" in roles or rate is not None
+    axis = frequency_column(content.present)
+    if axis and not (is_timed and roles & set(_DYNAMIC)):
+        raise over_frequency(axis)
+    if not roles & set(_DYNAMIC):
         hint += "" if columns.columns else "; a column map (--columns) translates other names"
         raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
     lengths = {item.signal.name: item.values.size for item in series}

@@ -23,6 +23,7 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks, in_unit
 from lmshealth.io.column_map import SI_TIMES, ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.foreign import frequency_column, over_frequency
 from lmshealth.io.formats.moments import SINCE_EPOCH
 from lmshealth.io.formats.registry import load
 from lmshealth.io.formats.text_layouts import LOCAL_TIME
@@ -60,8 +61,8 @@ _CROSSINGS, _ONE_SIDED = (50, 0.001), 10.0
 # taken in s without a witness: in ms it would be that of a recorder of 100 kHz.
 _LONG_UNITS = {"min": 60.0, "h": 3600.0}
 _CERTAIN_RATE = 100.0
-# Sample rates in Hz of records of vibrations. Even numbers without a name are times if the rate that
-# they give in a unit is so near to that of another source.
+# Sample rates in Hz of records of vibrations. Even numbers without a name are times if the rate
+# that they give in a unit is so near to that of another source.
 _RATES, _NEAR = (1.0, 1e7), 0.1
 _DURATION = re.compile(r"duration|dauer|dur[ée]e|total.?time|length", re.IGNORECASE)
 # Largest relative difference between a duration that a file states and that of its times.
@@ -146,6 +147,9 @@ def propose(
     content_digest(path, name=label)
     try:
         content, columns, rest = _columns(path, max_memory)
+        axis = frequency_column(content.present)
+        if axis and all(one.is_even for one in columns[:1]):
+            raise over_frequency(axis)
         stated = parse_metadata(content.metadata)[1]
         if rate and stated and abs(rate / stated - 1) > constants.AGREEMENT:
             detail = f"the file states {stated:.8g} Hz, --sample-rate is {rate:.8g} Hz"
@@ -239,7 +243,9 @@ def _times(
     or without one may be in several units.
     """
     stated = {one.name: _unit_of(one) for one in columns}
-    named = [o for o in columns if stated[o.name] or (_TIME.search(o.name) and o.unit in ("", "-"))]
+    named = [
+        o for o in columns if stated[o.name] or (_TIME.search(o.name) and o.unit in _RAW_UNITS)
+    ]
     unnamed = [one for one in columns if one.name.isdecimal() and one.is_even]
     named.sort(key=lambda one: not stated[one.name])
     found: dict[str, Guess] = {}
@@ -352,7 +358,7 @@ def _unit_of(one: _Column) -> str:
     if one.moments:
         return "s"
     own = unit_key(one.unit, "time") or (one.unit if one.unit in _LONG_UNITS else "")
-    return own or (_time_unit(one.name) if one.unit in ("", "-") else None) or ""
+    return own or (_time_unit(one.name) if one.unit in _RAW_UNITS else None) or ""
 
 
 def _time_unit(name: str) -> str | None:

@@ -187,6 +187,9 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
         samples = _numbers(text, chosen, dialect, times)
         guessed += [text.trailer] if text.trailer else []
+    elif not (dialect.has_rows or columns.csv.delimiter) and len(lines) > dialect.start:
+        detail = "text without rows of numbers; needed a line of names and rows of samples"
+        raise Unusable("format", detail)
     elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
         text.begin(dialect.start)
         while stream.read(_HEAD_BYTES):

@@ -51,7 +51,7 @@ class Dialect:
     """How a text is read: marks, a channel for each field of a row, and where the rows begin.
 
     ``start`` counts the lines before the rows; ``guessed`` lists what neither the log contract nor
-    the column map states.
+    the column map states; ``has_rows`` is whether the first lines hold any row of numbers.
     """
 
     delimiter: str
@@ -60,6 +60,7 @@ class Dialect:
     start: int
     metadata: dict[str, str] = field(default_factory=dict)
     guessed: tuple[str, ...] = ()
+    has_rows: bool = True
 
 
 class _Rows(NamedTuple):
@@ -128,7 +129,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     names, units, where = _names(heads, found, max(n_first, found.n_fields), columns)
     guessed = _guessed(found, layout, where, begin)
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
-    return Dialect(found.delimiter, found.decimal, channels, found.first, metadata, guessed)
+    marks, has_rows = (found.delimiter, found.decimal), found.share > 0
+    return Dialect(*marks, channels, found.first, metadata, guessed, has_rows)
 
 
 def fields_of(line: str, delimiter: str) -> list[str]:
@@ -280,7 +282,8 @@ def _names(
     others = [fields for _, fields in (*heads[max(k - 1, 0) : k], *heads) if fields is not names]
     fitting = (one for one in others if len(one) == len(names) and all(map(_is_unit, one)))
     units = next(filter(any, fitting), [""] * len(names))
-    return names, [word.strip(" []()") for word in units], where
+    bare = (word.strip(" []()") for word in units)
+    return names, ["" if _KEY.fullmatch(word) else word for word in bare], where
 
 
 def _is_unit(word: str) -> bool:

@@ -19,7 +19,7 @@ from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
 from lmshealth.io.formats.unit_channels import Described, choose, rate_of
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")
 _BEGIN = re.compile(rb"[\s\x1a]*?^    -1[ \t]*\r?\n", re.MULTILINE)
@@ -34,6 +34,18 @@ _TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
 _RESPONSE, _COHERENCE = 4, 6
 _REAL, _COMPLEX = (2, 4), (5, 6)
+# Names of other functions and data sets, for messages.
+_FUNCTIONS = {
+    **{0: "unknown", 1: "complex time response", 2: "spectrum", 3: "cross spectrum"},
+    **{4: "frequency response", 5: "transmissibility", 6: "coherence", 7: "correlation"},
+    **{8: "cross correlation", 9: "power spectral density", 10: "energy spectral density"},
+    **{12: "spectrum", 27: "order function"},
+}
+_SETS = {
+    **{15: "nodes", 18: "coordinate systems", 55: "mode shapes", 82: "lines of a geometry"},
+    **{151: "header", 164: "units", 780: "elements", 781: "nodes", 2411: "nodes"},
+    **{2412: "elements", 2414: "analysis", 2420: "coordinate systems", 2467: "groups"},
+}
 # Names in a header of degrees of freedom by their code; rotations are 4 to 6.
 _DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 _HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
@@ -60,6 +72,8 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with TemporaryDirectory(prefix="lmshealth-") as folder:
         file = _File(path, Path(folder), max_memory)
         names = _names(file.headers)
+        if not columns.columns and not any(map(_is_time_record, file.headers)):
+            raise _no_time_records(file.headers, names, file.others)
         dates = _dates(file.headers)
         described = [_describe(*named) for named in zip(file.headers, names, dates, strict=True)]
         chosen, content = choose(described, columns)
@@ -129,7 +143,8 @@ def _dof(header: Header, role: str) -> str:
 class _File:
     """The data sets 58 of a file, and what pyuff reads of their headers.
 
-    ``headers`` have the place of the data set among all data sets, too, from 1.
+    ``headers`` have the place of the data set among all data sets, too, from 1; ``others`` are the
+    numbers of the other data sets.
     """
 
     def __init__(self, path: Path, folder: Path, max_memory: float) -> None:
@@ -137,7 +152,9 @@ class _File:
             import pyuff
         check_memory("the file", _FILE_MEMORY * path.stat().st_size, max_memory)
         self._max_memory = max_memory
-        found = dict(_data_sets(path.read_bytes()))
+        every = list(_data_sets(path.read_bytes()))
+        found = {place: lines for place, number, lines in every if number == _FUNCTION}
+        self.others = sorted({number for _, number, _ in every} - {_FUNCTION})
         self._sizes = [len(lines) for lines in found.values()]
         copy = folder / "functions.uff"
         with copy.open("wb") as stream:
@@ -175,8 +192,8 @@ class _File:
         return read["x"], read["data"]
 
 
-def _data_sets(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Find the data sets 58 and check that all are whole: place among all, lines without tags."""
+def _data_sets(content: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Find the data sets and check that all are whole: place, number, and lines of those of 58."""
     at = place = 0
     while begin := _BEGIN.match(content, at):
         place, at = place + 1, begin.end()
@@ -193,11 +210,10 @@ def _data_sets(content: bytes) -> Iterator[tuple[int, bytes]]:
         end = (_BINARY_END if is_binary else _END).search(content, after)
         if end is None:
             raise corrupt("the last data set is cut off")
-        if is_function:
-            lines = content[at : end.start()]
-            if lines.count(b"\n") < 1 + _N_RECORDS:
-                raise _malformed(place)
-            yield place, lines
+        lines = content[at : end.start()] if is_function else b""
+        if is_function and lines.count(b"\n") < 1 + _N_RECORDS:
+            raise _malformed(place)
+        yield place, int(number[0]), lines
         at = end.end()
     if content[at:].strip(b" \t\r\n\x1a"):
         raise corrupt(f"no data set begins at byte {at}")
@@ -262,6 +278,22 @@ def _is_binary(lines: bytes) -> bool:
 
 def _malformed(place: int) -> Unusable:
     return Unusable("corrupt", f"data set {place} does not keep the format 58; export it again")
+
+
+def _no_time_records(
+    headers: Sequence[Header], names: Sequence[str], others: Sequence[int]
+) -> Unusable:
+    """Return the refusal of a file of other functions, or of a geometry."""
+    needed = "needed acceleration over time (data sets 58, function type 1)"
+    kinds = sorted({header["func_type"] for header in headers})
+    if kinds:
+        text = listed(f"function type {kind} ({_FUNCTIONS.get(kind, 'another')})" for kind in kinds)
+        found = f"holds no time record but {text}: {listed(names)}"
+        if _RESPONSE in kinds:
+            needed += "; `lmshealth frf` reads frequency responses"
+        return Unusable("columns", f"{found}; {needed}")
+    text = listed(f"{number} ({_SETS.get(number, 'another')})" for number in others)
+    return Unusable("format", f"holds the data sets {text}, and no measured functions; {needed}")
 
 
 def _names(headers: Sequence[Header]) -> list[str]:
