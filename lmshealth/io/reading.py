@@ -233,7 +233,7 @@ def _to_log(
     """Apply the log contract to the content of a file."""
     filled = {key: value for key, value in overrides.items() if value.strip()}
     metadata, rate = parse_metadata(content.metadata | layout.constants() | filled)
-    series = _series(content, layout, rate)
+    series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)
     refused = [replace(refusal, log=name) for refusal in content.refused]
@@ -276,11 +276,8 @@ def _to_log(
     )
 
 
-def _series(content: Content, columns: ColumnMap, rate: float | None) -> list[_Series]:
-    """Name the columns, convert them to SI and compare their lengths.
-
-    The rate in Hz of the metadata places samples in time, as a column of times does.
-    """
+def _series(content: Content, columns: ColumnMap) -> list[_Series]:
+    """Name the columns, convert them to SI and compare their lengths."""
     there = f"there: {listed(content.present)}"
     hint = f"; read with {', '.join(content.guessed)}" if content.guessed else ""
     left_out = {refusal.channel for refusal in content.refused}
@@ -308,14 +305,7 @@ def _series(content: Content, columns: ColumnMap, rate: float | None) -> list[_S
         series.append(_Series(signal, in_unit(values, signal.factor, limit, common)))
     if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
-    roles = {item.signal.role for item in series}
-    is_timed = "time" in roles or rate is not None
-    axis = frequency_column(content.present)
-    if axis and not (is_timed and roles & set(_DYNAMIC)):
-        raise over_frequency(axis)
-    if not roles & set(_DYNAMIC):
-        hint += "" if columns.columns else "; a column map (--columns) translates other names"
-        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
+    _check_signals({item.signal.role for item in series}, content.present, columns, there + hint)
     lengths = {item.signal.name: item.values.size for item in series}
     if len(set(lengths.values())) > 1:
         found = listed(f"{name} {size}" for name, size in lengths.items())
@@ -323,6 +313,19 @@ def _series(content: Content, columns: ColumnMap, rate: float | None) -> list[_S
     if (shortest := min(lengths.values())) < constants.SHORTEST_PIECE:
         raise Unusable("empty", f"{shortest} samples; needed at least {constants.SHORTEST_PIECE}")
     return series
+
+
+def _check_signals(
+    roles: set[Role], present: Sequence[str], columns: ColumnMap, there: str
+) -> None:
+    """Require a signal over time; a column map may name one beside a measured frequency."""
+    has_signal = bool(roles & set(_DYNAMIC))
+    is_certain = has_signal and ("time" in roles or bool(columns.columns))
+    if not is_certain and (axis := frequency_column(present)):
+        raise over_frequency(axis)
+    if not has_signal:
+        step = "" if columns.columns else "; a column map (--columns) translates other names"
+        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{step}")
 
 
 def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:

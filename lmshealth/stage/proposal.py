@@ -57,6 +57,7 @@ _OTHERS = re.compile(r"temp|humid|press|druck|speed|torque|moment|pos(?!t)|vel|s
 # A vibration crosses its mean so often at least: in all, and as a share of its samples. A spectrum
 # or a magnitude rises so much further above its mean than it falls below.
 _CROSSINGS, _ONE_SIDED = (50, 0.001), 10.0
+_ONE_SIGN = "has one sign, as a spectrum or a magnitude"
 # SI values of units of time that are no suffix, and the sample rate in Hz from which on times are
 # taken in s without a witness: in ms it would be that of a recorder of 100 kHz.
 _LONG_UNITS = {"min": 60.0, "h": 3600.0}
@@ -160,7 +161,9 @@ def propose(
         if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
             found = "; ".join(f"{g.source}: {g.why}" for g in guesses) or "no columns"
             detail = f"nothing looks like a following error or an acceleration ({found})"
-            raise Unusable("columns", f"{detail}; write a column map by hand")
+            is_series = others and not any(g.why == _ONE_SIGN for g in guesses)
+            step = "write a column map by hand" if is_series else "needed samples over time"
+            raise Unusable("columns", f"{detail}; {step}")
         timed = any(g.target.startswith("time") for g in guesses)
         if not timed and rate is None and stated is None:
             why = "".join(f"; {g.source}: {g.why}" for g in times.values())
@@ -218,20 +221,20 @@ def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], lis
 def _contents(
     path: Path, names: Sequence[str], max_memory: float
 ) -> Iterator[tuple[Content, bool]]:
-    """Yield contents with columns of numbers, together if all are, and those with moments."""
-    for group in (names, *((name,) for name in names)) if len(names) > 1 else (names,):
-        try:
-            targets = {f"acc_probed_{k}_g": name for k, name in enumerate(group)}
-            if group:
-                yield load(path, ColumnMap(columns=targets), max_memory), False
-            if group is names:
-                return
-        except Unusable:
-            if len(group) == 1:
-                with suppress(Unusable):
-                    found = load(path, ColumnMap(columns={"time_s": group[0]}), max_memory)
-                    if group[0] in found.columns:
-                        yield found, True
+    """Yield contents with columns of numbers, as many at once as can be, and with moments."""
+    targets = {f"acc_probed_{k}_g": name for k, name in enumerate(names)}
+    try:
+        if names:
+            yield load(path, ColumnMap(columns=targets), max_memory), False
+    except Unusable:
+        if len(names) > 1:
+            for half in (names[: len(names) // 2], names[len(names) // 2 :]):
+                yield from _contents(path, half, max_memory)
+            return
+        with suppress(Unusable):
+            found = load(path, ColumnMap(columns={"time_s": names[0]}), max_memory)
+            if names[0] in found.columns:
+                yield found, True
 
 
 def _times(
@@ -402,7 +405,7 @@ def _by_samples(one: _Column, guess: Guess) -> Guess:
     if one.moments or n < least or _OTHERS.search(one.name):
         return guess
     if low >= 0 and high - mean > _ONE_SIDED * (mean - low):
-        return guess._replace(why="has one sign, as a spectrum or a magnitude")
+        return guess._replace(why=_ONE_SIGN)
     why = f"looks like an accelerometer: crosses its mean {n} times in {one.samples.size} samples"
     return _signal("acc", one, why)
 

@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.foreign import describe
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
@@ -85,7 +86,10 @@ def gzipped(form: Format, others: Iterable[str] = ()) -> Format:
     def load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         with unpacked(path) as copy:
             with copy.open("rb") as stream:
-                if not form.sniff(stream.read(_BLOCK >> 8)):
+                head = stream.read(_BLOCK >> 8)
+                if not form.sniff(head):
+                    if foreign := describe(head, copy):
+                        raise Unusable("format", foreign)
                     raise corrupt(f"its content does not start as {form.name} does")
             return form.load(copy, columns, max_memory)
 

@@ -29,6 +29,7 @@ from lmshealth.io.formats.dialect import (
     find_dialect,
     is_number_or_moment,
 )
+from lmshealth.io.formats.foreign import describe
 from lmshealth.io.formats.moments import SinceFirst, parse_moments
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose
@@ -156,6 +157,10 @@ class Text:
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream:
+        # Any text may be a table.
+        if foreign := describe(stream.read(_HEAD_BYTES), path):
+            raise Unusable("format", foreign)
+        stream.seek(0)
         return parse_text(stream, path.stat().st_size, columns)
 
 

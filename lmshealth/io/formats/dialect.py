@@ -215,7 +215,7 @@ def _heads(lines: Sequence[str], skip: int, found: _Rows) -> Iterator[tuple[int,
         text = _REMARK.sub("", lines[k], count=1)
         remark = text != lines[k]
         # A key with its value, not a name above the rows; of these a colon may be the delimiter.
-        keyed = k + 1 < len(lines) and found.delimiter != ":" and _KEYED.match(text)
+        keyed = (remark or k + 1 < len(lines)) and found.delimiter != ":" and _KEYED.match(text)
         for delimiter in (found.delimiter, *_DELIMITERS) if text.strip() and not keyed else ():
             fields = [one.strip() for one in fields_of(text, delimiter)]
             n = len(fields) - (len(fields) == found.n_fields + 1 and not fields[-1])

@@ -138,13 +138,10 @@ def confirm(path: Path) -> Format:
             raise
         detail = f"the plug-in for {form.name} fails ({type(error).__name__}: {error}); update it"
         raise Unusable("format", detail) from error
-    if fits and form is not CSV:
-        return form
-    # Any text may be CSV.
-    if foreign := describe(head, path):
-        raise Unusable("format", foreign)
     if fits:
         return form
+    if foreign := describe(head, path):
+        raise Unusable("format", foreign)
     actual = next((other for other in FORMATS if other.sniff(head)), None)
     if actual is None:
         raise corrupt(f"does not start as {form.name} does")
@@ -162,5 +159,5 @@ def _unknown(path: Path, head: bytes) -> Unusable:
         step = f"rename the file to {actual.suffixes[0]}"
         return Unusable("format", f"{found}, the content is {actual.name}; {step}")
     known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
-    needed = f"needed one of {', '.join(known)}; save other arrays as columns of HDF5 or Parquet"
-    return Unusable("format", f"{found}; {needed}")
+    step = "rename text to .csv, save other arrays as columns of HDF5 or Parquet"
+    return Unusable("format", f"{found}; needed one of {', '.join(known)}; {step}")

@@ -72,7 +72,8 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with TemporaryDirectory(prefix="lmshealth-") as folder:
         file = _File(path, Path(folder), max_memory)
         names = _names(file.headers)
-        if not columns.columns and not any(map(_is_time_record, file.headers)):
+        asked = set(columns.columns.values()) & set(names)
+        if not asked and not any(map(_is_time_record, file.headers)):
             raise _no_time_records(file.headers, names, file.others)
         dates = _dates(file.headers)
         described = [_describe(*named) for named in zip(file.headers, names, dates, strict=True)]
