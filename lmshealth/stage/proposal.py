@@ -402,10 +402,10 @@ def _by_samples(one: _Column, guess: Guess) -> Guess:
     """Guess whether a column without a name or unit of a signal is an accelerometer."""
     low, mean, high = one.extremes
     n, least = one.n_crossings, max(_CROSSINGS[0], _CROSSINGS[1] * one.samples.size)
-    if one.moments or n < least or _OTHERS.search(one.name):
-        return guess
     if low >= 0 and high - mean > _ONE_SIDED * (mean - low):
         return guess._replace(why=_ONE_SIGN)
+    if one.moments or n < least or _OTHERS.search(one.name):
+        return guess
     why = f"looks like an accelerometer: crosses its mean {n} times in {one.samples.size} samples"
     return _signal("acc", one, why)
 

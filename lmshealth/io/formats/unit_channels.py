@@ -74,8 +74,9 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
         elif role_of(column) != "time":
             detail = f"sampled at {own or rate:.6g} Hz, the log at {rate:.6g} Hz; "
             if k in alike:
-                others = min(channels[k].start or 0.0 for k in samples)
-                detail = f"starts at {channels[k].start:.9g} s, the others at {others:.9g} s; "
+                others = min(channels[one].start or 0.0 for one in samples)
+                both = (round(start or 0.0, 6) for start in (channels[k].start, others))
+                detail = "starts at {:.12g} s, the others at {:.12g} s; ".format(*both)
             detail += "keep channels of one rate and start in one log"
             refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
