@@ -244,7 +244,7 @@ def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
     if sure := next(filter(_THOUSANDS.fullmatch, words), None):
         raise Unusable("columns", f"{sure!r} has marks between thousands; export without them")
     marked = [word for word in words if "," in word]
-    if found.delimiter != "," and marked and all(map(_MAYBE_THOUSANDS.fullmatch, marked)):
+    if marked and all(map(_MAYBE_THOUSANDS.fullmatch, marked)):
         step = 'if these are decimals set decimal = "," under [csv] of the column map'
         raise Unusable("columns", f"{marked[0]!r} may have a mark between thousands; {step}")
 

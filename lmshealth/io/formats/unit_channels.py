@@ -59,8 +59,8 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
     named = [*named, *_moments(channels, named, rate, columns)]
     alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
-    late = _aligned([channels[k] for k in alike], rate)
-    samples = {k: n for k, n in zip(alike, late, strict=True) if n is not None}
+    n_late = _aligned([channels[k] for k in alike], rate)
+    samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
     kept: dict[str, int] = {}
     refused: dict[str, Refusal] = {}
     for column, k in named:
@@ -75,8 +75,8 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
             detail = f"sampled at {own or rate:.6g} Hz, the log at {rate:.6g} Hz; "
             if k in alike:
                 others = min(channels[one].start or 0.0 for one in samples)
-                both = (round(start or 0.0, 6) for start in (channels[k].start, others))
-                detail = "starts at {:.12g} s, the others at {:.12g} s; ".format(*both)
+                late, common = (round(s or 0.0, 6) for s in (channels[k].start, others))
+                detail = f"starts at {late:.12g} s, the others at {common:.12g} s; "
             detail += "keep channels of one rate and start in one log"
             refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
