@@ -42,7 +42,7 @@ _TIME_UNITS = {
     "ms": r"milli|[_(]ms(ec)?\b",
     "us": r"micro|[_(][uµμ]s(ec)?\b",
     "ns": r"nano|[_(]ns(ec)?\b",
-    "s": r"[_(]s(ec)?\b|second",
+    "s": r"(?<!m)(?<!deg)(?<!rad)[_(]s(ec)?\b|second",
 }
 _SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECASE)
 # By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
@@ -254,7 +254,8 @@ def _times(
     found: dict[str, Guess] = {}
     open_question: Unusable | None = None
     for one in dict.fromkeys((*named, *unnamed)):
-        if not one.steps[0] >= 0:
+        low, mean, _ = one.steps
+        if not (low >= 0 and mean > 0) or role_of(one.name) not in (None, "time"):
             continue
         if any(guess.target for guess in found.values()):
             found[one.name] = Guess(one.name, "", "times, as another column")

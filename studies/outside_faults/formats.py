@@ -18,6 +18,7 @@ from lmshealth._arrays import FloatArray
 from studies.outside_faults.case import Case, Program, Seen, last_line
 
 RATE, SECONDS_OF_LOG = 2000.0, 20.0
+ANY = (0.0, 9.0)  # damping in %
 # Natural frequency in Hz and damping ratio of the two modes of the inputs made here.
 TRUE = ((126.0, 0.015), (155.0, 0.015))
 Ask = Callable[[Program, Path], Seen]
@@ -62,8 +63,8 @@ def found_modes(program: Program, path: Path, *options: str | Path) -> tuple[lis
     return text, "; ".join(refused) or (last_line(done.stderr) if done.returncode else "")
 
 
-def near(text: list[str], frequency: float, damping: tuple[float, float] = (0.0, 9.0)) -> bool:
-    """Return whether one of the modes is within 1 % of a frequency and in a range of damping (%)."""
+def near(text: list[str], frequency: float, damping: tuple[float, float]) -> bool:
+    """Return whether a mode is within 1 % of a frequency and in a range of damping (%)."""
     pairs = [tuple(map(float, one.replace("%", "").split(" Hz "))) for one in text]
     return any(abs(f / frequency - 1) < 0.01 and damping[0] <= z <= damping[1] for f, z in pairs)
 
@@ -73,7 +74,7 @@ def read(
 ) -> Seen:
     """Read a log without a map: the mode is there, and nothing is refused but as stated."""
     modes, refused = found_modes(program, make(folder))
-    right = near(modes, frequency, more.get("damping", (0.0, 9.0)))  # type: ignore[arg-type]
+    right = near(modes, frequency, more.get("damping", ANY))  # type: ignore[arg-type]
     allowed = str(more.get("allowed", ""))
     return Seen(
         right and (not refused or (bool(allowed) and allowed in refused)),
@@ -99,7 +100,7 @@ def proposed(make: Callable[[Path], Path], words: tuple[str, ...], program: Prog
     text = where.read_text("utf-8")
     modes, why = found_modes(program, path, "--columns", where)
     lines = [line for line in text.splitlines() if " = " in line and "assumed: set" not in line]
-    right = all(word in text for word in words) and not why and (not mode or near(modes, mode))
+    right = all(word in text for word in words) and not why and (not mode or near(modes, mode, ANY))
     return Seen(right, f"{'; '.join(modes)} {why} {' | '.join(lines)}".strip()[:200])
 
 

@@ -273,6 +273,18 @@ def test_channels_of_one_kind(tmp_path: Path) -> None:
     }  # fmt: skip
 
 
+def test_a_velocity_is_no_time(tmp_path: Path) -> None:
+    """A unit that ends in s, and a set point that ascends, make no times."""
+    names = "time_s,acc_x_g,reference_velocity_mm_s,speed_mm_s,Rate (deg/s)"
+    rising, level = 3.0 * TIME, np.full(2000, 50.0)
+    path = write(tmp_path / "a.csv", names, TIME, NOISE[0], level, rising, rising)
+    found = {g.source: g.target for g in propose(path)[1]}
+    assert [name for name, target in found.items() if target] == ["time_s", "acc_x_g"]
+    named = write(tmp_path / "b.csv", f"# sample_rate_hz: 500\n{names[7:]}", NOISE[0], level,
+                  rising, rising)  # fmt: skip
+    assert not any(g.target.startswith("time") for g in propose(named)[1])
+
+
 OUTSIDE = [
     ("axivity.csv", None, 400.0, 3),
     ("millis.csv", None, 400.0, 2),
