@@ -17,7 +17,7 @@ import numpy as np
 from lmshealth._arrays import FloatArray
 from studies.outside_faults.case import Case, Program, Seen, last_line
 
-RATE, SECONDS_OF_LOG = 2000.0, 20.0
+RATE, SECONDS_OF_LOG = 2000.0, 6.0
 ANY = (0.0, 9.0)  # damping in %
 # Natural frequency in Hz and damping ratio of the two modes of the inputs made here.
 TRUE = ((126.0, 0.015), (155.0, 0.015))
@@ -174,7 +174,7 @@ def timed(folder: Path, names: str, unit: float, digits: int, sep: str = ",") ->
 
 def many(folder: Path, n: int, rate: float = RATE) -> Path:
     """Write channels of equal standing."""
-    values = [record(k, rate, 8.0)[:, 0].tolist() for k in range(n)]
+    values = [record(k, rate, 3.0)[:, 0].tolist() for k in range(n)]
     times = (np.arange(len(values[0])) / rate).tolist()
     return table(folder / "many.csv", ",".join(["Time", *(f"ch{k}" for k in range(n))]),
                  times, *values)  # fmt: skip
