@@ -118,12 +118,13 @@ class Text:
         kept = len(lines)
         while kept and (not lines[kept - 1].strip() or self._is_text(lines[kept - 1])):
             kept -= 1
-        n_left_out = sum(bool(line.strip()) for line in lines[kept:])
+        texts = [line for line in lines[kept:] if line.strip()]
         row = lines[kept - 1].decode("latin-1").strip() if kept else ""
         # A block that is text to its beginning has no rows; rows may begin with text, too.
-        if not self.n_fields or not n_left_out or _WORD.match(row) or (start and kept < 2):
+        if not self.n_fields or not texts or _WORD.match(row) or (start and kept < 2):
             return block
-        self.trailer = f"{n_left_out} lines of text behind the rows left out"
+        if n_lines := sum(not line.startswith(b"EOF") for line in texts):
+            self.trailer = f"{n_lines} lines of text behind the rows left out"
         return block[: len(block) - sum(map(len, lines[kept:]))]
 
     def _is_text(self, line: bytes) -> bool:

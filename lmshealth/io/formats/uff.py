@@ -259,7 +259,8 @@ def _without_padding(lines: bytes) -> bytes:
         return lines
     if _is_binary(lines):
         is_padding = layout.is_counted or not lines[layout.end :].strip(_FILL)
-        return lines[: layout.end] + b"\n" if is_padding else lines
+        is_whole = len(lines) >= layout.end
+        return lines[: layout.end] + b"\n" if is_padding and is_whole else lines
     rows = lines[layout.start :].splitlines()
     n_whole, last = divmod(layout.n_values - 1, len(layout.widths))
     width = sum(layout.widths[: last + 1])
@@ -314,7 +315,7 @@ def _dates(headers: Sequence[Header]) -> list[float]:
     """
     found = [_DATE.search(header["id3"]) for header in headers]
     lengths = [header["num_pts"] * header["abscissa_inc"] for header in headers]
-    if not all(found) or not headers:
+    if not all(found) or not min(lengths, default=0.0) > 0:
         return [0.0] * len(headers)
     try:
         moments = [datetime.strptime(" ".join(m.groups()), "%d %b %y %H %M %S") for m in found if m]

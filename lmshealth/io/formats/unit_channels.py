@@ -85,7 +85,8 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     first = min((samples[k] for k in kept.values()), default=0)
     delays = {column: n for column, k in kept.items() if (n := samples[k] - first)}
     for column, n in delays.items():
-        detail = f"starts {n} samples after others; all are used where they have samples"
+        since = f"{n} samples ({n / (rate or 1.0):.6g} s)"
+        detail = f"starts {since} after others; all are used where they have samples"
         refused[column] = Refusal("", "gaps", detail, channel=column)
     return kept, Content({}, metadata, present, tuple(refused.values()), late=delays)
 

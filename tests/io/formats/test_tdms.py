@@ -331,7 +331,7 @@ def test_channels_that_start_later_are_aligned(tmp_path, start, offset):
     log = read_log(path)
     np.testing.assert_allclose(log.channels[0].values, 9.80665 * whole[0][100:])
     np.testing.assert_allclose(log.channels[1].values, 9.80665 * late)
-    assert "starts 100 samples after" in log.refused[0].detail
+    assert "starts 100 samples (0.05 s) after" in log.refused[0].detail
 
 
 @pytest.mark.parametrize("late", [0.00525, 0.7])
