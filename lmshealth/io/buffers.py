@@ -117,10 +117,16 @@ def as_samples(values: np.ndarray) -> Samples:
     return spool.samples()
 
 
-def in_unit(samples: Samples, factor: float, limit: float) -> Samples:
-    """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN."""
-    spool = Spool(samples.size)
-    for _, values in blocks(samples):
+def in_unit(
+    samples: Samples, factor: float, limit: float, part: tuple[int, int] | None = None
+) -> Samples:
+    """Multiply samples by a factor, and set those from the limit (in SI units) on to NaN.
+
+    All samples are taken, or those of a half-open range.
+    """
+    start, stop = part or (0, samples.size)
+    spool = Spool(stop - start)
+    for _, values in blocks(samples, start, stop):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):
             scaled = values * factor

@@ -40,7 +40,10 @@ _UNITS: dict[str, tuple[str, float]] = {
     "s": ("time", 1.0),
     "ms": ("time", 1e-3),
     "us": ("time", 1e-6),
+    "ns": ("time", 1e-9),
 }
+SI_TIMES = {unit: factor for unit, (dimension, factor) in _UNITS.items() if dimension == "time"}
+_TIMES = ("time", *(f"time_{unit}" for unit in SI_TIMES))
 # `_m_s2` must be tried before `_s`, or an acceleration would be read as a time.
 _LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
 # "Â" is left of a superscript or a micro sign that some exporter encoded twice.
@@ -83,7 +86,7 @@ def role_of(column: str) -> Role | None:
 
     ``time`` alone is no prefix: a column such as ``time_of_day`` is no time axis.
     """
-    if column in ("time", "time_s", "time_ms", "time_us"):
+    if column in _TIMES:
         return "time"
     fitting = (
         role for prefix, (role, _) in _PREFIXES.items() if f"{column}_".startswith(f"{prefix}_")

@@ -53,6 +53,12 @@ ADJACENT_SHARE = 0.1
 
 AGREEMENT = 1e-4
 """Largest relative difference between sample rates of one log (time stamps, metadata, channels)."""
+START_TOLERANCE = 0.1
+"""Largest part of a sample by which the starts of channels may differ from whole samples: a phase
+of 3.6° at a tenth of the sample rate, and the rounding of time stamps (1 µs) at 100 kHz."""
+LEAST_COMMON = 0.5
+"""Least share of a late channel that the others must have in common with it. The variance of an
+estimate grows as the record shortens: below it the channel costs more than it adds."""
 GAP = 1.5
 """Interval, in median intervals, from which samples are missing."""
 JITTER = 0.25

@@ -17,6 +17,7 @@ from lmshealth.io.channel_checks import check_signal, independent, missing_range
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.consistency import Findings, Motion, compare
 from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.foreign import frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
@@ -218,6 +219,9 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         near = nearest(absent, content.present)
         raise Unusable("columns", f"the column map needs {listed(absent)}; there: {near}{hint}")
     series = []
+    begin = max((content.late.get(source, 0) for source in content.columns), default=0)
+    stops = (content.late.get(name, 0) + own.size for name, own in content.columns.items())
+    end = min(stops, default=0)
     for source in tuple(content.columns):
         # Taken out: a log of hundreds of channels is in memory once.
         values = content.columns.pop(source)
@@ -229,12 +233,13 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         except Unusable as error:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
         limit = np.inf if signal.role == "time" else constants.LARGEST_MAGNITUDE
-        series.append(_Series(signal, in_unit(values, signal.factor, limit)))
+        # Channels that start later than others are used where all have samples.
+        first = content.late.get(source, 0)
+        common = (begin - first, max(end - first, begin - first)) if content.late else None
+        series.append(_Series(signal, in_unit(values, signal.factor, limit, common)))
     if twice := repeated(item.signal.name for item in series):
         raise Unusable("columns", f"{listed(twice)} comes in more than one unit; {there}")
-    if not any(item.signal.role in _DYNAMIC for item in series):
-        hint += "" if columns.columns else "; a column map (--columns) translates other names"
-        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{hint}")
+    _check_signals({item.signal.role for item in series}, content.present, columns, there + hint)
     lengths = {item.signal.name: item.values.size for item in series}
     if len(set(lengths.values())) > 1:
         found = listed(f"{name} {size}" for name, size in lengths.items())
@@ -242,6 +247,19 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     if (shortest := min(lengths.values())) < constants.SHORTEST_PIECE:
         raise Unusable("empty", f"{shortest} samples; needed at least {constants.SHORTEST_PIECE}")
     return series
+
+
+def _check_signals(
+    roles: set[Role], present: Sequence[str], columns: ColumnMap, there: str
+) -> None:
+    """Require a signal over time; a column map may name one beside a measured frequency."""
+    has_signal = bool(roles & set(_DYNAMIC))
+    is_certain = has_signal and ("time" in roles or bool(columns.columns))
+    if not is_certain and (axis := frequency_column(present)):
+        raise over_frequency(axis)
+    if not has_signal:
+        step = "" if columns.columns else "; a column map (--columns) translates other names"
+        raise Unusable("columns", f"no signal: {_NEEDED}; {there}{step}")
 
 
 def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:

@@ -6,33 +6,44 @@ For a column names and units decide first, the samples where neither does, each 
 import glob
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
+from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
 from lmshealth._files import write_text
 from lmshealth._toml import quoted
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
-from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
+from lmshealth.io.buffers import Samples, Spool, blocks, in_unit
+from lmshealth.io.column_map import SI_TIMES, ColumnMap, parse_column, role_of, unit_key
 from lmshealth.io.formats.content import Content
+from lmshealth.io.formats.foreign import frequency_column, over_frequency
+from lmshealth.io.formats.moments import SINCE_EPOCH
 from lmshealth.io.formats.registry import load
 from lmshealth.io.formats.text_layouts import LOCAL_TIME
 from lmshealth.io.log import Log
+from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
+from lmshealth.io.time_axis import time_axis
 from lmshealth.stage.description import ModeSpec
 
 # Words in the names of columns, in the languages of exporters, and units of times in names.
 _TIME = re.compile(
     r"time|zeit|temps|tiempo|tempo|date|datum|millis|micros|x_value|\bt\b|\.x\.data", re.IGNORECASE
 )
-_TIME_UNITS = {"ms": r"millis|[_(]ms\b", "us": r"micros|[_(][uµ]s\b", "s": r"[_(]s\b|second"}
+_TIME_UNITS = {
+    "ms": r"milli|[_(]ms(ec)?\b",
+    "us": r"micro|[_(][uµμ]s(ec)?\b",
+    "ns": r"nano|[_(]ns(ec)?\b",
+    "s": r"(?<!m)(?<!deg)(?<!rad)[_(]s(ec)?\b|second",
+}
 _SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECASE)
 # By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
 _SIGNALS = {
@@ -40,15 +51,23 @@ _SIGNALS = {
     "acc": ("acc|beschl|vibr", "acceleration", 1.0, "m/s²"),
     "current": ("current(?! *pos| *vel)|strom|courant|i_?q|ampere", "current", 1.0, "A"),
 }
-# Units in which sensors are recorded without conversion, and samples from which columns are judged.
+# Units in which sensors are recorded without conversion, and words of quantities that are none.
 _RAW_UNITS = ("", "-", "counts", "V", "mV", "Volt", "Volts")
-_JUDGED = 1 << 16
-# A vibration crosses its mean so often at least: in all, and as a share of its samples.
-_CROSSINGS = 50, 0.001
-# Columns that only oscillate of which so many are taken, those that do it slowest.
-_MOST_GUESSED = 3
-# Sample rates in Hz by which the unit of times without one is chosen.
-_RATES = {"s": (10.0, 2e5), "ms": (20.0, 2e5), "us": (20.0, 2e6)}
+_OTHERS = re.compile(r"temp|humid|press|druck|speed|torque|moment|pos(?!t)|vel|status", re.I)
+# A vibration crosses its mean so often at least: in all, and as a share of its samples. A spectrum
+# or a magnitude rises so much further above its mean than it falls below.
+_CROSSINGS, _ONE_SIDED = (50, 0.001), 10.0
+_ONE_SIGN = "has one sign, as a spectrum or a magnitude"
+# SI values of units of time that are no suffix, and the sample rate in Hz from which on times are
+# taken in s without a witness: in ms it would be that of a recorder of 100 kHz.
+_LONG_UNITS = {"min": 60.0, "h": 3600.0}
+_CERTAIN_RATE = 100.0
+# Sample rates in Hz of records of vibrations. Even numbers without a name are times if the rate
+# that they give in a unit is so near to that of another source.
+_RATES, _NEAR = (1.0, 1e7), 0.1
+_DURATION = re.compile(r"duration|dauer|dur[ée]e|total.?time|length", re.IGNORECASE)
+# Largest relative difference between a duration that a file states and that of its times.
+_LIKE_DURATION = 0.01
 # A date in the name of a file, with or without a time.
 _DATE = re.compile(
     r"(?<!\d)(?P<y>20\d\d)(?P<sep>[-_]?)(?P<m>\d\d)(?P=sep)(?P<d>\d\d)"
@@ -69,11 +88,51 @@ class Guess(NamedTuple):
     unit: str = ""  # TOML of its unit with a comment, where neither name nor file states one
 
 
-class _Column(NamedTuple):
-    name: str
-    unit: str
-    values: FloatArray  # the first samples, ``(n,)``
-    size: int
+class _Column:
+    """A column of the file: name, unit, all samples, and what they show.
+
+    ``moments`` is whether they are moments, read as times in s since the first.
+    """
+
+    def __init__(self, name: str, unit: str, samples: Samples, *, moments: bool = False) -> None:
+        self.name, self.unit, self.samples, self.moments = name, unit, samples, moments
+
+    @cached_property
+    def extremes(self) -> tuple[float, float, float]:
+        """Least value, mean and largest value; NaN where no sample is a number."""
+        low, high, total, n = np.inf, -np.inf, 0.0, 0
+        for _, block in blocks(self.samples):
+            if (finite := block[np.isfinite(block)]).size:
+                low, high = min(low, float(finite.min())), max(high, float(finite.max()))
+                total, n = total + float(finite.sum()), n + finite.size
+        return (low, total / n, high) if n else (np.nan, np.nan, np.nan)
+
+    @cached_property
+    def steps(self) -> tuple[float, float, float]:
+        """Least, mean and largest difference of consecutive samples."""
+        found = [np.diff(b) for _, b in blocks(self.samples, overlap=1) if b.size > 1]
+        if not found:
+            return np.nan, np.nan, np.nan
+        low, high = (f(np.array([f(one) for one in found])) for f in (np.min, np.max))
+        span = float(self.samples[self.samples.size - 1 :][0] - self.samples[:1][0])
+        return float(low), span / (self.samples.size - 1), float(high)
+
+    @property
+    def is_even(self) -> bool:
+        """Whether the samples ascend in equal steps, rounded or not, that do not count rows."""
+        low, mean, high = self.steps
+        return low > 0 and high - low < mean / 2 and not low == high == 1
+
+    @property
+    def n_crossings(self) -> int:
+        """Crossings of the mean by values that are no switch or counter of few levels."""
+        levels: set[float] = set()
+        n = 0
+        for _, block in blocks(self.samples, overlap=1):
+            finite = block[np.isfinite(block)]
+            levels |= set(np.unique(finite)[: constants.FEWEST_LEVELS].tolist())
+            n += int(np.count_nonzero(np.diff(finite > self.extremes[1])))
+        return n if len(levels) >= constants.FEWEST_LEVELS else 0
 
 
 def propose(
@@ -81,21 +140,35 @@ def propose(
 ) -> tuple[str, list[Guess]]:
     """Propose the column map of a file, as TOML with comments; return all guesses too.
 
-    ``rate`` is the sample rate in Hz where the file has none. `BadLog` if the file cannot be read
-    or nothing in it may be a signal.
+    Times are read by the functions of `read_log`. ``rate`` is the sample rate in Hz where the file
+    has none. `BadLog` if the file cannot be read, nothing in it may be a signal, or its sample rate
+    is unknown, contradicted or depends on a unit that nothing states.
     """
     label = shown(path)
     content_digest(path, name=label)
     try:
-        content, columns, guesses = _columns(path, max_memory)
-        guesses = [*_guesses(columns), *guesses]
+        content, columns, rest = _columns(path, max_memory)
+        axis = frequency_column(content.present)
+        if axis and all(one.is_even for one in columns[:1]):
+            raise over_frequency(axis)
+        stated = parse_metadata(content.metadata)[1]
+        if rate and stated and abs(rate / stated - 1) > constants.AGREEMENT:
+            detail = f"the file states {stated:.8g} Hz, --sample-rate is {rate:.8g} Hz"
+            raise Unusable("time", f"{detail}; leave the option out, or correct the file")
+        times = _times(path, columns, content, rate or stated, max_memory)
+        others = [one for one in columns if one.name not in times]
+        guesses = [*times.values(), *_guesses(others), *rest]
         if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
             found = "; ".join(f"{g.source}: {g.why}" for g in guesses) or "no columns"
             detail = f"nothing looks like a following error or an acceleration ({found})"
-            raise Unusable("columns", f"{detail}; write a column map by hand")
+            is_series = others and not any(g.why == _ONE_SIGN for g in guesses)
+            step = "write a column map by hand" if is_series else "needed samples over time"
+            raise Unusable("columns", f"{detail}; {step}")
         timed = any(g.target.startswith("time") for g in guesses)
-        if not timed and rate is None and "sample_rate_hz" not in content.metadata:
-            raise Unusable("time", "no column of times and no sample rate; give --sample-rate HZ")
+        if not timed and rate is None and stated is None:
+            why = "".join(f"; {g.source}: {g.why}" for g in times.values())
+            detail = f"no column of times and no sample rate; give --sample-rate HZ{why}"
+            raise Unusable("time", detail)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
     return "\n".join(_lines(label, content, guesses, None if timed else rate)), guesses
@@ -122,72 +195,174 @@ def moment_of(path: Path, log: Log) -> tuple[str, str]:
 
 def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], list[Guess]]:
     """Read all columns as they are; those that hold no such series of numbers are left out."""
-    content = load(path, ColumnMap(), max_memory)
-    left_out: list[str] = []
+    content = load(path, ColumnMap(columns={"acc_none": "\0"}), max_memory)
     read: dict[str, _Column] = {}
+    tried: set[str] = set()
     for _ in range(_DEPTH):
         pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
         units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
-        for name in (name for name in units if name not in [*left_out, *read]):
-            own = unit_key(units[name], "time") or _time_unit(name)
-            key = f"time_{own or 's'}" if own or _TIME.search(name) else "acc_probed"
-            try:
-                found = load(path, ColumnMap(columns={key: name}), max_memory)
-                # A struct is opened by its name.
-                there = max(content.present, found.present, key=len)
-                content = replace(
-                    content, metadata=content.metadata | found.metadata, present=there
-                )
-                samples = found.columns[name]
-                values = np.asarray(samples[:_JUDGED], dtype=np.float64)
-                read[name] = _Column(name, units[name], values, samples.size)
-            except (Unusable, KeyError):
-                left_out.append(name)
-    sizes = [one.size for one in read.values() if one.size > 1]
+        new = [name for name in units if name not in tried]
+        for found, moments in _contents(path, new, max_memory):
+            # A struct is opened by its name.
+            there = max(content.present, found.present, key=len)
+            content = replace(content, metadata=content.metadata | found.metadata, present=there)
+            for name in set(new) & set(found.columns):
+                read[name] = _Column(name, units[name], found.columns[name], moments=moments)
+        tried |= set(new)
+    columns = [read[name] for name in units if name in read]
+    sizes = [one.samples.size for one in columns if one.samples.size > 1]
     size = max(sizes, key=lambda n: (sizes.count(n), n), default=0)
-    others = [*left_out, *(one.name for one in read.values() if one.size != size)]
+    kept = [one for one in columns if one.samples.size == size]
+    others = [name for name in units if name not in [one.name for one in kept]]
     rest = [Guess(listed(others), "", f"text, or not {size} numbers")] if others else []
-    return content, [one for one in read.values() if one.size == size], rest
+    return content, kept, rest
 
 
-def _guesses(columns: list[_Column]) -> list[Guess]:
-    """Guess what each column is; what only oscillates is taken where nothing else is a signal."""
-    guesses = [_time(one) or _by_name(one) for one in columns]
-    if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
-        n = {k: _crossings(columns[k].values) for k, g in enumerate(guesses) if not g.target}
-        least = max(_CROSSINGS[0], _CROSSINGS[1] * max((c.values.size for c in columns), default=0))
-        fits = [k for k in n if columns[k].unit in _RAW_UNITS and n[k] >= least]
-        for k in sorted(fits, key=n.__getitem__)[:_MOST_GUESSED]:
-            why = f"looks like an accelerometer: crosses its mean {n[k]} times"
-            guesses[k] = _signal("acc", columns[k], f"{why} in {columns[k].values.size} samples")
-    kept: set[str] = set()
-    for k, guess in enumerate(guesses):
-        what = guess.target.partition("_")[0] if guess.target.startswith("time") else guess.target
-        if what in kept:
-            guesses[k] = guess._replace(target="", why=f"{guess.why}, as another column")
-        kept |= {what} - {""}
-    return guesses
+def _contents(
+    path: Path, names: Sequence[str], max_memory: float
+) -> Iterator[tuple[Content, bool]]:
+    """Yield contents with columns of numbers, as many at once as can be, and with moments."""
+    targets = {f"acc_probed_{k}_g": name for k, name in enumerate(names)}
+    try:
+        if names:
+            yield load(path, ColumnMap(columns=targets), max_memory), False
+    except Unusable:
+        if len(names) > 1:
+            for half in (names[: len(names) // 2], names[len(names) // 2 :]):
+                yield from _contents(path, half, max_memory)
+            return
+        with suppress(Unusable):
+            found = load(path, ColumnMap(columns={"time_s": names[0]}), max_memory)
+            if names[0] in found.columns:
+                yield found, True
 
 
-def _time(one: _Column) -> Guess | None:
-    """Guess a column of times: ascending, with the name or unit of times, or unnamed."""
-    unit, steps = unit_key(one.unit, "time") or _time_unit(one.name), np.diff(one.values)
-    if steps.size < 1 or not (steps > 0).all():
-        return None
-    step = float(np.median(steps))
-    if even := bool(np.ptp(steps) < step / 2):
-        step = float(steps.mean())  # of rounded times
-    # Steps of 1 count rows.
-    unnamed = one.name.isdecimal() and even and step != 1
-    if not (_TIME.search(one.name) or unit or unnamed):
-        return None
-    rates = {u: 1 / (step * parse_column(f"time_{u}").factor) for u in _RATES}
-    fits = (u for u, (low, high) in _RATES.items() if low <= rates[u] <= high)
-    taken = unit or next(fits, None)
-    if taken is None:
-        return None
-    how = f"in {unit}" if unit else f"in steps of {step:.6g}, taken as {taken}"
-    return Guess(one.name, f"time_{taken}", f"times {how}: {rates[taken]:.6g} Hz")
+def _times(
+    path: Path, columns: list[_Column], content: Content, rate: float | None, max_memory: float
+) -> dict[str, Guess]:
+    """Guess which column holds the times: the first that states its unit, has a name, or is even.
+
+    Others of them are not read. `Unusable` (``time``) where times contradict the sample rate in Hz,
+    or without one may be in several units.
+    """
+    stated = {one.name: _unit_of(one) for one in columns}
+    named = [
+        o for o in columns if stated[o.name] or (_TIME.search(o.name) and o.unit in _RAW_UNITS)
+    ]
+    unnamed = [one for one in columns if one.name.isdecimal() and one.is_even]
+    named.sort(key=lambda one: not stated[one.name])
+    found: dict[str, Guess] = {}
+    open_question: Unusable | None = None
+    for one in dict.fromkeys((*named, *unnamed)):
+        low, mean, _ = one.steps
+        if not (low >= 0 and mean > 0) or role_of(one.name) not in (None, "time"):
+            continue
+        if any(guess.target for guess in found.values()):
+            found[one.name] = Guess(one.name, "", "times, as another column")
+            continue
+        unit = stated[one.name]
+        try:
+            found[one.name] = _in_unit(one, *_rate_of(path, one, unit, max_memory), rate, content)
+        except _Contradiction:
+            raise
+        except _Question as question:
+            open_question = open_question or question
+            found[one.name] = Guess(one.name, "", question.detail)
+        except Unusable as error:
+            found[one.name] = Guess(one.name, "", f"times that cannot be used: {error.detail}")
+    if open_question and not any(guess.target for guess in found.values()):
+        raise open_question
+    return found
+
+
+class _Contradiction(Unusable):
+    """Times that give another sample rate than the file or the user states."""
+
+
+class _Question(Unusable):
+    """Times whose unit nothing states."""
+
+
+def _rate_of(path: Path, one: _Column, unit: str, max_memory: float) -> tuple[float, str]:
+    """Return the sample rate in Hz that `read_log` finds in times, and their unit.
+
+    Without a unit it is that of times in s, unless they are counted from an epoch.
+    """
+    target, scale = _time_target(unit or "s")
+    layout = ColumnMap(columns={target: one.name}, units=scale)
+    content = load(path, layout, max_memory)
+    values = in_unit(content.columns[one.name], layout.signal(target).factor, np.inf)
+    is_epoch = any(text.endswith(SINCE_EPOCH) for text in content.guessed)
+    rate = time_axis(values, None).sample_rate
+    # A counter of another unit may be as large, but not at a rate of vibrations.
+    if unit or not is_epoch or rate >= _RATES[0]:
+        return rate, unit or ("s" if is_epoch else "")
+    since_first = Spool()
+    for _, block in blocks(one.samples):
+        since_first.append(block - one.samples[:1][0])
+    return time_axis(since_first.samples(), None).sample_rate, ""
+
+
+def _time_target(unit: str) -> tuple[str, dict[str, str | float]]:
+    """Return the name of times in a unit, and its scale where the name carries none."""
+    scale = _LONG_UNITS.get(unit)
+    return (f"time_{unit}", {}) if scale is None else ("time", {"time": scale})
+
+
+def _in_unit(one: _Column, found: float, unit: str, rate: float | None, content: Content) -> Guess:
+    """Guess the unit of times that give a rate in Hz in their unit, or in s if it is not stated.
+
+    `_Contradiction` where the sample rate of another source does not agree, `_Question` where
+    neither it nor a duration chooses between units.
+    """
+    rates = {unit: found} if unit else {u: found / factor for u, factor in SI_TIMES.items()}
+    rates = {u: hz for u, hz in rates.items() if _RATES[0] <= hz <= _RATES[1]} or rates
+    how = f"in {unit}" if unit else f"in steps of {one.steps[1]:.6g}"
+    readings = " or ".join(f"{hz:.6g} Hz in {u}" for u, hz in rates.items())
+    fits, witness = [unit] if unit else [], ""
+    if rate is not None:
+        off = {u: abs(hz / rate - 1) for u, hz in rates.items()}
+        fits = [u for u, error in off.items() if error <= constants.AGREEMENT]
+        witness = f", as the sample rate is {rate:.6g} Hz"
+        if not fits and one.name.isdecimal() and min(off.values()) > _NEAR:
+            return Guess(one.name, "", f"ascends {how}, which are no times at {rate:.6g} Hz")
+        if not fits:
+            detail = f"times {one.name!r} give {readings}, the stated sample rate is {rate:.6g} Hz"
+            raise _Contradiction("time", f"{detail}; correct it, or write a column map by hand")
+    elif not unit:
+        fits = [u for u, hz in rates.items() for span in _durations(content)
+                if abs((one.samples.size - 1) / hz / span - 1) <= _LIKE_DURATION]  # fmt: skip
+        witness = ", as the file states a duration"
+        if not fits and found >= _CERTAIN_RATE:
+            fits, witness = ["s"], ", taken as s"
+    if len(set(fits)) != 1:
+        detail = f"column {one.name!r} ascends {how} and nothing states its unit: {readings}"
+        step = 'give the right one as --sample-rate HZ, or map it by hand: time_us = "…"'
+        raise _Question("time", f"{detail}; {step}")
+    target, scale = _time_target(fits[0])
+    why = f"times {how}{'' if unit else witness}: {rates[fits[0]]:.6g} Hz"
+    factor = "".join(f"{factor!r}  # s per {fits[0]}" for factor in scale.values())
+    return Guess(one.name, target, why, factor)
+
+
+def _durations(content: Content) -> list[float]:
+    """Return the durations in s that the metadata state."""
+    found = []
+    for key, text in content.metadata.items():
+        number = re.match(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([a-zµμ]*)", text)
+        if _DURATION.search(key) and number:
+            unit = unit_key(number[2], "time") or _time_unit(key) or "s"
+            scale = _LONG_UNITS.get(number[2]) or SI_TIMES[unit]
+            found.append(float(number[1]) * scale)
+    return [span for span in found if span > 0]
+
+
+def _unit_of(one: _Column) -> str:
+    """Return the unit of times that a column states; empty for another quantity or none."""
+    if one.moments:
+        return "s"
+    own = unit_key(one.unit, "time") or (one.unit if one.unit in _LONG_UNITS else "")
+    return own or (_time_unit(one.name) if one.unit in _RAW_UNITS else None) or ""
 
 
 def _time_unit(name: str) -> str | None:
@@ -195,10 +370,51 @@ def _time_unit(name: str) -> str | None:
     return next((unit for unit, words in _TIME_UNITS.items() if re.search(words, name, re.I)), None)
 
 
+def _guesses(columns: list[_Column]) -> list[Guess]:
+    """Guess what each column is; all that oscillate are taken where nothing else is a signal."""
+    guesses = [_by_name(one) for one in columns]
+    if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
+        guesses = [
+            _by_samples(one, guess) if one.unit in _RAW_UNITS and not guess.target else guess
+            for one, guess in zip(columns, guesses, strict=True)
+        ]
+    kept: set[str] = set()
+    for k, guess in enumerate(guesses):
+        target, name = guess.target, guess.target
+        for n in range(2, len(guesses) + 2):
+            if name not in kept or not target:
+                break
+            name = _numbered(target, n)
+        guesses[k] = guess._replace(target=name)
+        kept.add(name)
+    return guesses
+
+
+def _numbered(target: str, n: int) -> str:
+    """Write the name of a further signal of the same name, with its number before the unit."""
+    try:
+        stem = parse_column(target).name
+    except Unusable:
+        stem = target
+    return f"{stem}_{n}{target.removeprefix(stem)}"
+
+
+def _by_samples(one: _Column, guess: Guess) -> Guess:
+    """Guess whether a column without a name or unit of a signal is an accelerometer."""
+    low, mean, high = one.extremes
+    n, least = one.n_crossings, max(_CROSSINGS[0], _CROSSINGS[1] * one.samples.size)
+    if low >= 0 and high - mean > _ONE_SIDED * (mean - low):
+        return guess._replace(why=_ONE_SIGN)
+    if one.moments or n < least or _OTHERS.search(one.name):
+        return guess
+    why = f"looks like an accelerometer: crosses its mean {n} times in {one.samples.size} samples"
+    return _signal("acc", one, why)
+
+
 def _by_name(one: _Column) -> Guess:
     """Guess the quantity of a column from its name and unit."""
-    finite = one.values[np.isfinite(one.values)]
-    if not finite.size or np.ptp(finite) == 0:
+    low, _, high = one.extremes
+    if not low < high:
         return Guess(one.name, "", "constant")
     if role_of(one.name) is not None:
         return _signal(one.name, one, "named as in a log")
@@ -233,14 +449,6 @@ def _signal(prefix: str, one: _Column, why: str) -> Guess:
     per = f"{scale:g} {si} per {one.unit or 'count'}"
     assumed = f"{why}; no unit: {per} assumed, on which frequencies and damping do not depend"
     return Guess(one.name, target, assumed, f"{scale!r}  # {visible(per)} is assumed: set it")
-
-
-def _crossings(values: FloatArray) -> int:
-    """Count crossings of the mean by values that are no switch or counter of few levels."""
-    values = values[np.isfinite(values)]
-    if np.unique(values).size < constants.FEWEST_LEVELS:
-        return 0
-    return int(np.count_nonzero(np.diff(values > values.mean())))
 
 
 def _lines(label: str, content: Content, guesses: list[Guess], rate: float | None) -> Iterator[str]:

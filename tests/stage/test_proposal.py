@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import re
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -149,3 +152,158 @@ def test_any_name_is_quoted(tmp_path: Path) -> None:
     assert (stage.name, stage.modes) == ("my stage", (mode,))
     assert stage.description.source == 'in C:\\logs\\"a".csv\n\x7f'
     assert stage.description.match.stage == 'M[[]1][*]"'
+
+
+START = 1_767_600_000.0  # 2026-01-05 08:00 UTC
+STAMPS = {
+    "time": lambda t: f"{t:.6f}",
+    "time_s": lambda t: f"{t:.7f}",
+    "Zeit [ms]": lambda t: f"{1e3 * t:.4f}",
+    "millis": lambda t: f"{1e3 * t:.0f}",
+    "micros": lambda t: f"{1e6 * t:.0f}",
+    "t (us)": lambda t: f"{7e5 + 1e6 * t:.0f}",
+    "elapsed [ns]": lambda t: f"{1e9 * t:.0f}",
+    "timestamp_ns": lambda t: f"{9e12 + 1e9 * t:.0f}",
+    "Time [min]": lambda t: f"{t / 60:.9f}",
+    "Timestamp": lambda t: np.datetime_as_string(np.datetime64(int(1e6 * (START + t)), "us")),
+    "Datum": lambda t: f"05.01.2026 08:00:{t:09.6f}",
+    "Time": lambda t: f"{1e3 * (START + t):.0f}",
+    "unix time": lambda t: f"{1e6 * (START + t):.0f}",
+    "Date": lambda t: f"{46027.25 + t / 86400:.11f}",
+    "": lambda t: f"{t:.5f}",
+    " ": lambda t: np.datetime_as_string(np.datetime64(int(1e3 * (START + t)), "ms")),
+}
+
+
+LAYOUTS = [
+    (400.0, 12, ",", "Rate 400, overflows 0\n"),
+    (250.0, 2, ";", ""),
+    (640.0, 5, "\t", "\n\n"),
+]
+CASES = [(stamp, *LAYOUTS[k % 3]) for k, stamp in enumerate(STAMPS)]
+EVERY = [(stamp, *layout) for stamp in STAMPS for layout in LAYOUTS]
+
+
+@pytest.mark.parametrize(
+    ("stamp", "rate", "n_channels", "delimiter", "end"),
+    [*CASES, *(pytest.param(*one, marks=pytest.mark.slow) for one in EVERY if one not in CASES)],
+)
+def test_the_proposed_rate_is_that_of_the_log(
+    tmp_path: Path, stamp: str, rate: float, n_channels: int, delimiter: str, end: str
+) -> None:
+    """Rate and channels of a proposal are those that its column map reads."""
+    rng = np.random.default_rng(n_channels)
+    values = np.cumsum(rng.normal(0, 1, (600, n_channels)), axis=0)
+    values = np.diff(values, axis=0, n=2).round(4)
+    times = np.arange(len(values)) / rate
+    rows = [
+        delimiter.join([STAMPS[stamp](t), *map(str, row)])
+        for t, row in zip(times.tolist(), values.tolist(), strict=True)
+    ]
+    names = [delimiter.join([stamp, *(f"ch{k + 1}" for k in range(n_channels))])]
+    path = tmp_path / "a.csv"
+    path.write_text("\n".join((names if stamp.strip() else []) + rows) + "\n" + end)
+    text, guesses = propose(path)
+    log = read_log(path, columns=decode(text.encode(), ColumnMap))
+    (why,) = (g.why for g in guesses if g.target.startswith("time"))
+    assert f"{log.sample_rate:.6g} Hz" in why
+    assert log.sample_rate == pytest.approx(rate, rel=1e-3)
+    assert len(log.channels) == n_channels and log.channels[0].values.size == len(values)
+
+
+@pytest.mark.parametrize(
+    ("name", "step", "n_units"),
+    [("", 39.0625, 2), ("", 0.04, 2), ("Time", 0.5, 2), ("Time", 50.0, 2), ("t", 2.5, 2)],
+)
+def test_a_unit_that_nothing_states_is_asked_for(
+    tmp_path: Path, name: str, step: float, n_units: int
+) -> None:
+    """Without a witness both readings are shown; the rate or a duration chooses between them."""
+    stamps = step * np.arange(2000)
+    path = write(tmp_path / "a.csv", f"{name},b,c", stamps, NOISE[0], NOISE[1])
+    path.write_text(path.read_text().partition("\n")[2] if not name else path.read_text())
+    with pytest.raises(BadLog, match="nothing states its unit") as refused:
+        propose(path)
+    readings = [float(hz) for hz in re.findall(r"([\d.e+]+) Hz in", str(refused.value))]
+    assert len(readings) >= n_units and "--sample-rate" in str(refused.value)
+    for rate in readings[:2]:
+        text, _ = propose(path, rate=rate)
+        log = read_log(path, columns=decode(text.encode(), ColumnMap))
+        assert log.sample_rate == pytest.approx(rate, rel=1e-4)
+        timed = tmp_path / "b.csv"
+        timed.write_text(f"# Duration: {1999 / rate:.6g} s\n" + path.read_text())
+        text, guesses = propose(timed)
+        assert "duration" in guesses[0].why
+        log = read_log(timed, columns=decode(text.encode(), ColumnMap))
+        assert log.sample_rate == pytest.approx(rate, rel=1e-4)
+
+
+def test_a_counter_is_no_time_since_an_epoch(tmp_path: Path) -> None:
+    """A count that is as large as a date is not read in its unit."""
+    for first, step in ((1.7e9, 8333.0), (1.7e12, 1e6)):
+        stamps = first + step * np.arange(2000)
+        path = write(tmp_path / "a.csv", "SampleTime,acc_g", stamps, NOISE[0])
+        with pytest.raises(BadLog, match="nothing states its unit"):
+            propose(path)
+
+
+def test_times_that_contradict_a_rate(tmp_path: Path) -> None:
+    """Two statements of the sample rate that differ are refused with both, a ramp is no time."""
+    path = write(tmp_path / "a.csv", "Time [ms],acc_g", 1e3 * TIME, NOISE[0])
+    with pytest.raises(BadLog, match="give 500 Hz in ms, the stated sample rate is 510 Hz"):
+        propose(path, rate=510.0)
+    assert "sample_rate_hz" not in propose(path, rate=500.0)[0]
+    path = write(tmp_path / "b.csv", "# sample_rate_hz: 400\nacc_g", NOISE[0])
+    with pytest.raises(BadLog, match="states 400 Hz, --sample-rate is 500 Hz"):
+        propose(path, rate=500.0)
+    ramp = write(tmp_path / "c.csv", "x", 3.0 * TIME, NOISE[0])
+    ramp.write_text(ramp.read_text().partition("\n")[2])
+    assert {g.source: g.target for g in propose(ramp, rate=2000.0)[1]} == {"0": "", "1": "acc_1"}
+
+
+def test_channels_of_one_kind(tmp_path: Path) -> None:
+    """Equal names are numbered, other quantities left out, and late activity is seen."""
+    late = np.where(TIME < 3.8, 0.0, NOISE[3])
+    names = "Time,AI 1,AI-1,temperature,late,magnitude"
+    columns = TIME, NOISE[0], NOISE[1], NOISE[2], late, np.abs(NOISE[3]) ** 6 + 1e-9
+    found = {g.source: g.target for g in propose(write(tmp_path / "a.csv", names, *columns))[1]}
+    assert found == {
+        "Time": "time_s", "AI 1": "acc_ai_1", "AI-1": "acc_ai_1_2", "temperature": "",
+        "late": "acc_late", "magnitude": "",
+    }  # fmt: skip
+
+
+def test_a_velocity_is_no_time(tmp_path: Path) -> None:
+    """A unit that ends in s, and a set point that ascends, make no times."""
+    names = "time_s,acc_x_g,reference_velocity_mm_s,speed_mm_s,Rate (deg/s)"
+    rising, level = 3.0 * TIME, np.full(2000, 50.0)
+    path = write(tmp_path / "a.csv", names, TIME, NOISE[0], level, rising, rising)
+    found = {g.source: g.target for g in propose(path)[1]}
+    assert [name for name, target in found.items() if target] == ["time_s", "acc_x_g"]
+    named = write(tmp_path / "b.csv", f"# sample_rate_hz: 500\n{names[7:]}", NOISE[0], level,
+                  rising, rising)  # fmt: skip
+    assert not any(g.target.startswith("time") for g in propose(named)[1])
+
+
+OUTSIDE = [
+    ("axivity.csv", None, 400.0, 3),
+    ("millis.csv", None, 400.0, 2),
+    ("time_lowercase.csv", None, 400.0, 2),
+    ("rrf_m956.csv", 1344.0, 1344.0, 3),
+    ("rounded_1us.csv", 25600.0, 25600.0, 2),
+    ("tdms_time_channel.tdms", None, 2000.0, 1),
+]
+
+
+@pytest.mark.parametrize(("name", "given", "rate", "n_channels"), OUTSIDE)
+def test_files_of_others(
+    needs: Callable[[str], None], name: str, given: float | None, rate: float, n_channels: int
+) -> None:
+    """Files that were proposed at a wrong rate, in part or not at all."""
+    needs("data")
+    path = Path(os.environ["LMSHEALTH_DATA"]) / "outside_faults" / name
+    text, guesses = propose(path, rate=given)
+    log = read_log(path, columns=decode(text.encode(), ColumnMap))
+    assert log.sample_rate == pytest.approx(rate, rel=1e-5) and len(log.channels) == n_channels
+    times = [g.why for g in guesses if g.target.startswith("time")]
+    assert all(f"{log.sample_rate:.6g} Hz" in why for why in times)

@@ -3,7 +3,7 @@
 import gzip
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,6 +11,7 @@ from tempfile import TemporaryDirectory
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.formats.foreign import describe
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
@@ -25,7 +26,8 @@ class Content:
     ``columns`` are the wanted ones under their names in the file, ``(n_samples,)`` each; metadata
     are text as in the file; ``present`` are the names of all columns, for messages. Refused are
     wanted channels that cannot go with the others; the name of the log is added later. ``guessed``
-    lists what neither the file nor the column map states.
+    lists what neither the file nor the column map states; ``late`` has the number of samples by
+    which a column starts after those that are not in it.
     """
 
     columns: dict[str, Samples]
@@ -33,6 +35,7 @@ class Content:
     present: tuple[str, ...]
     refused: tuple[Refusal, ...] = ()
     guessed: tuple[str, ...] = ()
+    late: dict[str, int] = field(default_factory=dict)
 
 
 Load = Callable[[Path, ColumnMap, float], Content]
@@ -83,7 +86,10 @@ def gzipped(form: Format, others: Iterable[str] = ()) -> Format:
     def load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         with unpacked(path) as copy:
             with copy.open("rb") as stream:
-                if not form.sniff(stream.read(_BLOCK >> 8)):
+                head = stream.read(_BLOCK >> 8)
+                if not form.sniff(head):
+                    if foreign := describe(head, copy):
+                        raise Unusable("format", foreign)
                     raise corrupt(f"its content does not start as {form.name} does")
             return form.load(copy, columns, max_memory)
 

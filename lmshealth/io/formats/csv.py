@@ -19,13 +19,20 @@ from typing import IO, Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool, blocks
+from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
-from lmshealth.io.formats.dialect import Dialect, encoding_of, fields_of, find_dialect
+from lmshealth.io.formats.dialect import (
+    Dialect,
+    encoding_of,
+    fields_of,
+    find_dialect,
+    is_number_or_moment,
+)
+from lmshealth.io.formats.foreign import describe
+from lmshealth.io.formats.moments import SinceFirst, parse_moments
 from lmshealth.io.formats.text_layouts import LAYOUTS
 from lmshealth.io.formats.unit_channels import choose
-from lmshealth.io.metadata import moment_after
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
@@ -46,19 +53,9 @@ _SEGMENT = re.compile(
 )
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
-# The last row of some exports.
-_END = re.compile(rb"(?<=\n)EOF[^\r\n]*\s*$")
-# Least magnitude of time stamps that count ticks since an epoch, ticks of a second, and that epoch
-# as Unix time in s; the last time in s, of the year 2286, that is read in the unit of its column;
-# and Unix times from 2001 to 2039 (those of LabVIEW, since 1904, are later).
-_TICKS = (
-    *((1e18, 1e9, "ns", 0), (1e16, 1e7, "100 ns", -11644473600)),
-    *((1e15, 1e6, "µs", 0), (1e12, 1e3, "ms", 0)),
-)
-_LATEST, _UNIX_TIMES = 1e10, (1e9, 2.2e9)
-# Days since 1900 from 1954 to 2173, which spreadsheets write, and their largest step: in s it would
-# be a sample rate of 1 MHz.
-_DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
+# Most bytes of text behind the rows: rates, counts and ends that exporters write there.
+_TRAILER = 1 << 12
+_WORD = re.compile(r"[^\W\d_]{3}")
 
 
 class Text:
@@ -78,6 +75,7 @@ class Text:
         """Go behind the first lines, from where on rows are expected."""
         self._stream.seek(0)
         self.position = self.pending = self.n_fields = 0
+        self.trailer = ""  # what is left out behind the rows
         self._tail = b""  # bytes after the last line feed
         self._ahead = b""  # the block that is read next
         for _ in range(n_lines):
@@ -95,8 +93,11 @@ class Text:
         a row, ``too-large`` for more than the file can honestly hold.
         """
         block, self._ahead = self._ahead or self._stream.read(size), self._stream.read(size)
-        if not self._ahead:
-            block = _END.sub(b"", block)
+        while 0 < len(self._ahead) < _TRAILER and (more := self._stream.read(size)):
+            self._ahead += more
+        if len(self._ahead) < _TRAILER:  # the last block
+            block, self._ahead = block + self._ahead, b""
+            block = self._rows(block)
         block = self._checked(block)
         if not block and self._tail and not self._tail.endswith(b"\r"):
             # The last number of a file that ends inside a row may be incomplete.
@@ -109,6 +110,32 @@ class Text:
             needed = "needed shorter rows, and a second quote to every quote"
             raise Unusable("corrupt", f"{found}; {needed}")
         return block
+
+    def _rows(self, block: bytes) -> bytes:
+        """Leave out the lines of text behind the last row."""
+        start = max(0, len(block) - _TRAILER)
+        lines = block[start:].splitlines(keepends=True)
+        kept = len(lines)
+        while kept and (not lines[kept - 1].strip() or self._is_text(lines[kept - 1])):
+            kept -= 1
+        texts = [line for line in lines[kept:] if line.strip()]
+        row = lines[kept - 1].decode("latin-1").strip() if kept else ""
+        # A block that is text to its beginning has no rows; rows may begin with text, too.
+        if not self.n_fields or not texts or _WORD.match(row) or (start and kept < 2):
+            return block
+        if n_lines := sum(not line.startswith(b"EOF") for line in texts):
+            self.trailer = f"{n_lines} lines of text behind the rows left out"
+        return block[: len(block) - sum(map(len, lines[kept:]))]
+
+    def _is_text(self, line: bytes) -> bool:
+        """Return whether a line is a remark or begins with a word; a word alone may be damage."""
+        text = line.decode("latin-1").strip()
+        if text.startswith(("#", "EOF")):
+            return True
+        first = (fields_of(text, self._delimiter) or [""])[0]
+        several = self.n_fields > 1 or len(text.split()) > 1
+        is_word = _WORD.match(first) and not is_number_or_moment(first)
+        return bool(is_word) and several and "\0" not in text
 
     def __iter__(self) -> Iterator[bytes]:
         """Iterate over lines; pandas requires it of a file."""
@@ -131,6 +158,10 @@ class Text:
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream:
+        # Any text may be a table.
+        if foreign := describe(stream.read(_HEAD_BYTES), path):
+            raise Unusable("format", foreign)
+        stream.seek(0)
         return parse_text(stream, path.stat().st_size, columns)
 
 
@@ -161,9 +192,10 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
         times = {c: columns.signal(target).factor for c in chosen
                  if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
         samples = _numbers(text, chosen, dialect, times)
-        for name, unit in times.items():
-            samples[name], ticks, moment = _since_first(samples[name], unit)
-            guessed, metadata = [*guessed, *ticks], moment | metadata
+        guessed += [text.trailer] if text.trailer else []
+    elif not (dialect.has_rows or columns.csv.delimiter) and len(lines) > dialect.start:
+        detail = "text without rows of numbers; needed a line of names and rows of samples"
+        raise Unusable("format", detail)
     elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
         text.begin(dialect.start)
         while stream.read(_HEAD_BYTES):
@@ -294,7 +326,7 @@ def _spooled(
 ) -> dict[str, Samples]:
     """Read the rows block by block."""
     n_rows = n_blank = 0
-    first: dict[str, Any] = {}  # moments
+    since = {name: SinceFirst(unit) for name, unit in times.items()}
     taken = {name: Spool() for name in places}
     with read() as tables:
         for table in tables:
@@ -309,55 +341,18 @@ def _spooled(
                 n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
                 values = table[place]
-                if values.dtype.kind not in "fiu" and name in times:
-                    values = _moments(values)
-                    since = values - first.setdefault(name, values.min())
-                    values = since.dt.total_seconds() / times[name]
-                if values.dtype.kind not in "fiu":
+                is_number = values.dtype.kind in "fiu"
+                if not is_number and name not in times:
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
+                numbers = values.to_numpy() if is_number else since[name](parse_moments(values))
                 if n_used:
                     taken[name].append(np.full(n_blank, np.nan))
-                    taken[name].append(values.to_numpy()[:n_used])
+                    taken[name].append(numbers[:n_used])
             n_rows += len(table)
             n_blank = len(table) - n_used + (0 if n_used else n_blank)
     if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
-
-
-def _moments(values: Any) -> Any:
-    """Read moments; what is none is missing."""
-    import pandas as pd
-
-    day_first = bool(values.astype(str).str.match(r"\d{1,2}\.").any())
-    text = values.astype(str).str.replace(",", ".") if values.dtype == object else values
-    return pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
-
-
-def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
-    """Convert ticks or days since an epoch to times since the first, in a unit in s.
-
-    Other times stay as they are. Return what was taken for what, and the moment of the first ticks.
-    """
-    first = next((block for _, block in blocks(time)), np.zeros(1))
-    start, step = float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
-    ticks = (one[1:] for one in _TICKS if abs(start) >= one[0] and abs(start) * unit > _LATEST)
-    if _DAYS[0] <= start < _DAYS[1] and step < _DAY_STEP:
-        scale, what, epoch = 1 / 86400, "days", None
-    elif _UNIX_TIMES[0] <= start * unit < _UNIX_TIMES[1]:
-        scale, what, epoch = 1 / unit, "", 0
-    else:
-        scale, what, epoch = next(ticks, (0.0, "", None))
-    if not scale:
-        return time, (), {}
-    spool = Spool()
-    for _, block in blocks(time):
-        spool.append((block - start) / (scale * unit))
-    guessed = (f"times in {what} since an epoch",) if what else ()
-    if epoch is None:
-        return spool.samples(), guessed, {}
-    moment = moment_after(constants.FIRST_MOMENT, start / scale + epoch)
-    return spool.samples(), guessed, {"recorded_at": moment}
 
 
 def _too_long(row: object, found: str, needed: int) -> Unusable:

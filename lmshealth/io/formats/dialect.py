@@ -51,7 +51,7 @@ class Dialect:
     """How a text is read: marks, a channel for each field of a row, and where the rows begin.
 
     ``start`` counts the lines before the rows; ``guessed`` lists what neither the log contract nor
-    the column map states.
+    the column map states; ``has_rows`` is whether the first lines hold any row of numbers.
     """
 
     delimiter: str
@@ -60,6 +60,7 @@ class Dialect:
     start: int
     metadata: dict[str, str] = field(default_factory=dict)
     guessed: tuple[str, ...] = ()
+    has_rows: bool = True
 
 
 class _Rows(NamedTuple):
@@ -128,7 +129,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     names, units, where = _names(heads, found, max(n_first, found.n_fields), columns)
     guessed = _guessed(found, layout, where, begin)
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
-    return Dialect(found.delimiter, found.decimal, channels, found.first, metadata, guessed)
+    marks, has_rows = (found.delimiter, found.decimal), found.share > 0
+    return Dialect(*marks, channels, found.first, metadata, guessed, has_rows)
 
 
 def fields_of(line: str, delimiter: str) -> list[str]:
@@ -140,6 +142,12 @@ def fields_of(line: str, delimiter: str) -> list[str]:
         return next(csv.reader(text, delimiter=delimiter, skipinitialspace=True), [])
     except csv.Error as error:
         raise corrupt(f"a line cannot be split: {error}") from error
+
+
+def is_number_or_moment(word: str) -> bool:
+    """Return whether a field of a row may be one, also an empty field."""
+    kinds = (*_NUMBER.values(), _MOMENT, _THOUSANDS)
+    return any(kind.fullmatch(word) for kind in kinds)
 
 
 def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
@@ -207,7 +215,7 @@ def _heads(lines: Sequence[str], skip: int, found: _Rows) -> Iterator[tuple[int,
         text = _REMARK.sub("", lines[k], count=1)
         remark = text != lines[k]
         # A key with its value, not a name above the rows; of these a colon may be the delimiter.
-        keyed = k + 1 < len(lines) and found.delimiter != ":" and _KEYED.match(text)
+        keyed = (remark or k + 1 < len(lines)) and found.delimiter != ":" and _KEYED.match(text)
         for delimiter in (found.delimiter, *_DELIMITERS) if text.strip() and not keyed else ():
             fields = [one.strip() for one in fields_of(text, delimiter)]
             n = len(fields) - (len(fields) == found.n_fields + 1 and not fields[-1])
@@ -236,7 +244,7 @@ def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
     if sure := next(filter(_THOUSANDS.fullmatch, words), None):
         raise Unusable("columns", f"{sure!r} has marks between thousands; export without them")
     marked = [word for word in words if "," in word]
-    if found.delimiter != "," and marked and all(map(_MAYBE_THOUSANDS.fullmatch, marked)):
+    if marked and all(map(_MAYBE_THOUSANDS.fullmatch, marked)):
         step = 'if these are decimals set decimal = "," under [csv] of the column map'
         raise Unusable("columns", f"{marked[0]!r} may have a mark between thousands; {step}")
 
@@ -274,7 +282,8 @@ def _names(
     others = [fields for _, fields in (*heads[max(k - 1, 0) : k], *heads) if fields is not names]
     fitting = (one for one in others if len(one) == len(names) and all(map(_is_unit, one)))
     units = next(filter(any, fitting), [""] * len(names))
-    return names, [word.strip(" []()") for word in units], where
+    bare = (word.strip(" []()") for word in units)
+    return names, ["" if _KEY.fullmatch(word) else word for word in bare], where
 
 
 def _is_unit(word: str) -> bool:

@@ -79,6 +79,11 @@ class _Content(msgspec.Struct, tag=True):
     present: tuple[str, ...]
     refused: tuple[Refusal, ...]
     guessed: tuple[str, ...]
+    late: dict[str, int]
+
+
+# All of it but the columns.
+_PARTS = _Content.__struct_fields__[1:]
 
 
 class _Refused(msgspec.Struct, tag=True):
@@ -184,7 +189,7 @@ class _Reader:
                 columns = {
                     name: spools.get(k, Spool()).samples() for name, k in answer.columns.items()
                 }
-                parts = answer.metadata, answer.present, answer.refused, answer.guessed
+                parts = (getattr(answer, name) for name in _PARTS)
                 return Content(columns, *parts)
             dtype = np.dtype(answer.dtype)
             if dtype.kind not in "fiu":
@@ -296,8 +301,7 @@ def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
         own = {
             name: numbers.setdefault(spool, len(numbers)) for name, spool in content.columns.items()
         }
-        parts = content.metadata, content.present, content.refused, content.guessed
-        write(_Content(own, *parts))
+        write(_Content(own, *(getattr(content, name) for name in _PARTS)))
     except Unusable as error:
         write(_Refused(error.reason, error.detail))
     answers.flush()

@@ -151,7 +151,9 @@ def _testlab(
         begin = 0.0 if start is None or not start.size else float(start.ravel()[0])
         rate = rate_of(float(step.ravel()[0])) if step.size else None
         for k, name in enumerate(names):
-            channels.append((Described(name, unit, rate, start=begin), columns[:, k]))
+            channels.append(
+                (Described(name, unit, rate, start=begin, size=len(columns)), columns[:, k])
+            )
     return channels
 
 

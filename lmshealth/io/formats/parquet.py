@@ -4,8 +4,9 @@ from pathlib import Path
 from typing import Any
 
 from lmshealth.io.buffers import BLOCK, MINUTE, Spool
-from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import Content, Format, check_size, library, not_numeric, wanted
+from lmshealth.io.formats.moments import SinceFirst
 
 _MAGIC = b"PAR1"
 # Bytes of each column of the file that are read ahead.
@@ -24,9 +25,13 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     ) as file:
         schema, n_rows = file.schema_arrow, file.metadata.num_rows
         chosen = wanted(schema.names, columns)
+        times: dict[str, SinceFirst] = {}
         for name in chosen:
             kind: Any = schema.field(name).type
-            if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+            target = columns.target(name) or ""
+            if pa.types.is_timestamp(kind) and role_of(target) == "time":
+                times[name] = SinceFirst(columns.signal(target).factor)
+            elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 raise not_numeric(name, f"values of type {kind}")
         check_size(8 * n_rows * len(chosen), path.stat().st_size)
         metadata = {
@@ -40,7 +45,8 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         taken = {name: Spool(n_rows) for name in chosen}
         for batch in batches:
             for name, spool in taken.items():
-                spool.append(batch.column(name).to_numpy(zero_copy_only=False))
+                values = batch.column(name).to_numpy(zero_copy_only=False)
+                spool.append(times[name](values) if name in times else values)
     read = {name: spool.samples() for name, spool in taken.items()}
     return Content(read, metadata, tuple(schema.names))
 

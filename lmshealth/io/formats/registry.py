@@ -17,9 +17,11 @@ from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, gzipped, load_by
 from lmshealth.io.formats.csv import CSV
+from lmshealth.io.formats.foreign import describe
 from lmshealth.io.formats.hdf5 import HDF5
 from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.mat import MAT
+from lmshealth.io.formats.moments import without_epoch
 from lmshealth.io.formats.parquet import PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
@@ -123,7 +125,7 @@ def load(path: Path, columns: ColumnMap, max_memory: float = constants.MAX_MEMOR
         content = load_by(form.name, form.load, path, columns, max_memory)
     if form not in FORMATS and (fault := fault_of(content)):
         raise Unusable("format", f"the plug-in for {form.name} returns {fault}; update it")
-    return content
+    return without_epoch(content, columns)
 
 
 def fault_of(content: object) -> str:
@@ -145,26 +147,39 @@ def fault_of(content: object) -> str:
 def confirm(path: Path) -> Format:
     """Return the format of a file's suffix, which its first bytes must confirm."""
     form = format_of(path)
-    if form is None:
-        known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
-        needed = (
-            f"needed one of {', '.join(known)}; save other arrays as columns of HDF5 or Parquet"
-        )
-        raise Unusable("format", f"unknown suffix {path.suffix!r}; {needed}")
     with path.open("rb") as stream:
         head = stream.read(_HEAD)
     if not head:
         raise Unusable("empty", "0 bytes; copy the file again")
+    if form is None:
+        raise _unknown(path, head)
     try:
-        if form.sniff(head):
-            return form
+        fits = form.sniff(head)
     except Exception as error:
         if form in FORMATS:
             raise
         detail = f"the plug-in for {form.name} fails ({type(error).__name__}: {error}); update it"
         raise Unusable("format", detail) from error
+    if fits:
+        return form
+    if foreign := describe(head, path):
+        raise Unusable("format", foreign)
     actual = next((other for other in FORMATS if other.sniff(head)), None)
     if actual is None:
         raise corrupt(f"does not start as {form.name} does")
     found = f"the suffix is that of {form.name}, the content is {actual.name}"
     raise Unusable("format", f"{found}; rename the file to {actual.suffixes[0]}")
+
+
+def _unknown(path: Path, head: bytes) -> Unusable:
+    """Return the refusal of a file with an unknown suffix."""
+    if foreign := describe(head, path):
+        return Unusable("format", foreign)
+    found = f"unknown suffix {path.suffix!r}"
+    actual = next((other for other in FORMATS if other.sniff(head)), CSV)
+    if actual is not CSV:
+        step = f"rename the file to {actual.suffixes[0]}"
+        return Unusable("format", f"{found}, the content is {actual.name}; {step}")
+    known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
+    step = "rename text to .csv, save other arrays as columns of HDF5 or Parquet"
+    return Unusable("format", f"{found}; needed one of {', '.join(known)}; {step}")

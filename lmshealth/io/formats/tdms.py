@@ -11,13 +11,13 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
-from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.content import (
     Content,
     Format,
@@ -26,6 +26,7 @@ from lmshealth.io.formats.content import (
     library,
     not_numeric,
 )
+from lmshealth.io.formats.moments import SinceFirst
 from lmshealth.io.formats.unit_channels import Described, choose, rate_of
 from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed
@@ -39,6 +40,18 @@ _N_SCALES = "NI_Number_Of_Scales"
 _SCALE = re.compile(r"NI_Scale\[(\d{1,18})\d*\]")
 # Start time of a channel whose start was never set.
 _EPOCH = np.datetime64("1904-01-01", "us")
+# Properties of the clock of a channel.
+_CLOCK = ("wf_increment", "wf_start_time", "wf_start_offset")
+_UNLIKE = "segments of the channels differ in start or increment; split them"
+
+
+class _Part(NamedTuple):
+    """Number of samples of a channel at the end of a segment, and the properties of its clock."""
+
+    n_values: int
+    increment: Any
+    start: Any
+    offset: Any
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -55,14 +68,20 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         channels = [channel for group in file.groups() for channel in group.channels()]
         _check_sizes(channels, sum(segments))
         _check_scales(one.properties for one in (file, *file.groups(), *channels))
-        chosen, content = choose(_described(channels), columns)
+        parts = _parts(path)
+        chosen, content = choose(_described(channels, parts), columns)
         wanted = {name: channels[k] for name, k in chosen.items()}
-        read = _read(file, wanted, path.stat().st_size)
-        stamps = None if "time_s" in read else _stamps(path, [c.path for c in wanted.values()])
+        times = _times(wanted, columns)
+        read = _read(file, wanted, times, path.stat().st_size)
+        is_timed = any(role_of(columns.target(name) or "") == "time" for name in read)
+        stamps = None if is_timed else _stamps([parts[c.path] for c in wanted.values()])
+        if stamps is not None and content.late:
+            raise Unusable("time", _UNLIKE)
         # The increment of a channel is that of its last segment.
         clock = content.metadata if stamps is None else {}
         read |= {} if stamps is None else {"time_s": stamps}
-        starts = [channel.properties.get("wf_start_time") for channel in wanted.values()]
+        starts = [since.first for since in times.values()]
+        starts += [channel.properties.get("wf_start_time") for channel in wanted.values()]
         own = {key: as_text(file.properties[key]) for key in KEYS if key in file.properties}
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
     metadata = ({} if start is None else {"recorded_at": as_text(start)}) | clock | own
@@ -96,48 +115,81 @@ def _segments(path: Path) -> list[int]:
     return found
 
 
-def _stamps(path: Path, channels: Sequence[str]) -> Samples | None:
-    """Make time stamps in s where segments state another ``wf_increment``, or a gap by their start.
+def _parts(path: Path) -> dict[str, list[_Part]]:
+    """Read the clock of each channel in each segment, by the path of the channel.
 
-    None where one clock runs through all segments; `Unusable` (``time``) where channels differ.
+    npTDMS keeps the properties of the last segment. Segments of one clock are joined.
     """
     from nptdms.reader import TdmsReader
 
-    found: dict[str, list[tuple[int, Any, Any]]] = {name: [] for name in channels}
+    found: dict[str, list[_Part]] = {}
 
     class Reader(TdmsReader):  # type: ignore[misc]
-        """Collect the properties at the end of each segment, of which npTDMS keeps the last."""
+        """Collect the properties at the end of each segment."""
 
         def _update_object_properties(self, properties: object) -> None:
             super()._update_object_properties(properties)
             for name, own in self.object_metadata.items():
-                values = (own.properties.get(key) for key in ("wf_increment", "wf_start_time"))
-                if name in found:
-                    found[name].append((own.num_values, *values))
+                part = _Part(own.num_values, *map(own.properties.get, _CLOCK))
+                parts = found.setdefault(name, [])
+                if parts and parts[-1][1:] == part[1:]:
+                    parts.pop()
+                parts.append(part)
 
     with path.open("rb") as stream:
         Reader(stream).read_metadata()
-    clocks = [_clock(parts) for parts in found.values()]
+    return found
+
+
+def _stamps(channels: Sequence[Sequence[_Part]]) -> Samples | None:
+    """Make time stamps in s where segments state another ``wf_increment``, or a gap by their start.
+
+    None where one clock runs through all segments; `Unusable` (``time``) where channels differ.
+    """
+    clocks = [_clock(parts) for parts in channels]
     if all(len(clock) < 2 for clock in clocks):
         return None
     if any(clock != clocks[0] for clock in clocks):
-        raise Unusable("time", "segments of the channels differ in start or increment; split them")
+        raise Unusable("time", _UNLIKE)
     spool = Spool()
     for start, interval, n in clocks[0]:
         spool.append(start + interval * np.arange(n))
     return spool.samples()
 
 
-def _clock(parts: Sequence[tuple[int, Any, Any]]) -> list[tuple[float, float, int]]:
+def _starts(parts: Mapping[str, Sequence[_Part]]) -> dict[str, float | None]:
+    """Return the time in s of the first sample of each channel since that of the earliest.
+
+    None for a channel that states none.
+    """
+    first = {name: own[0] for name, own in parts.items() if own}
+    moments = {
+        name: part.start.as_datetime64("ns")
+        for name, part in first.items()
+        if hasattr(part.start, "as_datetime64") and part.start.as_datetime64("us") > _EPOCH
+    }
+    earliest = min(moments.values(), default=None)
+    found: dict[str, float | None] = {}
+    for name, part in first.items():
+        offset = float(part.offset) if isinstance(part.offset, int | float) else 0.0
+        since = 0.0
+        if earliest is not None and name in moments:
+            since = float((moments[name] - earliest) / np.timedelta64(1, "ns")) / 1e9
+        is_stated = earliest is None or name in moments
+        found[name] = since + offset if is_stated and np.isfinite(offset) else None
+    return found
+
+
+def _clock(parts: Sequence[_Part]) -> list[tuple[float, float, int]]:
     """Join segments of one clock; return start in s, interval in s and number of samples of each.
 
     Empty where an increment is missing.
     """
     clock: list[tuple[float, float, int]] = []
     end, last = 0.0, 0
-    first: Any = parts[0][2] if parts else None
+    first: Any = parts[0].start if parts else None
     before = first
-    for n_total, stated, moment in parts:
+    for n_total, stated, moment, _ in parts:
         rate, n = rate_of(stated), n_total - last
         if rate is None:
             return []
@@ -176,31 +228,47 @@ def _check_scales(objects: Iterable[Mapping[str, object]]) -> None:
                 raise Unusable("corrupt", detail)
 
 
-def _described(channels: Sequence[Any]) -> list[Described]:
+def _described(channels: Sequence[Any], parts: Mapping[str, Sequence[_Part]]) -> list[Described]:
     """Describe the channels; the group is named where the channel alone is ambiguous."""
     names = Counter(channel.name for channel in channels)
+    starts = _starts(parts)
     return [
         Described(
             channel.name if names[channel.name] == 1 else f"{channel.group_name}/{channel.name}",
             str(channel.properties.get("unit_string", "")),
             rate_of(channel.properties.get("wf_increment")),
+            start=starts.get(channel.path),
+            size=len(channel),
+            moments=channel.dtype.kind == "M",
         )
         for channel in channels
     ]
 
 
-def _read(file: Any, wanted: dict[str, Any], stored: int) -> dict[str, Samples]:
-    """Read the wanted channels in one pass, each of shape ``(n_samples,)``."""
+def _times(wanted: dict[str, Any], columns: ColumnMap) -> dict[str, SinceFirst]:
+    """Return the conversion of the columns of moments; all others must be numbers."""
+    found: dict[str, SinceFirst] = {}
     for name, channel in wanted.items():
-        if channel.dtype.kind not in "fiu":
+        target = columns.target(name) or ""
+        if channel.dtype.kind == "M" and role_of(target) == "time":
+            found[name] = SinceFirst(columns.signal(target).factor)
+        elif channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
+    return found
+
+
+def _read(
+    file: Any, wanted: dict[str, Any], times: Mapping[str, SinceFirst], stored: int
+) -> dict[str, Samples]:
+    """Read the wanted channels in one pass, each of shape ``(n_samples,)``."""
     check_size(8 * sum(len(channel) for channel in wanted.values()), stored)
     taken = {name: Spool() for name in wanted}
     for chunk in file.data_chunks() if wanted else ():
         for name, channel in wanted.items():
             samples = chunk[channel.group_name][channel.name]
             if len(samples):
-                taken[name].append(samples[:])
+                values = samples[:]
+                taken[name].append(times[name](values) if name in times else values)
     for name, channel in wanted.items():
         if taken[name].size != len(channel):
             found = f"{taken[name].size} of {len(channel)} samples are there"

@@ -7,6 +7,7 @@ and pairs tags wrongly where a line of another data set ends like one.
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -18,7 +19,7 @@ from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
 from lmshealth.io.formats.unit_channels import Described, choose, rate_of
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")
 _BEGIN = re.compile(rb"[\s\x1a]*?^    -1[ \t]*\r?\n", re.MULTILINE)
@@ -33,11 +34,33 @@ _TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
 _RESPONSE, _COHERENCE = 4, 6
 _REAL, _COMPLEX = (2, 4), (5, 6)
+# Names of other functions and data sets, for messages.
+_FUNCTIONS = {
+    **{0: "unknown", 1: "complex time response", 2: "spectrum", 3: "cross spectrum"},
+    **{4: "frequency response", 5: "transmissibility", 6: "coherence", 7: "correlation"},
+    **{8: "cross correlation", 9: "power spectral density", 10: "energy spectral density"},
+    **{12: "spectrum", 27: "order function"},
+}
+_SETS = {
+    **{15: "nodes", 18: "coordinate systems", 55: "mode shapes", 82: "lines of a geometry"},
+    **{151: "header", 164: "units", 780: "elements", 781: "nodes", 2411: "nodes"},
+    **{2412: "elements", 2414: "analysis", 2420: "coordinate systems", 2467: "groups"},
+}
 # Names in a header of degrees of freedom by their code; rotations are 4 to 6.
 _DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 _HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
 _SECONDS = ("", "none", "s", "sec", "second", "seconds")
 _UNEVEN, _EVEN = 0, 1
+# Most bytes of a header, and those that fill up a block of binary numbers.
+_HEADER, _FILL = 4096, b"\0 \r\n\x1a"
+# Columns of the values in a row by type of the ordinate and spacing of the abscissa; those of
+# single precision take 13 each.
+_SINGLE = (2, 5)
+_WIDTHS: dict[tuple[int, int], tuple[int, ...]] = {(4, _EVEN): (20,) * 4, (6, _EVEN): (20,) * 4}
+_WIDTHS |= {(4, _UNEVEN): (13, 20) * 2, (6, _UNEVEN): (13, 20, 20)}
+
+# Date in the third line of a header.
+_DATE = re.compile(r"(\d\d?)-([A-Za-z]{3})-(?:\d\d)?(\d\d)\s+(\d\d?):(\d\d):(\d\d)")
 
 # Bytes of memory for a byte of the file and of the data set that is read.
 _FILE_MEMORY, _SET_MEMORY = 3, 16
@@ -49,7 +72,11 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with TemporaryDirectory(prefix="lmshealth-") as folder:
         file = _File(path, Path(folder), max_memory)
         names = _names(file.headers)
-        described = [_describe(*named) for named in zip(file.headers, names, strict=True)]
+        asked = set(columns.columns.values()) & set(names)
+        if not asked and not any(map(_is_time_record, file.headers)):
+            raise _no_time_records(file.headers, names, file.others)
+        dates = _dates(file.headers)
+        described = [_describe(*named) for named in zip(file.headers, names, dates, strict=True)]
         chosen, content = choose(described, columns)
         read: dict[str, Samples] = {}
         stamps: dict[str, Samples] = {}
@@ -117,7 +144,8 @@ def _dof(header: Header, role: str) -> str:
 class _File:
     """The data sets 58 of a file, and what pyuff reads of their headers.
 
-    ``headers`` have the place of the data set among all data sets, too, from 1.
+    ``headers`` have the place of the data set among all data sets, too, from 1; ``others`` are the
+    numbers of the other data sets.
     """
 
     def __init__(self, path: Path, folder: Path, max_memory: float) -> None:
@@ -125,11 +153,13 @@ class _File:
             import pyuff
         check_memory("the file", _FILE_MEMORY * path.stat().st_size, max_memory)
         self._max_memory = max_memory
-        found = dict(_data_sets(path.read_bytes()))
+        every = list(_data_sets(path.read_bytes()))
+        found = {place: lines for place, number, lines in every if number == _FUNCTION}
+        self.others = sorted({number for _, number, _ in every} - {_FUNCTION})
         self._sizes = [len(lines) for lines in found.values()]
         copy = folder / "functions.uff"
         with copy.open("wb") as stream:
-            stream.writelines(_TAG + lines + _TAG for lines in found.values())
+            stream.writelines(_TAG + _without_padding(lines) + _TAG for lines in found.values())
         self._file = pyuff.UFF(str(copy))
         if self._file.get_n_sets() != len(found):
             raise Unusable("corrupt", "a header contains the tag of a data set; export it again")
@@ -163,8 +193,8 @@ class _File:
         return read["x"], read["data"]
 
 
-def _data_sets(content: bytes) -> Iterator[tuple[int, bytes]]:
-    """Find the data sets 58 and check that all are whole: place among all, lines without tags."""
+def _data_sets(content: bytes) -> Iterator[tuple[int, int, bytes]]:
+    """Find the data sets and check that all are whole: place, number, and lines of those of 58."""
     at = place = 0
     while begin := _BEGIN.match(content, at):
         place, at = place + 1, begin.end()
@@ -174,22 +204,98 @@ def _data_sets(content: bytes) -> Iterator[tuple[int, bytes]]:
         if not number[0].strip().isdigit() or not int(number[0]):
             raise corrupt(f"data set {place} has no number")
         is_function = int(number[0]) == _FUNCTION
-        is_binary = is_function and content[at + 6 : at + 7].lower() == b"b"
-        end = (_BINARY_END if is_binary else _END).search(content, at)
+        is_binary = is_function and _is_binary(content[at : at + 7])
+        layout = _layout(content[at : at + _HEADER]) if is_binary else None
+        # Samples may contain the bytes of a tag.
+        after = at + layout.end if layout and layout.is_counted else at
+        end = (_BINARY_END if is_binary else _END).search(content, after)
         if end is None:
             raise corrupt("the last data set is cut off")
-        if is_function:
-            lines = content[at : end.start()]
-            if lines.count(b"\n") < 1 + _N_RECORDS:
-                raise _malformed(place)
-            yield place, lines
+        lines = content[at : end.start()] if is_function else b""
+        if is_function and lines.count(b"\n") < 1 + _N_RECORDS:
+            raise _malformed(place)
+        yield place, int(number[0]), lines
         at = end.end()
     if content[at:].strip(b" \t\r\n\x1a"):
         raise corrupt(f"no data set begins at byte {at}")
 
 
+class _Layout(NamedTuple):
+    """How the header of a data set states that its values are stored.
+
+    ``widths`` are the columns of the values in a row of text. ``is_counted`` is whether a header of
+    binary numbers states that they take the bytes up to ``end``.
+    """
+
+    start: int
+    end: int
+    n_values: int
+    widths: tuple[int, ...]
+    is_counted: bool
+
+
+def _layout(lines: bytes) -> _Layout | None:
+    """Read the layout of a data set 58 from its header; None where that is malformed."""
+    head = lines.splitlines(keepends=True)[: 1 + _N_RECORDS]
+    start = sum(map(len, head))
+    try:
+        kind, n, spacing = (int(head[7][k : k + 10]) for k in (0, 10, 20))
+        n *= 1 + (kind in _COMPLEX) + (spacing == _UNEVEN)
+        n_bytes = n * (4 if kind in _SINGLE else 8)
+        is_counted = _is_binary(lines) and int(lines[31:43]) == n_bytes
+    except (IndexError, ValueError):
+        return None
+    widths = (13,) * 6 if kind in _SINGLE else _WIDTHS.get((kind, spacing), ())
+    return _Layout(start, start + n_bytes, n, widths, is_counted) if n > 0 and widths else None
+
+
+def _without_padding(lines: bytes) -> bytes:
+    """Leave out what follows the stated number of samples of a data set, if it is padding.
+
+    Padding are zeros and blanks, and of binary numbers any bytes where the header states the number
+    of bytes without them. Other data sets stay as they are, and are refused by their number.
+    """
+    if (layout := _layout(lines)) is None:
+        return lines
+    if _is_binary(lines):
+        is_padding = layout.is_counted or not lines[layout.end :].strip(_FILL)
+        is_whole = len(lines) >= layout.end
+        return lines[: layout.end] + b"\n" if is_padding and is_whole else lines
+    rows = lines[layout.start :].splitlines()
+    n_whole, last = divmod(layout.n_values - 1, len(layout.widths))
+    width = sum(layout.widths[: last + 1])
+    try:
+        after = [row[width:] if k == 0 else row for k, row in enumerate(rows[n_whole:])]
+        if any(float(word) != 0 for row in after for word in row.split()):
+            return lines
+    except ValueError:
+        return lines
+    rows = [*rows[:n_whole], *(row[:width] for row in rows[n_whole : n_whole + 1])]
+    return lines[: layout.start] + b"".join(row + b"\n" for row in rows)
+
+
+def _is_binary(lines: bytes) -> bool:
+    return lines[6:7].lower() == b"b"
+
+
 def _malformed(place: int) -> Unusable:
     return Unusable("corrupt", f"data set {place} does not keep the format 58; export it again")
+
+
+def _no_time_records(
+    headers: Sequence[Header], names: Sequence[str], others: Sequence[int]
+) -> Unusable:
+    """Return the refusal of a file of other functions, or of a geometry."""
+    needed = "needed acceleration over time (data sets 58, function type 1)"
+    kinds = sorted({header["func_type"] for header in headers})
+    if kinds:
+        text = listed(f"function type {kind} ({_FUNCTIONS.get(kind, 'another')})" for kind in kinds)
+        found = f"holds no time record but {text}: {listed(names)}"
+        if _RESPONSE in kinds:
+            needed += "; `lmshealth frf` reads frequency responses"
+        return Unusable("columns", f"{found}; {needed}")
+    text = listed(f"{number} ({_SETS.get(number, 'another')})" for number in others)
+    return Unusable("format", f"holds the data sets {text}, and no measured functions; {needed}")
 
 
 def _names(headers: Sequence[Header]) -> list[str]:
@@ -201,8 +307,30 @@ def _names(headers: Sequence[Header]) -> list[str]:
     return [f"set {header['place']}" for header in headers]
 
 
-def _describe(header: Header, name: str) -> Described:
-    """Describe a data set; all but time records of real numbers have no unit of a signal."""
+def _dates(headers: Sequence[Header]) -> list[float]:
+    """Return the dates of data sets in s since the first, zeros where they are those of one record.
+
+    A header dates the record, or when it was written: dates that differ by less than the record
+    takes do not order the samples of two channels.
+    """
+    found = [_DATE.search(header["id3"]) for header in headers]
+    lengths = [header["num_pts"] * header["abscissa_inc"] for header in headers]
+    if not all(found) or not min(lengths, default=0.0) > 0:
+        return [0.0] * len(headers)
+    try:
+        moments = [datetime.strptime(" ".join(m.groups()), "%d %b %y %H %M %S") for m in found if m]
+    except ValueError:
+        return [0.0] * len(headers)
+    since = [(moment - moments[0]).total_seconds() for moment in moments]
+    apart = max(since) - min(since) > max(lengths)
+    return since if apart else [0.0] * len(headers)
+
+
+def _describe(header: Header, name: str, date: float) -> Described:
+    """Describe a data set; all but time records of real numbers have no unit of a signal.
+
+    The date is that of `_dates`.
+    """
     unit = header["ordinate_axis_units_lab"].strip()
     unit = "" if unit == "NONE" else unit
     if not _is_time_record(header):
@@ -213,8 +341,8 @@ def _describe(header: Header, name: str) -> Described:
         unit = unit.replace("\ufffd", "2")
     uneven = header["abscissa_spacing"] == _UNEVEN
     rate = None if uneven else rate_of(header["abscissa_inc"])
-    start = 0.0 if uneven else float(header["abscissa_min"])
-    return Described(name, unit, rate, acceleration, start)
+    start = date + (0.0 if uneven else float(header["abscissa_min"]))
+    return Described(name, unit, rate, acceleration, start, header["num_pts"])
 
 
 def _is_time_record(header: Header) -> bool:

@@ -19,27 +19,32 @@ _TIME = re.compile(r"(time|zeit|temps|tiempo|tempo|t|x_value|timestamp)\b", re.I
 class Described:
     """Name and unit of a channel as in the file, empty where there is none.
 
-    ``rate`` is its sample rate in Hz, ``start`` the time in s of its first sample; ``acceleration``
-    whether the file calls it one, whatever its unit.
+    ``rate`` is its sample rate in Hz, ``start`` the time in s of its first sample, None where the
+    file has none, and ``size`` its number of samples, 0 where it is not yet there; ``acceleration``
+    whether the file calls it one, whatever its unit, and ``moments`` whether it holds moments.
     """
 
     name: str
     unit: str
     rate: float | None = None
     acceleration: bool = False
-    start: float = 0.0
+    start: float | None = 0.0
+    size: int = 0
+    moments: bool = False
 
 
 def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str, int], Content]:
     """Choose the channels of one sample rate that the contract or the column map names.
 
     Return the index in the file of each by its name as a column of the log, and a content that has
-    their sample rate, the names of all channels, and refusals, but no samples. Channels of another
-    rate or start are refused.
+    their sample rate, the names of all channels, refusals, and by how many samples they start late,
+    but no samples. Channels of another rate are refused, and those whose start is a fraction of a
+    sample off, or so late that the others would be used in part only.
 
     Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
-    with it, the named ones and those that keep the contract. Two channels that would be one column
-    are refused as ``columns``, a name that contradicts the unit of its channel as ``unit``.
+    with it, the named ones and those that keep the contract. Moments are times where there are no
+    others and no rate. Two channels that would be one column are refused as ``columns``, a name
+    that contradicts the unit of its channel as ``unit``.
     """
     named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
     if len(named) > constants.MOST_COLUMNS:
@@ -52,14 +57,15 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
         if (own := channels[k].rate) is not None and role_of(column) != "time"
     )
     rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
+    named = [*named, *_moments(channels, named, rate, columns)]
     alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
-    starts = [channels[k].start for k in alike]
-    start = max(starts, key=starts.count, default=0.0)
+    n_late = _aligned([channels[k] for k in alike], rate)
+    samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
     kept: dict[str, int] = {}
     refused: dict[str, Refusal] = {}
     for column, k in named:
-        late, own = channels[k].start - start, channels[k].rate
-        if k in alike and (rate is None or abs(late) * rate <= 0.5):
+        own = channels[k].rate
+        if k in samples:
             if column in kept and (role_of(column) != "time" or own is None):
                 both = listed([channels[kept[column]].name, channels[k].name])
                 detail = f"{both} would both be read as {column}; rename them or map one of them"
@@ -68,13 +74,59 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
         elif role_of(column) != "time":
             detail = f"sampled at {own or rate:.6g} Hz, the log at {rate:.6g} Hz; "
             if k in alike:
-                detail = f"starts {late:.6g} s after the other channels; "
+                others = min(channels[one].start or 0.0 for one in samples)
+                late, common = (round(s or 0.0, 6) for s in (channels[k].start, others))
+                detail = f"starts at {late:.12g} s, the others at {common:.12g} s; "
             detail += "keep channels of one rate and start in one log"
             refused[column] = Refusal("", "time", detail, channel=column)
     # 999.9999999999999 Hz is an artefact of the division.
     metadata = {} if rate is None else {"sample_rate_hz": f"{rate:.10g}"}
     present = tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels)
-    return kept, Content({}, metadata, present, tuple(refused.values()))
+    first = min((samples[k] for k in kept.values()), default=0)
+    delays = {column: n for column, k in kept.items() if (n := samples[k] - first)}
+    for column, n in delays.items():
+        since = f"{n} samples ({n / (rate or 1.0):.6g} s)"
+        detail = f"starts {since} after others; all are used where they have samples"
+        refused[column] = Refusal("", "gaps", detail, channel=column)
+    return kept, Content({}, metadata, present, tuple(refused.values()), late=delays)
+
+
+def _moments(
+    channels: Sequence[Described],
+    named: Sequence[tuple[str, int]],
+    rate: float | None,
+    columns: ColumnMap,
+) -> list[tuple[str, int]]:
+    """Return the channel of moments as a column of times, where nothing else states the rate."""
+    found = [(channel.name, k) for k, channel in enumerate(channels) if channel.moments]
+    timed = columns.sample_rate_hz or any(
+        role_of(columns.target(c) or "") == "time" for c, _ in named
+    )
+    return [("time_s", found[0][1])] if len(found) == 1 and rate is None and not timed else []
+
+
+def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | None]:
+    """Return by how many samples each channel starts after that to which most others fit.
+
+    None for a channel that is a fraction of a sample off, or so far that less than
+    `constants.LEAST_COMMON` of its record would be left.
+    """
+    starts = [0.0 if channel.start is None else channel.start for channel in channels]
+    fits: list[list[int | None]] = []
+    for start in dict.fromkeys(starts):
+        offsets = [0.0 if c.start is None else (c.start - start) * (rate or 0.0) for c in channels]
+        found: list[int | None] = [None] * len(channels)
+        low = high = 0
+        for k in sorted(range(len(channels)), key=lambda k: abs(offsets[k])):
+            n, size = round(offsets[k]), channels[k].size
+            span = max(high, n) - min(low, n)
+            is_exact = abs(offsets[k] - n) <= constants.START_TOLERANCE
+            is_exact &= rate is not None or starts[k] == start
+            if is_exact and (size < 1 or span <= (1 - constants.LEAST_COMMON) * size):
+                found[k], low, high = n, min(low, n), max(high, n)
+        fits.append(found)
+    # Most channels start at its start; then, most are aligned to it.
+    return max(fits, key=lambda fit: (fit.count(0), -fit.count(None)), default=[])
 
 
 def _agree(one: float, other: float) -> bool:

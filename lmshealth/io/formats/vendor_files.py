@@ -66,7 +66,7 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         n_rows += len(rows)
         check_size(8 * n_rows * len(spools), path.stat().st_size)
     if not n_rows:
-        detail = "no records (rec) of a trace; measured responses are read by `lmshealth frf`"
+        detail = "an XML file with no records (rec) of a trace; `lmshealth frf` reads responses"
         raise Unusable("columns", detail)
     return replace(content, columns={name: one.samples() for name, one in spools.items()})
 

@@ -239,3 +239,29 @@ def test_empty_lines_are_missing_samples():
     assert str(parse("delta_e_um\n" + body).columns["delta_e_um"].tolist()) == "[1.0, nan, 2.0]"
     stamped = parse("time_s,delta_e_um\n0,1\n\n1,2\n")
     assert stamped.columns["delta_e_um"].tolist() == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "end",
+    [
+        "Rate 1344, overflows 0\n", "Rate 1344, overflows 0", "# end of file\n", "EOF\n",
+        "Mean,0.1,0.2\nMaximum,1.0,2.0\n", "\nRecorded by: axis 7\n\n", "Größe;1\n",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("n_rows", [3, 40_000])
+def test_text_behind_the_rows(tmp_path, end, n_rows):
+    """Lines of text behind the last row are no samples, and are counted."""
+    rows = "".join(f"{k},{k % 7},{k % 5}\n" for k in range(n_rows))
+    (tmp_path / "a.csv").write_text("# sample_rate_hz: 10\nn,acc_x_g,acc_y_g\n" + rows + end)
+    log = read_log(tmp_path / "a.csv")
+    assert log.channels[0].values.size == n_rows
+    assert any("behind the rows" in text for text in log.guessed) == (end != "EOF\n")
+
+
+@pytest.mark.parametrize("end", ["7,ab\n", "7,1", "oops,1,1,1,1\n1,1,1\n", "7,x,2\n"])
+def test_rows_that_are_cut_off_are_no_text(tmp_path, end):
+    """A last row without fields, or with a damaged one, is refused."""
+    rows = "".join(f"{k},{k % 7},{k % 5}\n" for k in range(9))
+    (tmp_path / "a.csv").write_text("# sample_rate_hz: 10\nn,acc_x_g,acc_y_g\n" + rows + end)
+    with pytest.raises(BadLog):
+        read_log(tmp_path / "a.csv")

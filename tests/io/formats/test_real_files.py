@@ -14,7 +14,8 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.reading import read_log
 from studies.read_throughput.samples import MAPS
 
-# What each sample is without a map: channels, samples and Hz, or reason and a word of the detail.
+# What each sample is without a map: channels, samples, Hz and channels that are used in part, or
+# reason and a word of the detail.
 AS_IT_IS = {
     "owi_wind_turbine_tdms/open/good_tdms_2.tdms": (8, 15000, 250.0),
     "owi_wind_turbine_tdms/open/faulty_tdms_01.tdms": ("corrupt", "after 9 whole segments"),
@@ -34,6 +35,12 @@ AS_IT_IS = {
     "lsb250_linear_guide/open/exp2.mat": ("columns", "there: exp2"),
     "dropbear_ds8/open/10steps_test0.txt.gz": ("columns", "PinLoc"),
     "shake_3storey/open/Stiff_BonusEvent_3rd.csv": ("columns", "no signal"),
+    "outside_faults/uff_last_row_padded.uff": (1, 20001, 1000.0),
+    "outside_faults/uff_b_trailing_zeros.uff": (1, 20001, 1000.0),
+    "outside_faults/uff_b_nbytes_padded.uff": (1, 20001, 1000.0),
+    "outside_faults/tdms_time_channel.tdms": (1, 40000, 2000.0),
+    "outside_faults/tdms_starts_differ_3.tdms": (3, 38000, 2000.0, 1),
+    "outside_faults/tdms_starts_differ_same_length.tdms": (2, 38000, 2000.0, 1),
 }
 # With their column map.
 WITH_MAP = {
@@ -71,9 +78,10 @@ def check(path, expected, columns=None):
         assert caught.value.reason == expected[0] and expected[1] in caught.value.detail
         return
     log = read_log(path, columns=columns)
-    n_channels, n_samples, rate = expected
+    n_channels, n_samples, rate, *in_part = expected
     assert (len(log.channels), log.channels[0].values.size) == (n_channels, n_samples)
-    assert log.sample_rate == pytest.approx(rate, rel=1e-6) and log.refused == ()
+    assert log.sample_rate == pytest.approx(rate, rel=1e-6)
+    assert [one.reason for one in log.refused] == ["gaps"] * sum(in_part)
 
 
 @pytest.mark.parametrize("name", AS_IT_IS)

@@ -313,3 +313,63 @@ def test_segments_of_other_clocks(tmp_path):
         second = (values[3000:], {"wf_start_time": start, **RATE})
         log = read_log(write_segments(tmp_path / f"{late}.tdms", first, second))
         assert log.sample_rate == 1000.0 and len(log.pieces) == n_pieces
+
+
+def clock(start=0.0, offset=0.0, **more):
+    """Make the properties of a channel of 2 kHz that starts some seconds after 8 o'clock."""
+    moment = np.datetime64("2026-03-01T08:00:00", "us") + np.timedelta64(round(1e6 * start), "us")
+    own = {"wf_increment": 5e-4, "wf_start_time": moment, "wf_start_offset": offset}
+    return {"unit_string": "g", **own, **more}
+
+
+@pytest.mark.parametrize(("start", "offset"), [(0.05, 0.0), (0.0, 0.05), (0.03, 0.02)])
+def test_channels_that_start_later_are_aligned(tmp_path, start, offset):
+    """Channels some whole samples apart are used where both have samples, in one time."""
+    whole = np.random.default_rng(1).normal(size=(2, 1100))
+    late = whole[1][100:] + 0.5 * whole[0][100:]
+    path = write(tmp_path / "a.tdms", ("a", whole[0], clock()), ("b", late, clock(start, offset)))
+    log = read_log(path)
+    np.testing.assert_allclose(log.channels[0].values, 9.80665 * whole[0][100:])
+    np.testing.assert_allclose(log.channels[1].values, 9.80665 * late)
+    assert "starts 100 samples (0.05 s) after" in log.refused[0].detail
+
+
+@pytest.mark.parametrize("late", [0.00525, 0.7])
+def test_channels_that_cannot_be_aligned(tmp_path, late):
+    """A fraction of a sample, or half of the record: the minority is refused with both starts."""
+    channels = [(name, NOISE**k, clock()) for k, name in ((1, "a"), (2, "b"))]
+    path = write(tmp_path / "a.tdms", *channels, ("c", NOISE**3, clock(late)))
+    log = read_log(path)
+    assert [c.name for c in log.channels] == ["acc_a", "acc_b"]
+    assert f"starts at {late:g} s, the others at 0 s" in log.refused[0].detail
+    assert log.channels[0].values.size == NOISE.size
+
+
+def test_starts_that_are_equal_or_absent(tmp_path):
+    """Rounding of start times, and channels without one, change nothing."""
+    without = {"unit_string": "g", "wf_increment": 5e-4}
+    path = write(
+        tmp_path / "a.tdms",
+        *(("a", NOISE, clock()), ("b", NOISE**2, clock(1e-5)), ("c", NOISE**3, without)),
+        n_segments=3,
+    )
+    log = read_log(path)
+    assert len(log.channels) == 3 and log.refused == () and log.channels[0].values.size == 2000
+
+
+@pytest.mark.parametrize("name", ["Time", "Zeitstempel", "x"])
+def test_a_channel_of_moments_is_the_time(tmp_path, name):
+    """Moments place samples where no rate is stated, and date the log."""
+    stamps = np.datetime64("2026-03-01T08:00:00", "us") + np.arange(2000) * np.timedelta64(
+        500, "us"
+    )
+    path = write(tmp_path / "a.tdms", (name, stamps, {}), ("a", NOISE, {"unit_string": "g"}))
+    log = read_log(path)
+    assert log.sample_rate == pytest.approx(2000.0)
+    assert log.metadata.recorded_at.isoformat() == "2026-03-01T08:00:00+00:00"
+    mapped = ColumnMap(columns={"time_ms": name, "acc_b_g": "a"})
+    assert read_log(path, columns=mapped).sample_rate == pytest.approx(2000.0)
+    rated = write(tmp_path / "b.tdms", (name, stamps[:1].repeat(2000), {}), ("a", NOISE, clock()))
+    assert read_log(rated).sample_rate == 2000.0
+    with pytest.raises(BadLog, match="one number per sample"):
+        read_log(path, columns=ColumnMap(columns={"acc_b_g": name}))

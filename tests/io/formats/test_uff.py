@@ -222,9 +222,10 @@ def test_binary_is_read_as_pyuff_reads_it(tmp_path, ordinate, dtype, spacing):
 
 
 def test_binary_numbers_that_look_like_a_tag(tmp_path):
-    """Samples whose bytes are the end of a data set (one in 10^16) make a damaged file of it."""
+    """Samples whose bytes are the end of a data set (one in 10^16) are refused, not cut there."""
     body = b"\n    -1\n" + VALUES[:10].tobytes()
-    corrupt(tmp_path / "log.uff", "begins at byte", uff_set(body, 11, binary=str(len(body))))
+    corrupt(tmp_path / "log.uff", "0 of 11 samples", uff_set(body, 11, binary="88"))
+    corrupt(tmp_path / "log.uff", "begins at byte", uff_set(body, 11, binary="0"))
 
 
 def test_big_endian(tmp_path):
@@ -300,16 +301,84 @@ def test_limit_of_memory(tmp_path):
         assert caught.value.reason == "too-large"
 
 
-def test_records_that_start_later_are_refused(tmp_path):
-    """A record of another start than the others is refused by name."""
-    path = tmp_path / "log.uff"
-    for start, n_refused in ((0.0, 0), (0.25, 1)):
-        records = {"a": VALUES[:100], "b": VALUES[::-1][:100], "c": VALUES[1:101]}
-        write_uff(path, {"a": records["a"], "b": records["b"]})
-        late = write_uff(
-            tmp_path / "late.uff", {"c": records["c"]}, x=start + np.arange(100) / 2000
+@pytest.mark.parametrize(
+    ("start", "n_refused", "first"),
+    [(0.0, 0, 0), (0.0005, 0, 1), (0.01, 0, 20), (0.00025, 1, 0), (0.25, 1, 0), (-0.01, 0, 0)],
+)
+def test_records_that_start_later(tmp_path, start, n_refused, first):
+    """Records are aligned by whole samples, or refused with both starts where that is not exact."""
+    path, x = tmp_path / "log.uff", np.arange(200) / 2000
+    rows = NOISE[:, :100]
+    write_uff(path, {"a": rows[0], "b": rows[1]}, x=x[:100])
+    late = write_uff(tmp_path / "late.uff", {"c": rows[2]}, x=start + x[:100])
+    path.write_bytes(path.read_bytes() + late.read_bytes())
+    log = read_log(path)
+    found = {c.name: c.values for c in log.channels}
+    assert len(found) == 3 - n_refused and len(log.refused) == (2 if start < 0 else start > 0)
+    np.testing.assert_allclose(
+        found["acc_a"], 9.80665 * rows[0][first : first + found["acc_a"].size]
+    )
+    if n_refused:
+        assert f"starts at {start:g} s, the others at 0 s" in log.refused[0].detail
+    elif start:
+        assert found["acc_c"].size == 100 - abs(round(2000 * start))
+        np.testing.assert_allclose(
+            found["acc_c"], 9.80665 * rows[2][round(max(-2000 * start, 0)) :][: found["acc_c"].size]
         )
-        path.write_bytes(path.read_bytes() + late.read_bytes())
-        content = load(path, ColumnMap(), 1e9)
-        assert len(content.refused) == n_refused and len(content.columns) == 3 - n_refused
-        assert all("starts 0.25 s after" in one.detail for one in content.refused)
+
+
+@pytest.mark.parametrize(("date", "n_refused"), [("08:30:00", 0), ("08:30:01", 0), ("09:30:00", 1)])
+def test_dates_of_records(tmp_path, date, n_refused):
+    """Records of other times are no channels of one log; the date may be that of writing."""
+    path = tmp_path / "log.uff"
+    many = np.resize(VALUES, 40_000)
+    sets = [uff_set(many.tobytes(), 40_000, binary="320000", name=f"acc_{k}_g") for k in "abc"]
+    path.write_bytes(b"".join(sets).replace(b"08:30:00", date.encode(), 1))
+    content = load(path, ColumnMap(), 1e9)
+    assert len(content.refused) == n_refused and len(content.columns) == 3 - n_refused
+
+
+FEW = np.linspace(-2.5, 4, 101)
+BODY = FEW.astype("<f4").tobytes()
+EXACT = lines(FEW, 2)
+
+
+@pytest.mark.parametrize(
+    ("body", "binary"),
+    [
+        (EXACT.rstrip() + b"  0.00000e+00\n", ""),
+        (EXACT.rstrip() + b" " * 13 + b"\n", ""),
+        (EXACT + b"  0.00000e+00" * 6 + b"\n", ""),
+        (EXACT + b"\n   \n\n", ""),
+        (EXACT.replace(b"\n", b"\r\n") + b"\r\n", ""),
+        (BODY + bytes(380), "404"),
+        (BODY + bytes(380), "784"),
+        (BODY + b"\r\n", "404"),
+        (BODY + b"\n\n", "406"),
+        (BODY + b" " * 108, "512"),
+        (BODY + b"\xab" * 108, "404"),
+    ],
+)  # fmt: skip
+def test_padding_behind_the_stated_samples(tmp_path, body, binary):
+    """Zeros and blanks behind the stated number of samples are no samples."""
+    made = uff_set(body, 101, ordinate=2, binary=binary)
+    columns = loaded(tmp_path / "log.uff", made, uff_set(EXACT, 101, ordinate=2, name="acc_x_g"))
+    np.testing.assert_allclose(columns["delta_e_um"], FEW, rtol=1e-5)
+    assert columns["acc_x_g"].size == 101
+
+
+@pytest.mark.parametrize(
+    ("body", "binary"),
+    [
+        (EXACT[: len(EXACT) // 2], ""),
+        (EXACT.rstrip() + b"  1.00000e+00\n", ""),
+        (EXACT + b"text text text text\n", ""),
+        (BODY[:-4], "404"),
+        (BODY[:200], "404"),
+        (BODY + b"\xab" * 108, "512"),
+    ],
+)
+def test_more_or_less_than_padding(tmp_path, body, binary):
+    """What is cut off, and numbers beyond those stated, contradict the header."""
+    word = "of 101 samples|does not keep|cut off|end of a row"
+    corrupt(tmp_path / "log.uff", word, uff_set(body, 101, ordinate=2, binary=binary))
