@@ -428,6 +428,9 @@ def _fit_group(
     Where that does not converge the group is fitted alone, and then in parts.
     """
     targets = found.modes
+    own = {t.name for t in group if found.within(t.frequency)}
+    if not own:  # nothing to publish: they explain what reaches into the band, or left the spectra
+        return []
     first, last = targets.index(near[0]), targets.index(near[-1])
     low, high = 0.0, top
     if first:
@@ -444,7 +447,6 @@ def _fit_group(
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]
-    own = {t.name for t in group if found.within(t.frequency)}
     rejected = {name: why for name, why in fit.rejected.items() if name in own}
     if fit.modes is None:
         return [ClusterFit(None, rejected)]
