@@ -20,6 +20,7 @@ from rich import box, progress
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from lmshealth.io.log import WARNINGS
 from lmshealth.report.text import fixed, number, percent, plain
 
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
@@ -94,10 +95,14 @@ def print_text(text: str, mark: str = "") -> None:
 
 
 def print_refused(rows: Sequence[Row]) -> None:
-    """Print refusals and their reasons, and apart from them channels that are used in part."""
+    """Print refusals and their reasons, and apart from them warnings about what is used."""
     for title, in_part in (("Refused", False), ("Used in part", True)):
-        if own := [row for row in rows if (row["reason"] == "gaps") == in_part]:
+        if own := [row for row in rows if _is_warning(row) == in_part]:
             print_table(title, cells(_REFUSED, short_names(own)), 5)
+
+
+def _is_warning(row: Row) -> bool:
+    return row["reason"] in WARNINGS and bool(row["channel"])
 
 
 class _Numbers(Formatter):

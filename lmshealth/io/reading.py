@@ -356,9 +356,9 @@ def _measured(
     try:
         gone, notes["gaps"] = missing_ranges(values)
         rough = check_signal(values)
-        values, notes["wrapped"] = unwrapped(values, rough)
+        values, notes["unwrapped"] = unwrapped(values, rough)
         if item.signal.role in _DYNAMIC:
-            rough = roughness(values) if notes["wrapped"] else rough
+            rough = roughness(values) if notes["unwrapped"] else rough
             check_sign(values, rough)
             notes["levels"] = coarse_levels(values)
             bad = spikes(values, gone, rough)

@@ -231,8 +231,8 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
         following = taken + start - at
         for _, block in blocks(values, taken, following):
             spool.append(block)
-        ends = values[following - 1 : following + 1] if linear else np.full(2, np.nan)
-        spool.append(np.linspace(*ends, stop - start + 2)[1:-1])
+        first, last = values[following - 1 : following + 1] if linear else (np.nan, np.nan)
+        spool.append(np.linspace(first, last, stop - start + 2)[1:-1])
         taken, at = following, stop
     for _, block in blocks(values, taken):
         spool.append(block)
