@@ -18,7 +18,7 @@ from lmshealth.io.time_axis import IntArray
 
 # Samples of each of the places from which the model is estimated, frequencies at which the error of
 # filled samples is compared, and share of the sample rate up to which that is done.
-_PLACE, _N_PLACES, _N_FREQUENCIES, _USABLE = 1 << 14, 8, 129, 0.45
+_PLACE, _N_PLACES, _N_FREQUENCIES, _USABLE = 1 << 13, 8, 129, 0.45
 _ORDER = constants.PREDICTION_ORDER
 
 

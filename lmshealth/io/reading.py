@@ -356,7 +356,7 @@ def _measured(
     try:
         gone, notes["gaps"] = missing_ranges(values)
         rough = check_signal(values)
-        values, notes["unwrapped"] = unwrapped(values, rough)
+        values, notes["unwrapped"] = unwrapped(values, gone, rough)
         if item.signal.role in _DYNAMIC:
             rough = roughness(values) if notes["unwrapped"] else rough
             check_sign(values, rough)

@@ -19,6 +19,8 @@ _BLOW = 10 * _ORDER
 # Differences of levels below this share of the range are rounding of floats; a level is a whole
 # number of steps within the second.
 _ROUNDING, _WHOLE = 1e-9, 0.05
+# Samples among which the next overflow is searched at once.
+_STRIDE = 256
 # A step may be the smallest difference of levels over a number up to this: of many not all occur.
 _MOST_SKIPPED = 4
 
@@ -45,61 +47,105 @@ def level_step(values: Samples) -> float | None:
     return None
 
 
-def unwrapped(values: Samples, rough: Roughness) -> tuple[Samples, str]:
+def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Samples, str]:
     """Undo the overflows of a counter: return samples and a note, which is empty without any.
 
-    A wrapped channel jumps from one end of its range to the other, by 2^bits steps of its levels
-    less what a sample moves. `Unusable` (``wrapped``) where the jumps are those of a counter, but
-    no whole number of steps.
+    After an overflow samples are off their linear prediction by 2^bits steps of the levels of the
+    channel, which span less. `Unusable` (``wrapped``) where that number is not whole, or the
+    overflows are too many to be undone. ``missing`` are half-open ranges, ``(n_ranges, 2)``.
     """
     span = rough.high - rough.low
-    if rough.step <= constants.WRAP_JUMP * span:
+    if rough.step <= span / 2:
         return values, ""
-    jumps, other = _jumps(values, constants.WRAP_JUMP * span)
-    if not 0 < other <= constants.WRAP_SMOOTH * span or jumps.size > values.size / 100:
-        return values, ""
-    inner = np.clip(jumps, 2, values.size - 2)
-    x = np.array([values[i - 2 : i + 2] for i in inner.tolist()]).T
-    down = x[2] < x[1]
-    ends = np.where(down, rough.high - x[1], x[1] - rough.low)
-    ends = np.maximum(ends, np.where(down, x[2] - rough.low, rough.high - x[2]))
-    size = np.abs(x[2] - x[1])
-    if not (ends <= 2 * other).all():
-        return values, ""
-    found = f"{jumps.size} jumps from one end of its range to the other, by {np.median(size):.6g}"
+    jumps = _jumps(values, span / 2)
+    bad = np.concatenate([missing, np.stack([jumps, jumps + 1], axis=1)])
+    model = fit_prediction(values, bad)
     step = level_step(values)
-    bits = 0 if step is None else round(float(np.log2(np.median(size) / step)))
-    if step is not None and bits in constants.WRAP_BITS:
-        whole = step * 2.0**bits
-        if span < whole and (np.abs(whole - size) <= 2 * other).all():
-            turns = np.where(down, whole, -whole)
-            return _shifted(values, jumps, turns), f"{found}: overflows of {bits} bits, undone"
-    # Before and after an overflow the signal moves the same way, unlike at a step of a square wave.
-    same = ((x[1] - x[0] > 0) == down) & ((x[3] - x[2] > 0) == down)
-    if jumps.size >= constants.FEWEST_WRAPS and same.all():
-        needed = "export the values of the counter without rounding, or record it with more bits"
-        raise Unusable("wrapped", f"{found}: overflows of no whole number of steps; {needed}")
+    bits = 0 if step is None else int(np.ceil(np.log2(span / step)))
+    whole = 0.0 if step is None or bits not in constants.WRAP_BITS else step * 2.0**bits
+    if model is None or 0 < whole < 2 * constants.WRAP_SIGMAS * model.variance**0.5:
+        _refuse_full(values, rough, whole - span, bits)
+        return values, ""
+    if whole > span:
+        undone, n = _without_turns(values, model, whole)
+        if n:
+            found = f"{n} samples are off by the {2**bits} steps of {bits} bits of a counter"
+            return undone, f"{found} that overflows: undone"
+    _refuse_unknown(values, jumps, model, span)
     return values, ""
 
 
-def _jumps(values: Samples, limit: float) -> tuple[IntArray, float]:
-    """Return the samples that jump by more than a limit, and the largest other difference."""
-    found, other = [np.empty(0, dtype=np.int64)], 0.0
+def _refuse_unknown(values: Samples, jumps: IntArray, model: Prediction, span: float) -> None:
+    """Refuse (``wrapped``) a channel that jumps by its range, which is no whole number of steps."""
+    std = model.variance**0.5
+    first = jumps[np.diff(jumps, prepend=-_ORDER) >= _ORDER]
+    some = first[first >= _ORDER][:: max(1, first.size // 1000)].tolist()
+    sizes = [abs(float(model.errors(values[i - _ORDER : i + 1])[0])) for i in some]
+    odd = np.array([size for size in sizes if size > constants.ORDINARY * std])
+    if odd.size < max(constants.FEWEST_WRAPS, len(some) / 2):
+        return
+    alike = np.abs(odd - np.median(odd)) < constants.ORDINARY * std
+    # A square wave has noise beyond both its levels.
+    if np.median(odd) > span - 3 * std and alike.mean() > constants.WRAPS_UNDONE:
+        found = f"{jumps.size} jumps of its range: a counter overflows by no whole number of steps"
+        needed = "export its values without rounding, or record it with more bits"
+        raise Unusable("wrapped", f"{found}; {needed}")
+
+
+def _jumps(values: Samples, limit: float) -> IntArray:
+    """Return the samples that differ by more than a limit from the one before."""
+    found = [np.empty(0, dtype=np.int64)]
     for at, block in blocks(values, overlap=1):
-        size = np.abs(np.diff(block))
-        jump = size > limit
-        found.append(np.flatnonzero(jump) + at + 1)
-        other = max(other, float(size[size <= limit].max(initial=0.0)))
-    return np.unique(np.concatenate(found)), other
+        found.append(np.flatnonzero(np.abs(np.diff(block)) > limit) + at + 1)
+    return np.unique(np.concatenate(found))
 
 
-def _shifted(values: Samples, jumps: IntArray, turns: FloatArray) -> Samples:
-    """Add to all samples the turns up to them."""
-    spool, total = Spool(values.size), np.append(0.0, np.cumsum(turns))
-    for at, block in blocks(values):
-        count = np.searchsorted(jumps, np.arange(at, at + block.size), side="right")
-        spool.append(block + total[count])
-    return spool.samples()
+def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Samples, int]:
+    """Bring each sample within half a turn of its prediction; return how many were off.
+
+    None is changed, and 0 returned, unless all are then as the prediction expects.
+    """
+    spool, a, squares, n = Spool(values.size), model.filter, 0.0, 0
+    before = np.full(_ORDER, model.mean)
+    for _, block in blocks(values):
+        x = np.concatenate([before, block])
+        gone = ~np.isfinite(x)
+        x[gone] = model.mean
+        errors = model.errors(x)
+        i = 0
+        while True:
+            off = np.abs(errors[i : i + _STRIDE]) > whole / 2
+            if not off.any():
+                i += _STRIDE
+                if i >= errors.size:
+                    break
+                continue
+            i += int(off.argmax())
+            turn = whole * round(float(errors[i]) / whole)
+            reached = errors[i : i + _ORDER + 1]
+            reached -= turn * a[: reached.size]
+            x[i + _ORDER] -= turn
+            squares, n, i = squares + float(errors[i]) ** 2, n + 1, i + 1
+        before = x[-_ORDER:].copy()
+        x[gone] = np.nan
+        spool.append(x[_ORDER:])
+    if n and squares < constants.WRAPS_SPREAD**2 * n * model.variance:
+        return spool.samples(), n
+    return values, 0
+
+
+def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> None:
+    """Refuse (``wrapped``) a channel that holds all levels of a counter but for a few.
+
+    Unlike vibration it has as many samples at both ends of its range as elsewhere.
+    """
+    near = (rough.high - rough.low) / 100
+    x = _sample(values)
+    ends = min(np.mean(x < rough.low + near), np.mean(x > rough.high - near))
+    if 0 < left < near and ends > constants.WRAP_ENDS:
+        found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
+        needed = "the counter overflows; record it with more bits, or faster"
+        raise Unusable("wrapped", f"{found}: {needed}")
 
 
 def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
