@@ -55,6 +55,9 @@ WRAP_SIGMAS, WRAPS_SPREAD = 5.0, 4.0
 """Standard deviations of linear prediction that half the range of a counter exceeds, so that at
 most one normal sample of 10⁶ may be off by a turn; and the largest root mean square of what remains
 after turns: samples that overflow are those of the largest errors."""
+WRAP_BEND = 0.3
+"""Robust standard deviations by which an overflow exceeds the largest second difference that is
+expected of so much normal noise, (2 ln n)^½: a twentieth of such channels is examined."""
 FEWEST_WRAPS, WRAPS_UNDONE = 2, 0.95
 """Fewest jumps that refuse a channel as a counter of unknown step, and share of them that must be
 of one size."""
@@ -97,8 +100,12 @@ SPIKE_SHARE = 1.0
 alone among many that do not, and of such noise none are singled out."""
 MOST_SPIKES = 0.01
 """Largest share of bad samples: more are part of the signal, or cut it to pieces."""
-SHAPE_SAMPLES, FEWEST_FOR_SHAPE = 1 << 16, 2000
-"""Samples from which the distribution of a channel is judged, and fewest."""
+SHAPE_SAMPLES, LEVEL_SAMPLES, FEWEST_FOR_SHAPE = 1 << 16, 1 << 13, 2000
+"""Samples from which the distribution of a channel is judged, those from which its levels are, and
+fewest."""
+EDGE_REACH = 3.0
+"""Standard deviations from the median to the end of the range above which there is no edge: that of
+|x| is 1.1 away, that of a vector's magnitude at most 2.3; the ends of normal noise are 4."""
 EDGE, AT_EDGE = 6.0, 0.13
 """Ratio of the distances of the 1 % and 0.1 % quantiles from the least sample beyond which the
 distribution has a sharp edge: 10 at an edge, below 3 in tails of normal or exponential noise. Most

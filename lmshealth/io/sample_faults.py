@@ -55,7 +55,8 @@ def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Sam
     overflows are too many to be undone. ``missing`` are half-open ranges, ``(n_ranges, 2)``.
     """
     span = rough.high - rough.low
-    if rough.step <= span / 2:
+    largest = float(np.sqrt(2 * np.log(values.size))) + constants.WRAP_BEND
+    if rough.step <= span / 2 or rough.bend <= largest * rough.usual:
         return values, ""
     jumps = _jumps(values, span / 2)
     bad = np.concatenate([missing, np.stack([jumps, jumps + 1], axis=1)])
@@ -140,7 +141,9 @@ def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> N
     Unlike vibration it has as many samples at both ends of its range as elsewhere.
     """
     near = (rough.high - rough.low) / 100
-    x = _sample(values)
+    x = _sample(values, constants.SHAPE_SAMPLES)
+    if x.size < constants.FEWEST_FOR_SHAPE:
+        return
     ends = min(np.mean(x < rough.low + near), np.mean(x > rough.high - near))
     if 0 < left < near and ends > constants.WRAP_ENDS:
         found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
@@ -250,7 +253,11 @@ def check_sign(values: Samples, rough: Roughness) -> None:
 
     The density of |x| is largest at a sharp edge; that of (x² + y² + z²)^½ begins at zero.
     """
-    x = _sample(values)
+    x = _sample(values, constants.LEVEL_SAMPLES)
+    middle, reach = float(np.median(x)), constants.EDGE_REACH * float(x.std())
+    if min(middle - rough.low, rough.high - middle) > reach:
+        return
+    x = _sample(values, constants.SHAPE_SAMPLES)
     if x.size < constants.FEWEST_FOR_SHAPE or np.unique(x).size < constants.FEWEST_LEVELS:
         return
     for own, low, high in ((x, rough.low, rough.high), (-x, -rough.high, -rough.low)):
@@ -272,7 +279,7 @@ def check_sign(values: Samples, rough: Roughness) -> None:
 
 def coarse_levels(values: Samples) -> str:
     """Return what is wrong with the levels of a channel; empty if nothing."""
-    x = _sample(values)
+    x = _sample(values, constants.LEVEL_SAMPLES)
     levels, count = np.unique(x, return_counts=True)
     if levels.size < 3:
         return ""
@@ -298,9 +305,9 @@ def coarse_levels(values: Samples) -> str:
     return ""
 
 
-def _sample(values: Samples) -> FloatArray:
-    """Return samples of eight places, without the missing ones."""
-    n = constants.SHAPE_SAMPLES // 8
+def _sample(values: Samples, most: int) -> FloatArray:
+    """Return so many samples of eight places at most, without the missing ones."""
+    n = most // 8
     starts = np.unique(np.linspace(0, max(0, values.size - n), 8).astype(int)).tolist()
     x = np.concatenate([values[at : at + n] for at in starts])
     return np.asarray(x[np.isfinite(x)])
