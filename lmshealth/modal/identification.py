@@ -267,7 +267,7 @@ def _transform(
             f"no segment of constant velocity without gaps lasts {shortest:.3g} s, which the modes "
             f"need; the longest piece without gaps has {longest:.3g} s",
         )
-    return stationary(phases, 0), LogSpectra(
+    spectra = LogSpectra(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
         cross_spectra(
@@ -279,6 +279,20 @@ def _transform(
             resonances=resonances,
         ),
     )
+    return stationary(phases, 0), spectra if targets else _resolved(spectra)
+
+
+def _resolved(spectra: LogSpectra) -> LogSpectra:
+    """Leave out of short segments the ordinates of few periods.
+
+    A segment that is long enough for the top of a wide band shows only trend and leakage below.
+    """
+    least = constants.SEGMENT_PERIODS
+    cut = (
+        s if s.duration > spectra.duration / 2 else s.band(least / s.duration, np.inf)
+        for s in spectra.spectra
+    )
+    return replace(spectra, spectra=tuple(s for s in cut if s.frequency.size))
 
 
 def _lines_at_modes(fits: Sequence[ClusterFit]) -> list[float]:
