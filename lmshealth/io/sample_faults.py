@@ -216,7 +216,7 @@ def _spike(
     values: Samples, missing: IntArray, model: Prediction, suspects: IntArray, least: float
 ) -> _Spike | None:
     """Judge one place: a spike of more than the least size, or None."""
-    first, last = int(suspects[0]) - _ORDER - 1, int(suspects[-1]) + _ORDER + 2
+    first, last = int(suspects[0]) - 2 * _ORDER, int(suspects[-1]) + 2 * _ORDER + 1
     if suspects[-1] - suspects[0] > 3 or first < 0 or last > values.size:
         return None
     x = values[first:last].copy()
