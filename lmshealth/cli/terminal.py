@@ -95,15 +95,15 @@ def print_text(text: str, mark: str = "") -> None:
 
 
 def print_refused(rows: Sequence[Row]) -> None:
-    """Print refusals and their reasons, and apart from them channels that are used in part."""
+    """Print refusals and their reasons, and apart from them warnings about what is used."""
     for title, in_part in (("Refused", False), ("Used in part", True)):
         if own := [row for row in rows if _is_warning(row) == in_part]:
             print_table(title, cells(_REFUSED, short_names(own)), 5)
 
 
 def _is_warning(row: Row) -> bool:
-    # Whole logs are refused for the same reasons.
-    return row["reason"] == "gaps" or (row["reason"] in WARNINGS and bool(row["channel"]))
+    # Whole logs are refused for the same reasons, without a channel.
+    return row["reason"] in WARNINGS and bool(row["channel"])
 
 
 class _Numbers(Formatter):

@@ -48,6 +48,8 @@ _FLAGS = {
     "unsteady": "its excitation varies over time, which the standard deviations include.",
     "coloured": "its excitation has no flat spectrum, which the standard deviations include.",
     "cluster": "one estimate for two modes that the data do not separate.",
+    "levels": "a channel is coarsely quantised or lacks levels; see below.",
+    "rate": "the sample rate is in doubt, and with it all frequencies; see below.",
     "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }
 

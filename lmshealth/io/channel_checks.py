@@ -1,6 +1,7 @@
 """Checks of channels: missing samples, constant value, clipping, linear dependence."""
 
 from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -9,6 +10,10 @@ from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, Samples, blocks
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray, too_many
+
+# Standard deviation of normal noise over the median of its magnitude, and samples of a block from
+# which the usual second difference is taken.
+_NORMAL, _SAMPLE = 1.4826, 1 << 12
 
 
 def missing_ranges(values: Samples) -> tuple[IntArray, str]:
@@ -38,10 +43,39 @@ def missing_ranges(values: Samples) -> tuple[IntArray, str]:
     return ranges, note
 
 
-def check_signal(values: Samples) -> None:
+class Roughness(NamedTuple):
+    """Range of a channel, its largest first and second differences, and the usual second one."""
+
+    low: float
+    high: float
+    step: float  # largest |x_t - x_{t-1}|
+    bend: float  # largest |x_{t-1} - 2 x_t + x_{t+1}|
+    usual: float  # robust standard deviation of the latter
+
+
+def roughness(values: Samples) -> Roughness:
+    """Measure a channel, ``(n_samples,)``, in one pass; missing samples are left out."""
+    low, high, step, bend, usual = np.inf, -np.inf, 0.0, 0.0, [0.0]
+    for _, block in blocks(values, overlap=2):
+        if np.isnan(block.min(initial=0.0)):
+            block = block[np.isfinite(block)]
+        low = min(low, float(block.min(initial=low)))
+        high = max(high, float(block.max(initial=high)))
+        if block.size < 3:
+            continue
+        first = np.diff(block)
+        second = np.diff(first)
+        step = max(step, float(first.max()), -float(first.min()))
+        bend = max(bend, float(second.max()), -float(second.min()))
+        some = np.abs(second[:_SAMPLE])
+        usual.append(float(max(_NORMAL * np.median(some), some.mean())))
+    return Roughness(low, high, step, bend, float(np.median(usual[1:] or usual)))
+
+
+def check_signal(values: Samples) -> Roughness:
     """Refuse a constant (``flat``) or ``clipped`` channel, ``(n_samples,)`` in SI units."""
-    low = min(float(block.min()) for block in _measured(values))
-    high = max(float(block.max()) for block in _measured(values))
+    rough = roughness(values)
+    low, high = rough.low, rough.high
     if low == high:
         raise Unusable("flat", f"all {values.size} samples are {low:.6g} (SI); check the sensor")
     if high - low < constants.SMALLEST_RANGE:
@@ -53,6 +87,7 @@ def check_signal(values: Samples) -> None:
         found = f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum"
         needed = "widen the range of the sensor"
         raise Unusable("clipped", f"{found} {high:.6g} (SI) of {values.size}; {needed}")
+    return rough
 
 
 def independent(
@@ -82,6 +117,43 @@ def independent(
         order.append(best)
         rest = rest - np.outer(rest[:, best], rest[best]) / left[best]
     return order
+
+
+def magnitudes(
+    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]]
+) -> dict[int, list[int]]:
+    """Find channels that are the magnitude of others, each with the indices of these.
+
+    With r = (x² + y² + z²)^½ - g the square of r is linear in r, x², y² and z², which have equal
+    weights. Arguments as in `independent`, in one unit.
+    """
+    found: dict[int, list[int]] = {}
+    start, stop = max(ranges, key=lambda one: one[1] - one[0])
+    if len(columns) < 3 or stop - start < constants.FEWEST_FOR_SHAPE:
+        return found
+    x = np.stack([c[start : min(start + constants.COMPARED, stop)] for c in columns])
+    x = x / np.abs(x).max().clip(np.finfo(float).tiny)
+    for k, r in enumerate(x):
+        rest = [j for j in range(len(x)) if j != k]
+        weights, unexplained = _regression([*x[rest] ** 2, r], r**2)
+        if unexplained < min(constants.MAGNITUDE, 0.1 * _regression(x[rest], r)[1]):
+            own = weights[: len(rest)]
+            axes = own > own.max() / 2
+            if axes.sum() > 1 and own[axes].min() > 0.95 * own.max():
+                found[k] = [j for j, is_axis in zip(rest, axes, strict=True) if is_axis]
+    return found
+
+
+def _regression(
+    columns: Sequence[FloatArray] | FloatArray, target: FloatArray
+) -> tuple[FloatArray, float]:
+    """Regress on columns ``(n,)`` and a constant; return weights and the unexplained share."""
+    design = np.stack([c - c.mean() for c in columns], axis=1)
+    centred = target - target.mean()
+    weights = np.linalg.lstsq(design, centred, rcond=1e-12)[0]
+    total = float(centred @ centred)
+    rest = centred - design @ weights
+    return weights, float(rest @ rest) / total if total else 1.0
 
 
 def _measured(values: Samples) -> Iterator[FloatArray]:

@@ -49,6 +49,84 @@ FEWEST_STUCK = 5
 ADJACENT_SHARE = 0.1
 """Least share of samples at an end whose successor is there too."""
 
+# Faults that samples show
+
+WRAP_BITS = (8, 10, 12, 14, 16, 18, 20, 24, 32)
+"""Bits of counters and converters."""
+WRAP_SIGMAS, WRAPS_SPREAD = 5.0, 4.0
+"""Standard deviations of linear prediction that half the range of a counter exceeds, so that at
+most one normal sample of 10⁶ may be off by a turn; and the largest root mean square of what remains
+after turns: samples that overflow are those of the largest errors."""
+WRAP_BEND = 0.3
+"""Robust standard deviations by which an overflow exceeds the largest second difference that is
+expected of so much normal noise, (2 ln n)^½: a twentieth of such channels is examined."""
+FEWEST_WRAPS, WRAPS_UNDONE = 2, 0.95
+"""Fewest jumps that refuse a channel as a counter of unknown step, and share of them that must be
+of one size."""
+WRAP_ENDS = 1e-3
+"""Least share of the samples in each outermost hundredth of the range of a counter that overflows
+all the time: of normal noise there are 10⁻⁵."""
+PREDICTION_ORDER, PREDICTION_SAMPLES = 32, 1000
+"""Order of the linear prediction, and fewest samples to estimate it from. Of a sum of resonances
+and noise it leaves within a few per cent the least error of any order; its 32 coefficients are
+known to 18 % of the error of prediction together from 1000 samples."""
+LONGEST_FILLED = 16
+"""Most missing samples in a row that are replaced by their expectation: half of the order, so that
+each is nearer to known samples than the model reaches."""
+FILLED_ERROR = 0.3
+"""Largest share of the power spectral density that errors of filled samples may have, at any
+frequency. It is reached at the lowest level between resonances, where least of a mode is seen: with
+8 % of the samples missing in gaps of 12 (share 0.25) damping ratios are 1 to 2 % low, half of their
+standard deviation over 40 s (`studies/outside_faults`)."""
+ORDINARY = 8.0
+"""Standard deviations of the prediction error up to which samples beside a filled one are ordinary.
+10⁹ samples of normal noise stay below 6.2; a blow or a step exceeds it, and is not filled in."""
+SUSPECT = 6.5
+"""Robust standard deviations of a second difference beyond which it is examined. Of 10⁹ samples of
+normal noise one exceeds 6.2; most channels are not examined."""
+SPIKE = 8.0
+"""Standard deviations of its expectation by which a bad sample differs at least from it."""
+SPIKE_ALONE = 12.0
+"""The same where a blow would leave nothing after it: in white noise."""
+CLEARLY = 0.25
+"""A sample is bad, not a blow, where what it leaves of the prediction errors is below this share of
+what a blow there leaves."""
+SPIKE_LEVELS = 4.0
+"""Smallest differences of two levels that a bad sample exceeds: single samples of a quantised
+signal may be a level off."""
+SPIKE_ENERGY = 0.01
+"""Energy of all bad samples of a channel, as a share of that of its noise, below which they change
+nothing: a mode's noise floor rises by less than 1 %."""
+SPIKE_SHARE = 1.0
+"""Fewest bad samples per other event of the channel: noise of heavy tails has a few that stand
+alone among many that do not, and of such noise none are singled out."""
+MOST_SPIKES = 0.01
+"""Largest share of bad samples: more are part of the signal, or cut it to pieces."""
+SHAPE_SAMPLES, LEVEL_SAMPLES, FEWEST_FOR_SHAPE = 1 << 16, 1 << 13, 2000
+"""Samples from which the distribution of a channel is judged, those from which its levels are, and
+fewest."""
+EDGE_REACH = 3.0
+"""Standard deviations from the median to the end of the range above which there is no edge: that of
+|x| is 1.1 away, that of a vector's magnitude at most 2.3; the ends of normal noise are 4."""
+EDGE, AT_EDGE = 6.0, 0.13
+"""Ratio of the distances of the 1 % and 0.1 % quantiles from the least sample beyond which the
+distribution has a sharp edge: 10 at an edge, below 3 in tails of normal or exponential noise. Most
+samples are there if the 5 % quantile is nearer than this share of the median: 0.093 for |x| of
+normal x, 0.1 where the density is constant."""
+NEAR_ZERO, MAGNITUDE_SKEW = 0.05, 0.3
+"""Least sample of a magnitude over its median, and its skewness: that of a vector has 0.49 in three
+and 0.63 in two dimensions, that of |x| 0.995; normal noise has none."""
+LEAST_STEPS = 0.5
+"""Standard deviation in steps below which quantisation is no white noise: at 0.5 the variance is
+off by 1 % (2 exp(-2π² 0.5²)), at 0.3 by a third."""
+MAGNITUDE = 1e-3
+"""Share of the variance of its square that a magnitude of other channels has beyond theirs:
+rounding to a thirtieth of its standard deviation leaves 10⁻⁴. Also below a tenth of what a linear
+combination leaves of it."""
+WIDE_GAP, GAP_EXPECTED = 0.5, 60
+"""Gap between levels in standard deviations from which levels are missing (an error of g²/12, 2 %
+of the variance), if so many samples were expected in it."""
+
 # Time
 
 AGREEMENT = 1e-4

@@ -57,8 +57,18 @@ class Refusal:
     frequency: float | None = field(default=None, compare=False, kw_only=True)
 
 
-# Reasons of refusals that name a channel and are warnings: it is used nevertheless.
-WARNINGS = ("gaps", "rate", "dropped", "repeated")
+# Reasons of warnings among the refusals of a log, which name a channel: it is used nevertheless.
+# Each with the flag of the modes that it shows, or of all where the channel is the time or a set
+# point; empty where the fault is repaired, or what it concerns is left out.
+WARNINGS = {
+    "gaps": "",
+    "unwrapped": "",
+    "spikes": "",
+    "levels": "levels",
+    "rate": "rate",
+    "dropped": "",
+    "repeated": "",
+}
 
 
 @dataclass(frozen=True, slots=True)

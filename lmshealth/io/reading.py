@@ -13,7 +13,13 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
+from lmshealth.io.channel_checks import (
+    check_signal,
+    independent,
+    magnitudes,
+    missing_ranges,
+    roughness,
+)
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.consistency import Findings, Motion, compare
 from lmshealth.io.formats.content import Content
@@ -21,8 +27,18 @@ from lmshealth.io.formats.foreign import frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.prediction import filled
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
-from lmshealth.io.time_axis import IntArray, TimeAxis, pieces, resampled, set_velocity, time_axis
+from lmshealth.io.sample_faults import check_sign, coarse_levels, spikes, unwrapped
+from lmshealth.io.time_axis import (
+    IntArray,
+    TimeAxis,
+    pieces,
+    resampled,
+    set_velocity,
+    time_axis,
+    with_dropped,
+)
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
@@ -156,6 +172,8 @@ def _to_log(
     series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
     axis = time_axis(stamps[0] if stamps else None, rate)
+    axis, added = axis.completed()
+    series = [_completed(item, added) for item in series]
     refused = [replace(refusal, log=name) for refusal in content.refused]
     if axis.note:
         refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
@@ -163,11 +181,11 @@ def _to_log(
     channels = []
     for item in series:
         if item.signal.role in _MEASURED:
-            gone = _missing(item, name, refused)
-            if gone is not None:
-                missing.append(gone)
+            read = _measured(item, axis, added, name, refused)
+            if read is not None:
+                missing.append(read[1])
                 kind = cast(ChannelKind, item.signal.role)
-                channels.append(Channel(item.signal.name, kind, item.values))
+                channels.append(Channel(item.signal.name, kind, read[0]))
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
     references = [item for role in _REFERENCES for item in series if item.signal.role == role]
@@ -177,7 +195,7 @@ def _to_log(
     found = _compared(series, channels, metadata.velocity, axis)
     refused += [Refusal(name, why, note, channel=channel) for why, channel, note in found.notes]
     breaks = np.union1d(axis.breaks, found.dropped)
-    ranges = pieces(series[0].values.size, [*missing, found.repeated], breaks)
+    ranges = pieces(channels[0].values.size, [*missing, found.repeated], breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     channels = _without_copies(channels, ranges, name, refused)
@@ -262,18 +280,65 @@ def _check_signals(
         raise Unusable("columns", f"no signal: {_NEEDED}; {there}{step}")
 
 
+def _completed(item: _Series, added: IntArray) -> _Series:
+    """Insert the samples that time lacks; those of a set point are interpolated."""
+    if not added.size:
+        return item
+    return item._replace(
+        values=with_dropped(item.values, added, linear=item.signal.role in _REFERENCES)
+    )
+
+
 def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:
-    """Find the missing samples of a channel; None if it cannot be used, which is refused."""
+    """Find the missing samples of a set point; None if it cannot be used, which is refused."""
     try:
         gone, note = missing_ranges(item.values)
-        if item.signal.role in _MEASURED:
-            check_signal(item.values)
     except Unusable as error:
         refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
         return None
     if note:
         refused.append(Refusal(name, "gaps", note, channel=item.signal.name))
     return gone
+
+
+def _measured(
+    item: _Series, axis: TimeAxis, added: IntArray, name: str, refused: list[Refusal]
+) -> tuple[Samples, IntArray] | None:
+    """Check the samples of a channel, and repair what is repaired exactly.
+
+    Return its samples and the ranges that remain missing; None if it cannot be used. What was
+    found is added to ``refused``.
+    """
+    values, notes = item.values, dict[str, str]()
+    try:
+        gone, notes["gaps"] = missing_ranges(values)
+        rough = check_signal(values)
+        values, notes["unwrapped"] = unwrapped(values, gone, rough)
+        if item.signal.role in _DYNAMIC:
+            rough = roughness(values) if notes["unwrapped"] else rough
+            check_sign(values, rough)
+            notes["levels"] = coarse_levels(values)
+            bad = spikes(values, gone, rough)
+            if bad.size:
+                n = int(np.sum(bad[:, 1] - bad[:, 0]))
+                notes["spikes"] = f"{n} samples are no part of the signal, and count as missing"
+            gone = np.concatenate([gone, bad])
+            gone = gone[np.argsort(gone[:, 0], kind="stable")]
+    except Unusable as error:
+        refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
+        return None
+    values, left = filled(values, gone, axis.breaks)
+    open_ones = f"{len(left)} of {len(gone)} ranges are not filled" if left.size else ""
+    if np.array_equal(gone, added):  # time_s has a note of these
+        notes["gaps"] = open_ones
+    elif notes["gaps"]:
+        notes["gaps"] += f"; {open_ones or 'they are filled by linear prediction'}"
+    refused += [
+        Refusal(name, reason, detail, channel=item.signal.name)
+        for reason, detail in notes.items()
+        if detail
+    ]
+    return values, left
 
 
 def _at_one_rate(
@@ -300,6 +365,11 @@ def _without_copies(
     others = listed(dynamic[k].name for k in sorted(order))
     detail = f"is a multiple or combination of {others}; check whether a sensor is recorded twice"
     refused += [Refusal(name, "dependent", detail, channel=copy.name) for copy in copies]
+    rest = [one for one in channels if one.kind == "acceleration" and one not in copies]
+    for k, axes in magnitudes([one.values for one in rest], ranges).items():
+        what = f"is the magnitude of {listed(rest[j].name for j in axes)}, which are used"
+        refused.append(Refusal(name, "dependent", what, channel=rest[k].name))
+        copies.append(rest[k])
     return [channel for channel in channels if channel not in copies]
 
 

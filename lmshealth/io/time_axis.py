@@ -1,11 +1,11 @@
 """The time axis: sample rate, interruptions, resampling, and the set velocity of a set position.
 
-Samples are never sorted, and never interpolated across a gap (README.md, "Time").
+Samples are never sorted; `prediction` fills short gaps only (README.md, "Time").
 """
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import pairwise
-from typing import NamedTuple
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,9 +35,10 @@ _OUTPUT, _ZEROS, _WINDOW = 1 << 12, 32, 10.0
 class TimeAxis(NamedTuple):
     """Sample rate in Hz, samples before which a record is interrupted, ``(n_breaks,)``.
 
-    ``note`` counts the interruptions; it is empty if there are none. Samples whose stamps do not
-    keep to the clock are ``lost``, half-open ranges, ``(n_ranges, 2)``. Where the rate varies there
-    is a clock for each stretch between breaks, and `resampled` makes ``sample_rate`` of it.
+    ``note`` counts the interruptions; it is empty if there are none. ``dropped`` samples, a few,
+    belong before each break, 0 where that is uncertain, ``(n_breaks,)``. Samples whose stamps do
+    not keep to the clock are ``lost``, half-open ranges, ``(n_ranges, 2)``. Where the rate varies
+    there is a clock for each stretch between breaks, and `resampled` makes ``sample_rate`` of it.
     """
 
     sample_rate: float
@@ -45,6 +46,27 @@ class TimeAxis(NamedTuple):
     note: str
     lost: IntArray = np.empty((0, 2), dtype=np.int64)
     clocks: tuple[Clock, ...] = ()
+    dropped: IntArray = np.empty(0, dtype=np.int64)
+
+    def completed(self) -> tuple[Self, IntArray]:
+        """Return the axis with dropped samples in their places, and their half-open ranges.
+
+        They are missing samples then, not interruptions.
+        """
+        shift = np.concatenate([[0], np.cumsum(self.dropped)])
+        if not self.dropped.any():
+            return self, np.empty((0, 2), dtype=np.int64)
+        known = self.dropped > 0
+        start = (self.breaks + shift[:-1])[known]
+        added = np.stack([start, start + self.dropped[known]], axis=1)
+        # A range ends with the sample before its end.
+        before = np.searchsorted(self.breaks, self.lost - [0, 1], side="right")
+        lost = self.lost + shift[before]
+        breaks = (self.breaks + shift[1:])[~known]
+        note = (
+            f"{self.note}; short ones are filled by linear prediction" if added.size else self.note
+        )
+        return self._replace(breaks=breaks, lost=lost, note=note, dropped=breaks * 0), added
 
 
 def too_many(n_interruptions: int, n_samples: int) -> bool:
@@ -86,7 +108,7 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
 
 def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
     """Find the axis of stamps, rounded to a step in s; ``slack`` is allowed beyond tolerances."""
-    breaks, note, interval, scatter = _interruptions(time, slack)
+    breaks, lengths, note, interval, scatter = _interruptions(time, slack)
     if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
         found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
         raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
@@ -123,7 +145,12 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
     except ValueError as error:
         raise Unusable("time", f"time_s: {error}") from error
     if not varies:
-        return TimeAxis(own, breaks, note, gone)
+        # Coarse stamps do not count the samples of a gap.
+        lacking = np.where(step > constants.JITTER * interval, 0.0, lengths / interval - 1)
+        dropped = np.rint(lacking).astype(np.int64)
+        certain = np.abs(lacking - dropped) < constants.JITTER
+        few = (dropped > 0) & (dropped <= constants.LONGEST_FILLED)
+        return TimeAxis(own, breaks, note, gone, (), np.where(certain & few, dropped, 0))
     return TimeAxis(own, breaks, f"{note}: resampled to the lowest", gone, tuple(clocks))
 
 
@@ -133,11 +160,11 @@ def _steps(time: Samples) -> Iterator[tuple[int, FloatArray]]:
         yield at, np.diff(time[at : at + BLOCK + 1])
 
 
-def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, float]:
+def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float, float]:
     """Find gaps and odd intervals by the median interval of a group and of its neighbours.
 
-    Return breaks, their counts as a text, the mean regular interval and four times the usual
-    deviation from it in s.
+    Return breaks, the intervals before them in s, their counts as a text, the mean regular interval
+    and four times the usual deviation from it in s.
     """
     middles, spreads = [], []
     for _, steps in _steps(time):
@@ -153,7 +180,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, f
         raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
     local = np.pad(median, 1, mode="edge")
     total, n_regular, n_gaps, missing = 0.0, 0, 0, 0.0
-    breaks = [np.empty(0, dtype=np.int64)]
+    breaks, lengths = [np.empty(0, dtype=np.int64)], [np.empty(0)]
     for at, steps in _steps(time):
         own = 1 + (at + np.arange(steps.size)) // _GROUP
         near = np.stack([local[own - 1], local[own], local[own + 1]])
@@ -165,6 +192,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, f
         total += float(steps[~irregular].sum())
         n_regular += int(np.count_nonzero(~irregular))
         breaks.append(np.flatnonzero(irregular) + at + 1)
+        lengths.append(steps[irregular])
     where: IntArray = np.concatenate(breaks)
     notes = [f"{n_gaps} gaps with {missing:.0f} dropped samples"] if n_gaps else []
     if n_odd := where.size - n_gaps:
@@ -177,7 +205,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, str, float, f
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
     # The mean over all regular intervals averages the rounding of time stamps out.
     interval = total / n_regular if n_regular else float(np.median(median))
-    return where, note, interval, 4 * float(np.median(spread))
+    return where, np.concatenate(lengths), note, interval, 4 * float(np.median(spread))
 
 
 def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, FloatArray]:
@@ -195,6 +223,25 @@ def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, Flo
     centre = (edges[:-1] + edges[1:] - 1) / 2
     spline = make_interp_spline(centre, mean, k=min(3, mean.size - 1))
     return spline, np.diff(mean) / np.diff(centre)
+
+
+def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
+    """Insert samples at the half-open ranges that they have in the result.
+
+    They are missing (NaN), or interpolated as those of a set point are.
+    """
+    spool = Spool(values.size + int(np.sum(added[:, 1] - added[:, 0])))
+    taken = at = 0
+    for start, stop in added.tolist():
+        following = taken + start - at
+        for _, block in blocks(values, taken, following):
+            spool.append(block)
+        first, last = values[following - 1 : following + 1] if linear else (np.nan, np.nan)
+        spool.append(np.linspace(first, last, stop - start + 2)[1:-1])
+        taken, at = following, stop
+    for _, block in blocks(values, taken):
+        spool.append(block)
+    return spool.samples()
 
 
 def _residual(
@@ -353,7 +400,7 @@ def _reach(position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: fl
     most = max(1, int(constants.LONGEST_REACH * sample_rate))
     step = fastest = 0.0
     for start, stop in pieces:
-        for _, block in blocks(position, start, stop):
+        for _, block in blocks(position, start, stop, overlap=2):
             if block.size > 2 * most:
                 step = max(step, _step(block))
                 average = (block[most:] - block[:-most]) * sample_rate / most

@@ -267,7 +267,7 @@ def _transform(
             f"no segment of constant velocity without gaps lasts {shortest:.3g} s, which the modes "
             f"need; the longest piece without gaps has {longest:.3g} s",
         )
-    return stationary(phases, 0), LogSpectra(
+    spectra = LogSpectra(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
         cross_spectra(
@@ -279,6 +279,20 @@ def _transform(
             resonances=resonances,
         ),
     )
+    return stationary(phases, 0), spectra if targets else _resolved(spectra)
+
+
+def _resolved(spectra: LogSpectra) -> LogSpectra:
+    """Leave out of short segments the ordinates of few periods.
+
+    A segment that is long enough for the top of a wide band shows only trend and leakage below.
+    """
+    least = constants.SEGMENT_PERIODS
+    cut = (
+        s if s.duration > spectra.duration / 2 else s.band(least / s.duration, np.inf)
+        for s in spectra.spectra
+    )
+    return replace(spectra, spectra=tuple(s for s in cut if s.frequency.size))
 
 
 def _lines_at_modes(fits: Sequence[ClusterFit]) -> list[float]:
@@ -428,6 +442,9 @@ def _fit_group(
     Where that does not converge the group is fitted alone, and then in parts.
     """
     targets = found.modes
+    own = {t.name for t in group if found.within(t.frequency)}
+    if not own:  # nothing to publish: they explain what reaches into the band, or left the spectra
+        return []
     first, last = targets.index(near[0]), targets.index(near[-1])
     low, high = 0.0, top
     if first:
@@ -444,7 +461,6 @@ def _fit_group(
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]
-    own = {t.name for t in group if found.within(t.frequency)}
     rejected = {name: why for name, why in fit.rejected.items() if name in own}
     if fit.modes is None:
         return [ClusterFit(None, rejected)]

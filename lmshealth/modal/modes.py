@@ -13,11 +13,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from lmshealth._arrays import FloatArray, freeze
 from lmshealth._result import Result
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import WARNINGS, Refusal
 from lmshealth.signal.spectral_lines import Line
 
 # Fields of `Modes` with one entry per mode.
 _TEXTS = ("names", "sources", "channels", "flags")
+# Beginnings of names of measured channels; other channels are times and set points.
+_MEASURED = ("delta_e", "acc", "current")
 _ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion", "excitation")
 
 
@@ -47,7 +49,7 @@ class Modes(Result):
     # half-power bandwidth), ``at-bound`` (frequency or damping at the end of the search),
     # ``loose-fit`` (dispersion above 1.5), ``cluster`` (represents two close modes), ``unsteady``
     # (the intensity of its excitation varies), ``coloured`` (the spectrum of its excitation is not
-    # flat), ``doubtful-name`` (may be another mode).
+    # flat), ``doubtful-name`` (may be another mode), and those of `WARNINGS` about its channels.
     flags: tuple[str, ...]
     shape_channels: tuple[str, ...]  # of the shapes; empty where shapes were not identified
     # Acceleration of each channel in each mode (of a following error its second derivative),
@@ -181,7 +183,8 @@ def merge(
 ) -> Modes:
     """Join independent estimates, ascending in frequency; the joint covariance has their blocks.
 
-    Lines and refusals of the parts are replaced; ``shape_channels`` holds those of all parts.
+    Lines and refusals of the parts are replaced; warnings among these flag the modes that they
+    concern. ``shape_channels`` holds those of all parts.
     """
     n, first = sum(len(part.names) for part in parts), 0
     cov, shapes = np.zeros((2 * n, 2 * n)), np.full((n, len(shape_channels)), np.nan)
@@ -206,7 +209,20 @@ def merge(
         lines=tuple(lines),
         refused=tuple(refused),
     )
-    return modes.select(np.argsort(modes.ln_frequency, kind="stable").tolist())
+    modes = modes.select(np.argsort(modes.ln_frequency, kind="stable").tolist())
+    return replace(modes, flags=tuple(_flagged(modes, i) for i in range(n)))
+
+
+def _flagged(modes: Modes, i: int) -> str:
+    """Return the flags of a mode with those of warnings about the channels that show it."""
+    shown = {name for name, x in zip(modes.shape_channels, modes.shapes[i], strict=True) if x == x}
+    own = dict.fromkeys(modes.flags[i].split())
+    for row in modes.refused:
+        flag = WARNINGS.get(row.reason, "") if row.channel else ""
+        of_log = not row.channel.startswith(_MEASURED)
+        if flag and (of_log or row.channel in {*shown, modes.channels[i]}):
+            own[flag] = None
+    return " ".join(own)
 
 
 def numbered(modes: Modes) -> Modes:

@@ -4,7 +4,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from lmshealth.io.log import Notice
+from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.prognosis.constants import CALIBRATED_RISK, SURPRISE
 from lmshealth.prognosis.results import ModeError
 from lmshealth.report import constants, figures
@@ -17,7 +17,7 @@ _SEVERITIES = "serious", "caution", "note"
 def notices(assessment: Assessment) -> tuple[Notice, ...]:
     """Return the notices about a machine, the serious ones first: rows of ``warnings.csv``."""
     found = [*assessment.notices, *_of_track(assessment), *_of_health(assessment)]
-    found += _of_laws(assessment)
+    found += [*_of_laws(assessment), *_of_channels(assessment)]
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
@@ -29,7 +29,7 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
     flags = () if latest is None else zip(latest.modes.names, latest.modes.flags, strict=True)
     by_flag: dict[str, list[str]] = {}
     for mode, own in flags:
-        for flag in own.split():
+        for flag in (one for one in own.split() if one not in WARNINGS.values()):
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
         names = " and ".join(map(spell, dict.fromkeys(modes)))
@@ -63,6 +63,20 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
         if edge:
             what = f"The interval of {spell(name)} ends at an end of the map, which bounds it."
             yield Notice("end-of-map", "caution", name, what, "Extend the map.")
+
+
+def _of_channels(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about channels whose samples are faulty, repaired or left out."""
+    found: dict[tuple[str, str], list[Refusal]] = {}
+    for row in assessment.refused:
+        if row.reason in WARNINGS and row.channel:
+            found.setdefault((row.reason, row.channel), []).append(row)
+    for (reason, channel), rows in found.items():
+        logs = len({row.log for row in rows})
+        what = f"{channel}: {rows[-1].detail} (in {rows[-1].log}; {logs} such logs)."
+        repaired = not WARNINGS[reason]
+        to_do = "refused.csv lists all."
+        yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
 
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:

@@ -155,7 +155,9 @@ def test_refusals_alone_are_shown(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_channels_used_in_part_are_no_refusals(capsys: pytest.CaptureFixture[str]) -> None:
     """A channel with gaps is used: it stands under a title of its own."""
-    print_modes([], [refused() | {"reason": "gaps", "detail": "3 missing"}, refused()])
+    print_modes(
+        [], [refused() | {"reason": "gaps", "channel": "acc_x", "detail": "3 missing"}, refused()]
+    )
     first, second = capsys.readouterr().out.split("Used in part\n")
     assert "no bytes" in first and "gaps" not in first
     assert "3 missing" in second and "no bytes" not in second

@@ -477,6 +477,12 @@ def group_lengths(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
     return list(groups.values())
 
 
+def _groups(data: ClusterData) -> list[list[int]]:
+    """Group the spectra of one length that have ordinates without lines."""
+    groups = group_lengths(data.spectra.spectra)
+    return [group for group in groups if any(data.masks[i].any() for i in group)]
+
+
 def make_blocks(
     data: ClusterData, bandwidth: float, near: Sequence[float] | None = None
 ) -> tuple[MeanOrdinates, ...]:
@@ -486,7 +492,7 @@ def make_blocks(
         average_ordinates(
             [spectra[i] for i in group], [data.masks[i] for i in group], bandwidth, near=near
         )
-        for group in group_lengths(spectra)
+        for group in _groups(data)
     )
 
 
@@ -575,8 +581,7 @@ def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
     likelihood = replace(optimum.likelihood, blocks=make_blocks(data, bandwidth))
     masked = np.diag(np.full(data.unit.size, np.inf)).astype(complex)
     full = [np.tile(masked, (mask.size, 1, 1)) for mask in data.masks]
-    groups = group_lengths(data.spectra.spectra)
-    for group, values in zip(groups, likelihood.expected(optimum.p), strict=True):
+    for group, values in zip(_groups(data), likelihood.expected(optimum.p), strict=True):
         kept = np.any([data.masks[i] for i in group], axis=0)
         for i in group:
             full[i][kept] = values

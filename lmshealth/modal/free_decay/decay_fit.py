@@ -39,6 +39,8 @@ _TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
 _FIRST_LEVEL = 0.3  # of the ambient response
 # A line's damping is within this share of the least one.
 _AT_BOUND = 0.01
+# Least start value of the noise as a share of the mean power: rounding.
+_LEAST_NOISE = 1e-12
 # Tolerance in log likelihood while poles are counted.
 _ROUGH = 0.02
 
@@ -263,9 +265,13 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
     The result has no modes where the band holds only noise.
     """
     n = blocks[0].ordinates.shape[2]
-    # The level of the noise between the peaks of each channel.
-    medians = [np.median(np.abs(block.ordinates) ** 2, axis=(0, 1)) for block in blocks]
-    levels = np.log(np.mean(medians, axis=0) / np.log(2))
+    # The level of the noise between the peaks of each channel; most ordinates of one that is
+    # constant in most segments are zero.
+    powers = [np.abs(block.ordinates) ** 2 for block in blocks]
+    medians = np.mean([np.median(power, axis=(0, 1)) for power in powers], axis=0)
+    means = np.mean([np.mean(power, axis=(0, 1)) for power in powers], axis=0)
+    medians = np.maximum(medians, _LEAST_NOISE * means).clip(np.finfo(float).tiny)
+    levels = np.log(medians / np.log(2))
     likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
     start = np.concatenate([levels, np.zeros(n)])
     found = maximise(likelihood, start, np.arange(2 * n))

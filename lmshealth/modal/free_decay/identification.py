@@ -212,7 +212,10 @@ def _fit_bands(
     limits: Range,
     targets: Sequence[Target],
 ) -> list[_BandModes]:
-    """Fit the modes of each band with peaks."""
+    """Fit the modes of each band with peaks, in the channels that are not constant."""
+    channels = [c for c in channels if any(np.ptp(c.values[s.start : s.stop]) for s in decays)]
+    if not channels:
+        return []
     # Cut again for every band: copies of all decays at every start would exceed the memory.
     cut = partial(_cut, log, channels, decays)
     longest = cut(0.0)[0]

@@ -75,8 +75,8 @@ def _first_repeat(correlation: FloatArray, longest: int, share: float) -> int | 
 def _refine(correlation: FloatArray, period: int) -> float:
     """Follow the peak to ever later multiples of the period."""
     estimate, multiple = float(period), 1
-    # The overlap at the end is too short.
-    while multiple * estimate < 0.9 * correlation.size - _REACH:
+    # The peaks of a shorter period are not apart, and the overlap at the end is too short.
+    while period > _REACH and multiple * estimate < 0.9 * correlation.size - _REACH:
         centre = round(multiple * estimate)
         low = max(1, centre - _REACH)
         near = correlation[low : centre + _REACH + 1]

@@ -1,0 +1,172 @@
+"""Autoregressive model of a channel: expectation of missing samples, and of single bad ones.
+
+x_t = Σ φ_k x_{t-k} + e_t with white e of variance σ²; a = (1, -φ). The missing samples of least
+Σ e² are their conditional expectation given all others, and σ² B⁻¹ is its error, B the Toeplitz
+matrix of b_l = Σ a_k a_{k+l} [Janssen1986]. README.md, "Missing samples".
+"""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth.io import constants
+from lmshealth.io.buffers import Samples, Spool, blocks
+from lmshealth.io.time_axis import IntArray
+
+# Samples of each of the places from which the model is estimated, frequencies at which the error of
+# filled samples is compared, and share of the sample rate up to which that is done.
+_PLACE, _N_PLACES, _N_FREQUENCIES, _USABLE = 1 << 13, 8, 129, 0.45
+_ORDER = constants.PREDICTION_ORDER
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Prediction:
+    """Linear prediction of a channel from its last samples."""
+
+    mean: float
+    filter: FloatArray  # a, ``(order + 1,)``
+    variance: float  # of the prediction error
+
+    @property
+    def correlation(self) -> FloatArray:
+        """b_l for l from 0 to the order, shape ``(order + 1,)``."""
+        return np.asarray(np.correlate(self.filter, self.filter, "full")[_ORDER:])
+
+    def errors(self, x: FloatArray) -> FloatArray:
+        """Return the prediction errors of samples ``(n,)`` from the order on, ``(n - order,)``."""
+        return np.convolve(x - self.mean, self.filter, "valid")
+
+    def expected(self, x: FloatArray, unknown: IntArray) -> FloatArray:
+        """Return the expectation of unknown samples given the others.
+
+        Indices ascend and lie at least the order from both ends of x, which is zero-based there.
+        """
+        known = x - self.mean
+        known[unknown] = 0.0
+        # Σ_t a_{t-i} e_t, e the errors with zeros at the unknown samples.
+        lack = np.correlate(np.convolve(known, self.filter, "valid"), self.filter, "valid")
+        apart = np.abs(unknown[:, None] - unknown)
+        b = np.append(self.correlation, 0.0)[np.minimum(apart, _ORDER + 1)]
+        return np.asarray(self.mean - np.linalg.solve(b, lack[unknown - _ORDER]))
+
+    def error_shares(self, lengths: Sequence[int], n_samples: int) -> FloatArray:
+        """Return the largest share of the power spectral density that errors of gaps have.
+
+        For filling all gaps of up to each of their ascending lengths, ``(n_gaps,)``.
+        """
+        turn = np.exp(-2j * np.pi * np.linspace(0, _USABLE, _N_FREQUENCIES))
+        inverse = np.abs(np.polynomial.polynomial.polyval(turn, self.filter)) ** 2
+        each: dict[int, FloatArray] = {}
+        for size in set(lengths):
+            powers = turn[:, None] ** np.arange(size)
+            place = np.arange(size)
+            error = np.linalg.inv(self.correlation[np.abs(place[:, None] - place)])
+            each[size] = np.einsum("fi,ij,fj->f", powers.conj(), error, powers).real * inverse
+        total = np.cumsum([each[size] for size in lengths], axis=0) / n_samples
+        return np.asarray(total.max(axis=1))
+
+
+def fit_prediction(values: Samples, bad: IntArray) -> Prediction | None:
+    """Fit the model by least squares where no sample in the window is missing or bad.
+
+    ``bad`` are ascending half-open ranges, ``(n_ranges, 2)``; None where too few windows remain.
+    """
+    starts = np.unique(np.linspace(0, max(0, values.size - _PLACE), _N_PLACES).astype(int))
+    parts = [(at, values[at : min(at + _PLACE, values.size)]) for at in starts.tolist()]
+    usable = [(x, ~within(bad, at, x.size)) for at, x in parts]
+    n = sum(int(good.sum()) for _, good in usable)
+    if n <= constants.PREDICTION_SAMPLES:
+        return None
+    mean = float(sum(x[good].sum() for x, good in usable) / n)
+    gram, rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
+    for x, good in usable:
+        if x.size <= _ORDER:
+            continue
+        whole = np.convolve(~good, np.ones(_ORDER + 1), "valid") < 0.5
+        window = np.lib.stride_tricks.sliding_window_view(x - mean, _ORDER + 1)[whole]
+        gram += window.T @ window
+        rows += len(window)
+    if rows <= constants.PREDICTION_SAMPLES:
+        return None
+    # Columns from the oldest sample to the newest.
+    phi = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=1e-13)[0]
+    a = np.concatenate([[1.0], -phi[::-1]])
+    variance = float(a[::-1] @ gram @ a[::-1]) / rows
+    return Prediction(mean, a, variance) if variance > 0 else None
+
+
+def within(ranges: IntArray, at: int, size: int) -> BoolArray:
+    """Return which of the samples from ``at`` on lie in half-open ranges."""
+    steps = np.zeros(size + 1)
+    there = ranges[(ranges[:, 1] > at) & (ranges[:, 0] < at + size)] - at
+    np.add.at(steps, there[:, 0].clip(0), 1)
+    np.add.at(steps, there[:, 1].clip(max=size), -1)
+    return np.asarray(np.cumsum(steps)[:-1] > 0)
+
+
+def filled(values: Samples, missing: IntArray, breaks: IntArray) -> tuple[Samples, IntArray]:
+    """Replace short gaps of a channel by the expectation of their samples.
+
+    ``missing`` are ascending half-open ranges, ``(n_ranges, 2)``; time is interrupted before the
+    samples ``breaks``. Filled are gaps of up to `LONGEST_FILLED` samples, as far as their errors
+    have at most `FILLED_ERROR` of the power spectral density at any frequency, which lie in
+    ordinary surroundings. Return the samples and the ranges that remain missing.
+    """
+    size = missing[:, 1] - missing[:, 0]
+    short = size <= constants.LONGEST_FILLED
+    model = fit_prediction(values, missing) if short.any() else None
+    if model is None:
+        return values, missing
+    order = np.sort(size[short]).tolist()
+    allowed = model.error_shares(order, values.size) <= constants.FILLED_ERROR
+    longest = max((n for n, fits in zip(order, allowed, strict=True) if fits), default=0)
+    # Of equal lengths all are filled, or none.
+    if not all(fits for n, fits in zip(order, allowed, strict=True) if n == longest):
+        longest = max((n for n in order if n < longest), default=0)
+    short = size <= longest
+    blocked = np.concatenate([missing[~short], np.stack([breaks, breaks], axis=1)])
+    places: list[tuple[int, FloatArray]] = []
+    left = [missing[~short]]
+    for group in _clusters(missing[short]):
+        first, last = int(group[0, 0]) - _ORDER, int(group[-1, 1]) + _ORDER
+        inside = first >= 0 and last <= values.size
+        if inside and not ((blocked[:, 0] < last) & (blocked[:, 1] > first)).any():
+            x = values[first:last].copy()
+            unknown = np.concatenate([np.arange(a, b) for a, b in group - first])
+            x[unknown] = 0.0
+            x[unknown] = model.expected(x, unknown)
+            if (model.errors(x) ** 2).max() < constants.ORDINARY**2 * model.variance:
+                places.append((first, x))
+                continue
+        left.append(group)
+    rest = np.concatenate(left)
+    return _replaced(values, places), rest[np.argsort(rest[:, 0], kind="stable")]
+
+
+def _clusters(gaps: IntArray) -> Iterator[IntArray]:
+    """Yield gaps that lie less than the order from each other together."""
+    apart = np.flatnonzero(gaps[1:, 0] - gaps[:-1, 1] >= _ORDER) + 1
+    for a, b in pairwise([0, *apart.tolist(), len(gaps)]):
+        if a < b:
+            yield gaps[a:b]
+
+
+def _replaced(values: Samples, places: Sequence[tuple[int, FloatArray]]) -> Samples:
+    """Return samples with the stretches from some ascending indices on replaced."""
+    if not places:
+        return values
+    spool = Spool(values.size)
+    starts = np.array([first for first, _ in places])
+    for at, block in blocks(values):
+        part = block.copy()
+        longest = max(x.size for _, x in places)
+        low, high = np.searchsorted(starts, [at - longest, at + block.size])
+        for first, x in places[low:high]:
+            a, b = max(first, at), min(first + x.size, at + block.size)
+            if a < b:
+                part[a - at : b - at] = x[a - first : b - first]
+        spool.append(part)
+    return spool.samples()

@@ -1,0 +1,158 @@
+"""Overflows, bad samples, lost signs and missing levels are found; good channels are left alone."""
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from lmshealth.io.channel_checks import magnitudes, roughness
+from lmshealth.io.refusal import Unusable
+from lmshealth.io.sample_faults import check_sign, coarse_levels, level_step, spikes, unwrapped
+
+NONE = np.empty((0, 2), dtype=np.int64)
+N = 30_000
+
+
+def vibration(seed=0, noise=0.1):
+    """Make a resonance in noise, of standard deviation one."""
+    rng = np.random.default_rng(seed)
+    pole = np.exp(2j * np.pi * 0.05 - 2 * np.pi * 0.05 * 0.02)
+    x = lfilter([1], np.poly([pole, pole.conj()]), rng.standard_normal(N))
+    return x / x.std() + noise * rng.standard_normal(N)
+
+
+def overflow(counts, bits):
+    """Let a counter overflow."""
+    half = 2 ** (bits - 1)
+    return (counts + half) % (2 * half) - half
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16, 24])
+@pytest.mark.parametrize("share", [0.6, 0.9])
+@pytest.mark.parametrize("step", [1.0, 0.0981])
+def test_overflows_are_undone(bits, share, step):
+    """The samples are those of a counter of more bits, whatever their unit."""
+    x = vibration()
+    counts = np.round(x / np.abs(x).max() * 2 ** (bits - 1) / share).astype(np.int64)
+    values = overflow(counts, bits) * step
+    undone, note = unwrapped(values, NONE, roughness(values))
+    np.testing.assert_allclose(undone, counts * step, rtol=0, atol=1e-6 * step * 2**bits)
+    assert f"{bits} bits" in note
+
+
+def test_overflows_of_no_whole_number_are_refused():
+    """Rounded values do not state the step of their counter."""
+    x = vibration(noise=0.01)
+    turn = 1.5 * np.abs(x).max()
+    values = (x + turn / 2) % turn - turn / 2
+    with pytest.raises(Unusable) as caught:
+        unwrapped(values, NONE, roughness(values))
+    assert caught.value.reason == "wrapped"
+
+
+@pytest.mark.parametrize("name", ["square", "steps", "white", "quantised"])
+def test_other_jumps_are_no_overflows(name):
+    """Square waves, moves and noise jump by more than half of their range, too."""
+    rng = np.random.default_rng(1)
+    t = np.arange(N)
+    values = {
+        "square": np.round(127 * np.where(t // 997 % 2, 1, -1) + 2 * rng.standard_normal(N)),
+        "steps": np.exp(-(t % 2000) / 120) + 1e-3 * rng.standard_normal(N),
+        "white": rng.standard_normal(N),
+        "quantised": np.round(40 * rng.standard_normal(N)),
+    }[name]
+    undone, note = unwrapped(values, NONE, roughness(values))
+    assert undone is values and not note
+
+
+@pytest.mark.parametrize("width", [1, 2])
+def test_bad_samples_are_found(width):
+    """Single samples and pairs beyond what the signal allows are found where they are."""
+    x = vibration()
+    at = np.arange(500, N - 500, 1500)
+    for k in range(width):
+        x[at + k] += 12.0
+    found = spikes(x, NONE, roughness(x))
+    assert found.tolist() == [[i, i + width] for i in at.tolist()]
+
+
+def test_a_bad_sample_near_a_missing_one_is_found():
+    """Missing samples beside it are predicted together with it."""
+    x = vibration()
+    x[500] += 12.0
+    x[505] = np.nan
+    found = spikes(x, np.array([[505, 506]]), roughness(x))
+    assert found.tolist() == [[500, 501]]
+
+
+@pytest.mark.parametrize("name", ["normal", "tails", "blows", "shocks", "encoder", "steps"])
+@pytest.mark.parametrize("seed", range(3))
+def test_signals_have_no_bad_samples(name, seed):
+    """Heavy tails, blows that ring, steps and single levels of an encoder belong to the signal."""
+    rng = np.random.default_rng(seed)
+    pole = np.exp(2j * np.pi * 0.06 - 2 * np.pi * 0.06 * 0.02)
+    poly = np.poly([pole, pole.conj()])
+    blows = (rng.random(N) < 3e-4) * rng.exponential(20, N)
+    x = {
+        "normal": vibration(seed),
+        "tails": rng.standard_t(3, N),
+        "blows": lfilter([1], poly, blows) + 0.1 * rng.standard_normal(N),
+        "shocks": lfilter([1, -2, 1], poly, blows) + 0.1 * rng.standard_normal(N),
+        "encoder": np.round(0.4 * vibration(seed, 0.0)) * 4.88e-9,
+        "steps": np.where(np.arange(N) // 5000 % 2, 30.0, 0.0) + vibration(seed),
+    }[name]
+    assert not spikes(x, NONE, roughness(x)).size
+
+
+@pytest.mark.parametrize("name", ["abs", "negative", "coupled", "square", "two", "three"])
+def test_magnitudes_are_refused(name):
+    """Without its sign a vibration is none, also after its mean was removed."""
+    x, y, z = (vibration(seed) for seed in range(3))
+    values = {
+        "abs": np.abs(x), "negative": -np.abs(x), "coupled": np.abs(x) - 0.8, "square": x**2,
+        "two": np.hypot(x, y), "three": np.sqrt(x**2 + y**2 + z**2),
+    }[name]  # fmt: skip
+    with pytest.raises(Unusable) as caught:
+        check_sign(values, roughness(values))
+    assert caught.value.reason == "rectified"
+
+
+@pytest.mark.parametrize("name", ["vibration", "gravity", "sine", "ramp", "friction", "moves"])
+def test_signed_channels_are_accepted(name):
+    """Offsets, sines, ramps and one-sided errors of moves are no magnitudes."""
+    x, t = vibration(), np.arange(N)
+    values = {
+        "vibration": x,
+        "gravity": 9.81 + 0.1 * x,
+        "sine": np.sin(0.1 * t),
+        "ramp": t + x,
+        "friction": np.where(t // 5000 % 2, 3.0, 0.0) + 0.1 * x,
+        "moves": 5 * np.exp(-(t % 2000) / 120) + 0.01 * x,
+    }[name]
+    check_sign(values, roughness(values))
+
+
+def test_the_magnitude_of_other_channels_is_found():
+    """With or without gravity it is found by the axes that it is made of."""
+    x, y, z, other = (vibration(seed) for seed in range(4))
+    z = z + 9.81
+    for r in (np.sqrt(x**2 + y**2 + z**2), np.sqrt(x**2 + y**2 + z**2) - 9.80665):
+        found = magnitudes([x, other, y, np.round(r, 3), z], [(0, N)])
+        assert found == {3: [0, 2, 4]}
+    assert magnitudes([x, other, y, z], [(0, N)]) == {}
+
+
+def test_levels():
+    """A third of a step and a stuck bit are noted; a stuck last bit only doubles the step."""
+    x = vibration()
+    counts = np.round(60 * x).astype(np.int64)
+    assert "steps" in coarse_levels(np.round(0.3 * x))
+    assert "no sample lies between" in coarse_levels((counts & ~32).astype(float))
+    for good in (np.round(0.7 * x), counts & ~1, counts, x):
+        assert coarse_levels(np.asarray(good, dtype=float)) == ""
+
+
+def test_the_step_of_levels():
+    """The step is found from rounded values, and there is none without levels."""
+    counts = np.round(60 * vibration())
+    assert level_step(np.round(0.0981 * counts, 5)) == pytest.approx(0.0981, rel=1e-5)
+    assert level_step(vibration()) is None
