@@ -1,7 +1,5 @@
 """Commands on archives and stores: run, watch, report."""
 
-import signal
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from datetime import datetime
@@ -135,8 +133,6 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
     Prints one line for each run, change and failure; with --format json one document a line.
     """
     pdf, interactive, style = (given.pop(name) for name in ("pdf", "interactive", "style"))
-    # Like an interrupt: workers end, and the next run continues.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):
         now = f"{datetime.now().astimezone().isoformat(timespec='seconds')} "
         if isinstance(result, LmshealthError):
