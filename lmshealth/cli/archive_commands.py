@@ -20,7 +20,6 @@ from lmshealth.cli import options, terminal, views
 from lmshealth.errors import LmshealthError
 from lmshealth.report.constants import TERMINAL_ROWS
 from lmshealth.report.rendering import write_pdfs
-from lmshealth.report.text import plain
 from lmshealth.stage.description import Stage
 
 
@@ -100,15 +99,15 @@ def run(
     else:
         used = result.n_logs - result.n_refused
         again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
-        click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
+        terminal.print_line(f"{used} of {result.n_logs} logs analysed{again}.")
         if result.n_unread:
-            click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
+            terminal.print_line(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
         views.print_summaries(result.rows)
         for change in result.changes[:TERMINAL_ROWS]:
             terminal.print_text(f"Changed: {change}")
         if rest := len(result.changes[TERMINAL_ROWS:]):
-            click.echo(f"{rest} more changes; changes.csv lists all.")
-        click.echo(f"Report: {result.index}")
+            terminal.print_line(f"{rest} more changes; changes.csv lists all.")
+        terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     _write_others(result, given["store"] or default_url(out), pdf=pdf, interactive=interactive)
     some = result.n_refused or result.n_unread or result.failed
@@ -142,9 +141,9 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             terminal.print_json(_document(result), indent=-1)
         else:
             used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
-            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run")
+            terminal.print_line(f"{now}{used}, {result.n_remembered} of them in an earlier run")
             for change in result.changes:
-                click.echo(f"{now}{plain(str(change))}")
+                terminal.print_line(f"{now}{change}")
         terminal.print_errors(now + error for error in _errors(result))
         url = given["store"] or default_url(out)
         _write_others(result, url, pdf=pdf, interactive=interactive)
@@ -169,7 +168,7 @@ def report(
     """
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
-    click.echo(f"Report: {result.index}")
+    terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(f"{machine}: {why}" for machine, why in result.failed.items())
     _write_others(result, store, pdf=pdf, interactive=interactive)
     ctx.exit(options.SOME_REFUSED if result.failed else 0)
