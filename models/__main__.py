@@ -149,7 +149,10 @@ def _print_table(table: Table) -> None:
     console = Console(highlight=False)
     if not console.is_terminal:  # cut-off names are useless in a file or a pipe
         console.width = max(console.width, _TABLE_WIDTH)
-    elif console.measure(table, options=console.options.update(max_width=1000)).maximum > console.width:
+    elif (
+        console.measure(table, options=console.options.update(max_width=1000)).maximum
+        > console.width
+    ):
         for cells in zip(*(column.cells for column in table.columns), strict=True):
             for column, cell in zip(table.columns, cells, strict=True):
                 console.print(f"{column.header}: {cell}", overflow="fold")
@@ -409,7 +412,7 @@ def _open_streams() -> None:
         pass
     os.close(descriptor)
     for number, name in enumerate(("stdout", "stderr"), 1):
-        stream = getattr(sys, name) or open(number, "w", closefd=False)
+        stream = getattr(sys, name) or os.fdopen(number, "w", closefd=False)
         stream.reconfigure(errors=_ERRORS)
         setattr(sys, name, stream)
 

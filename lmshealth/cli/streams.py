@@ -104,7 +104,7 @@ def standard_streams() -> Iterator[None]:
     os.close(descriptor)
     was_closed = sys.stdout is None
     for number, name in enumerate(("stdout", "stderr"), 1):
-        stream = getattr(sys, name) or open(number, "w", encoding="utf-8", closefd=False)
+        stream = getattr(sys, name) or os.fdopen(number, "w", encoding="utf-8", closefd=False)
         # Others are of a caller, who reads what was written.
         if getattr(sys, name) is getattr(sys, f"__{name}__"):
             setattr(sys, name, _Stream(stream))

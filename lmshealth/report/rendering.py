@@ -2,9 +2,12 @@
 
 import hashlib
 import inspect
+import io
 import re
+import warnings
 from base64 import b64encode
 from collections.abc import Iterable
+from contextlib import redirect_stdout
 from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
@@ -67,7 +70,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     The bytes are reproducible, and nothing is loaded from the network or other files. `PdfError` if
     WeasyPrint is missing or cannot lay out a page.
     """
-    html, fetcher = _library()
+    html, fetcher = load_pdf_library()
     style, written = read("pdf.css"), []
     for page in pages:
         source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
@@ -84,11 +87,17 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     return written
 
 
-def _library() -> tuple[Any, Any]:
-    """Import WeasyPrint, with a fetcher that allows nothing outside of a page."""
+def load_pdf_library() -> tuple[Any, Any]:
+    """Import WeasyPrint, with a fetcher that allows nothing outside of a page.
+
+    `PdfError` names what to install where it, or a library of the system that it needs, is missing.
+    """
     try:
-        from weasyprint import HTML
-        from weasyprint.urls import URLFetcher
+        # It works without HarfBuzz-Subset, but announces that a later version will not.
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore", DeprecationWarning)
+            from weasyprint import HTML
+            from weasyprint.urls import URLFetcher
     except ImportError as error:
         raise PdfError(
             'PDFs need WeasyPrint: pip install "lmshealth[pdf]"; the pages are written, and '
@@ -96,7 +105,8 @@ def _library() -> tuple[Any, Any]:
         ) from error
     except OSError as error:
         raise PdfError(
-            "WeasyPrint does not find its libraries; install libpangoft2-1.0-0 and "
-            f"libharfbuzz-subset0 (Debian); the pages are written ({error})"
+            "PDFs need libraries of the system, which WeasyPrint does not find; install "
+            "libpangoft2-1.0-0 and libharfbuzz-subset0 (Debian, Ubuntu) or pango (Homebrew, MSYS2)"
+            f"; the pages are written ({str(error).partition('.  ')[0]})"
         ) from error
     return HTML, URLFetcher(allowed_protocols=("data",))
