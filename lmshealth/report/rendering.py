@@ -3,11 +3,12 @@
 import hashlib
 import inspect
 import io
+import os
 import re
 import warnings
 from base64 import b64encode
-from collections.abc import Iterable
-from contextlib import redirect_stdout
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
@@ -78,13 +79,27 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
         source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", source)
         target = page.with_suffix(".pdf")
         try:
-            content = html(string=source, url_fetcher=fetcher).write_pdf()
+            with _reproducible():
+                content = html(string=source, url_fetcher=fetcher).write_pdf()
         except Exception as error:  # any failure: the HTML page exists
             found = f"cannot be made: {type(error).__name__} {error}"
             raise PdfError(f"{target}: {found}; print {page} from a browser instead") from error
         write_bytes(target, content)
         written.append(target)
     return written
+
+
+@contextmanager
+def _reproducible() -> Iterator[None]:
+    """Fix the time that fontTools, which WeasyPrint uses without HarfBuzz-Subset, puts into fonts."""
+    name = "SOURCE_DATE_EPOCH"
+    before = os.environ.get(name)
+    os.environ[name] = before or "0"
+    try:
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
 
 
 def load_pdf_library() -> tuple[Any, Any]:
