@@ -91,7 +91,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
 
 @contextmanager
 def _reproducible() -> Iterator[None]:
-    """Fix the time that fontTools, which WeasyPrint uses without HarfBuzz-Subset, puts into fonts."""
+    """Fix the time in fonts by fontTools, which WeasyPrint uses without HarfBuzz-Subset."""
     name = "SOURCE_DATE_EPOCH"
     before = os.environ.get(name)
     os.environ[name] = before or "0"
