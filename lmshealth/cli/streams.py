@@ -63,6 +63,7 @@ class _Stream(io.TextIOWrapper):
     lost: OSError | None = None
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
+        self._original = stream  # it closes the buffer when it is deleted
         self.charset = codecs.lookup(stream.encoding).name
         # click writes UTF-8 to whatever is ASCII.
         encoding = "latin-1" if self.charset == "ascii" else self.charset
