@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 import json
 import os
 import sys
@@ -34,6 +35,7 @@ from models.recordings.sweep import Sweep, record_sweep
 from models.recordings.velocities import Experiment, drive_velocities
 
 _TABLE_WIDTH = 100
+_ERRORS = "models-readable"
 _EXAMPLES = {
     "modes": "python -m models modes lms-y --preload 0.8 --format json",
     "map": "python -m models map lms-y --out lms-y.map.csv",
@@ -129,7 +131,8 @@ def modes(stage: str, preload: float, mount: float, file_format: str, **state: f
         click.echo(json.dumps({"modes": records}, indent=2))
         return
     joints = ("isolator", "mount", "guide")
-    table = Table("mode", "Hz", "ζ %", *SENSORS, *joints, box=box.SIMPLE_HEAD)
+    heads = ("mode", "Hz", "damping %", *SENSORS, *joints)
+    table = Table(*heads, box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
     for record in records:
         table.add_row(
             record["mode"],
@@ -138,9 +141,24 @@ def modes(stage: str, preload: float, mount: float, file_format: str, **state: f
             *(f"{record['participation'][name]:.4f}" for name in SENSORS),
             *(f"{100 * sum(record['strain_energy'][name]):.1f} %" for name in joints),
         )
-    console = Console()
-    # Cut-off names are useless in a file or a pipe.
-    Console(width=max(console.width, _TABLE_WIDTH)).print(table)
+    _print_table(table)
+
+
+def _print_table(table: Table) -> None:
+    """Print a table, or where a terminal is too narrow for it a line for each cell."""
+    console = Console(highlight=False)
+    if not console.is_terminal:  # cut-off names are useless in a file or a pipe
+        console.width = max(console.width, _TABLE_WIDTH)
+    elif (
+        console.measure(table, options=console.options.update(max_width=1000)).maximum
+        > console.width
+    ):
+        for cells in zip(*(column.cells for column in table.columns), strict=True):
+            for column, cell in zip(table.columns, cells, strict=True):
+                console.print(f"{column.header}: {cell}", overflow="fold")
+            console.print()
+        return
+    console.print(table)
 
 
 def _loop_table(loops: list[dict[str, Any]]) -> Table:
@@ -198,15 +216,15 @@ def margins(stage: str, preload: float, mount: float, file_format: str) -> None:
         report = {"stage": stage, "needed": needed, "table_1": table_1, "loops": loops}
         click.echo(json.dumps(report, indent=2))
         return
-    console = Console()
-    wide = Console(width=max(console.width, _TABLE_WIDTH))
-    wide.print(_loop_table(loops))
-    wide.print(_crossover_table(loops))
-    click.echo("* the smallest of its kind in this loop: it decides.")
-    click.echo(
+    _print_table(_loop_table(loops))
+    _print_table(_crossover_table(loops))
+    lines = (
+        "* the smallest of its kind in this loop: it decides.\n"
         "Table 1 of the paper, measured: bandwidth {bandwidth_hz} Hz, gain margin "
         "{gain_margin_db} dB, phase margin {phase_margin_deg}°.".format(**table_1)
     )
+    # A pipe gets whole lines, a terminal what fits.
+    Console(highlight=False, soft_wrap=not sys.stdout.isatty()).print(lines)
 
 
 @cli.command("map", epilog=_epilog("map"))
@@ -379,11 +397,35 @@ def _with_progress(total: int, work: Callable[[Callable[[int], None]], None]) ->
 
 def main() -> None:
     """Run the command line; a named error is one line on standard error and status 1."""
+    _open_streams()
     try:
         cli(prog_name="python -m models")
     except (ModelError, OSError) as error:
         click.echo(f"error: {error}", err=True)
         sys.exit(1)
+
+
+def _open_streams() -> None:
+    """Open standard streams that are closed, and let none fail for a character it cannot encode."""
+    # Else the next file that is opened has the number of a standard stream.
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) <= 2:
+        pass
+    os.close(descriptor)
+    for number, name in enumerate(("stdout", "stderr"), 1):
+        stream = getattr(sys, name) or os.fdopen(number, "w", closefd=False)
+        stream.reconfigure(errors=_ERRORS)
+        setattr(sys, name, stream)
+
+
+def _replace(error: UnicodeError) -> tuple[str, int]:
+    """Spell what a stream cannot encode in ASCII."""
+    assert isinstance(error, UnicodeEncodeError)
+    spelled = {"°": "deg", "±": "+/-", "×": "x"}
+    part = error.object[error.start : error.end]
+    return "".join(spelled.get(one, "?") for one in part), error.end
+
+
+codecs.register_error(_ERRORS, _replace)
 
 
 if __name__ == "__main__":

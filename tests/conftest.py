@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from lmshealth.report.rendering import PdfError, load_pdf_library
 from studies.harness import servers
 
 ROOT = Path(__file__).parent.parent
@@ -39,11 +40,14 @@ def _missing(name: str) -> str | None:
         if not folder:
             return "LMSHEALTH_DATA is not set: it names the folder of real measurements"
         return None if Path(folder).is_dir() else f"LMSHEALTH_DATA={folder} is no folder"
+    if name == "git":
+        found = shutil.which("git") and (ROOT / ".git").exists()
+        return None if found else "git is not installed, or this is no clone (Debian: git)"
     if name == "pdf":
         try:
-            import weasyprint  # noqa: F401
-        except (ImportError, OSError) as error:
-            return f"WeasyPrint or its libraries are not installed: {error}"
+            load_pdf_library()
+        except PdfError as error:
+            return str(error)
         return None
     if name == "peers":
         missing = [module for module in ("pyoma2", "pyOMA") if find_spec(module) is None]

@@ -6,6 +6,7 @@ import subprocess
 import sys
 import tomllib
 import zipfile
+from collections.abc import Callable
 from importlib.metadata import Distribution, PackageNotFoundError, distribution
 from pathlib import Path
 
@@ -95,7 +96,9 @@ def test_a_release_states_one_version() -> None:
     version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
     changelog = (ROOT / "CHANGELOG.md").read_text()
     command = ["git", "tag", "--points-at", "HEAD"]
-    tags = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout
+    tags = ""
+    if shutil.which("git"):
+        tags = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False).stdout
     assert not wrong_versions(version, changelog, tags.split())
     assert len(wrong_versions("9.9", changelog, ["v0.1.0"])) == 2
 
@@ -116,8 +119,9 @@ def test_lock_holds_what_is_declared() -> None:
 
 
 @pytest.mark.slow
-def test_wheel_works_on_its_own(tmp_path: Path) -> None:
+def test_wheel_works_on_its_own(tmp_path: Path, needs: Callable[[str], None]) -> None:
     """A wheel built from the sdist has all modules and data, and its program runs elsewhere."""
+    needs("git")
     source = tmp_path / "source"
     tracked = subprocess.run(
         ["git", "ls-files", "lmshealth", "pyproject.toml", "README.md", "LICENSE"],

@@ -25,6 +25,7 @@ from urllib.parse import urlsplit
 from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
+from lmshealth._interrupts import INTERRUPTS, ignore_interrupts
 from lmshealth._serialize import VERSION
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
@@ -82,12 +83,15 @@ class _ProcessPool(Pool):
         for _ in range(constants.START_ATTEMPTS):
             # The processes exit when the other end of this pipe is closed, by us or by our own end.
             parent_exit, self._open_end = multiprocessing.Pipe(duplex=False)
-            self.executor: ProcessPoolExecutor = ProcessPoolExecutor(
-                self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
-            )
+            # Processes that start in these blocks inherit the mask: two trackers of resources, and
+            # after those, whose start has unblocked some interrupts, the workers.
+            with _interrupts_blocked():
+                resource_tracker.ensure_running()
+                self.executor: ProcessPoolExecutor = ProcessPoolExecutor(
+                    self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
+                )
             try:
-                resource_tracker.ensure_running()  # its start unblocks SIGINT: not in what follows
-                with _interrupts_blocked():  # the processes start here, and inherit the mask
+                with _interrupts_blocked():
                     first = self.executor.submit(os.getpid)
                 first.result()
                 return
@@ -200,11 +204,11 @@ def processes(size: int) -> Iterator[Pool]:
 
 @contextmanager
 def _interrupts_blocked() -> Iterator[None]:
-    """Block SIGINT in this thread; processes and threads that start meanwhile inherit that."""
+    """Block interrupts in this thread; processes and threads that start meanwhile inherit that."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, INTERRUPTS)
     try:
         yield
     finally:
@@ -213,9 +217,9 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _initialise(parent_exit: Connection) -> None:
     """Set up a worker process: no interrupts, one thread for linear algebra, exit with parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
+    ignore_interrupts()
     if hasattr(signal, "pthread_sigmask"):
-        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)
     threadpool_limits(1)  # as in `processes`: sums in another order differ in their last digits
 
     def exit_with_parent() -> None:

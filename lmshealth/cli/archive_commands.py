@@ -1,7 +1,5 @@
 """Commands on archives and stores: run, watch, report."""
 
-import signal
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from datetime import datetime
@@ -21,7 +19,6 @@ from lmshealth.cli import options, terminal, views
 from lmshealth.errors import LmshealthError
 from lmshealth.report.constants import TERMINAL_ROWS
 from lmshealth.report.rendering import write_pdfs
-from lmshealth.report.text import plain
 from lmshealth.stage.description import Stage
 
 
@@ -94,17 +91,19 @@ def run(
     else:
         used = result.n_logs - result.n_refused
         again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
-        click.echo(f"{used} of {result.n_logs} logs analysed{again}.")
+        terminal.print_line(f"{used} of {result.n_logs} logs analysed{again}.")
         if result.n_unlisted:
-            click.echo(f"{result.n_unlisted} logs are not listed in manifest.csv: see refused.csv.")
+            terminal.print_line(
+                f"{result.n_unlisted} logs are not listed in manifest.csv: see refused.csv."
+            )
         if result.n_unread:
-            click.echo(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
+            terminal.print_line(f"{result.n_unread} invalid tables or table rows: see refused.csv.")
         views.print_summaries(result.rows)
         for change in result.changes[:TERMINAL_ROWS]:
             terminal.print_text(f"Changed: {change}")
         if rest := len(result.changes[TERMINAL_ROWS:]):
-            click.echo(f"{rest} more changes; changes.csv lists all.")
-        click.echo(f"Report: {result.index}")
+            terminal.print_line(f"{rest} more changes; changes.csv lists all.")
+        terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     if pdf:
         write_pdfs(result.pages)
@@ -130,8 +129,6 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
     Prints one line for each run, change and failure; with --format json one document a line.
     """
     pdf, style = given.pop("pdf"), given.pop("style")
-    # Like an interrupt: workers end, and the next run continues.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):
         now = f"{datetime.now().astimezone().isoformat(timespec='seconds')} "
         if isinstance(result, LmshealthError):
@@ -142,9 +139,11 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
         else:
             used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
             more = f", {result.n_unlisted} not in manifest.csv" if result.n_unlisted else ""
-            click.echo(f"{now}{used}, {result.n_remembered} of them in an earlier run{more}")
+            terminal.print_line(
+                f"{now}{used}, {result.n_remembered} of them in an earlier run{more}"
+            )
             for change in result.changes:
-                click.echo(f"{now}{plain(str(change))}")
+                terminal.print_line(f"{now}{change}")
         terminal.print_errors(now + error for error in _errors(result))
         if pdf:
             write_pdfs(result.pages)
@@ -166,7 +165,7 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
     """
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
-    click.echo(f"Report: {result.index}")
+    terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     if pdf:
         write_pdfs(result.pages)

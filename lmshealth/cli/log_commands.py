@@ -176,8 +176,9 @@ def _propose_stage(path: Path, log: Log) -> tuple[int, int] | None:
 @options.reading_options
 @click.option(
     "--channels",
-    callback=lambda ctx, option, names: re.split(r"\s*,\s*", names.strip()) if names else None,
-    help="Use only these channels, separated by commas.",
+    multiple=True,
+    callback=lambda ctx, option, given: _names(",".join(given)) if given else None,
+    help="Use only these channels, separated by commas; may be given several times.",
 )
 @options.band_option("Use only this band, in Hz.")
 @click.option(
@@ -232,6 +233,14 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     if given["save"] and found:
         _save(given["save"], found[0])
     _exit(ctx, found, lost)
+
+
+def _names(listed: str) -> list[str]:
+    """Return the names of a list with commas, each once."""
+    names = dict.fromkeys(name.strip() for name in listed.split(","))
+    if "" in names:
+        raise click.BadParameter(f"{listed!r} has an empty name", param_hint="--channels")
+    return list(names)
 
 
 def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
@@ -498,6 +507,7 @@ def _each(
     named = ctx.params["logs"]
     # A pattern such as *.csv does not mean the manifest in the same folder.
     paths = [path for path in named if path.name not in NOT_LOGS] or named
+    paths = list({path.absolute(): path for path in paths}.values())  # a log is used once
 
     def items(path: Path) -> list[Any]:
         if path.parent not in manifests:
@@ -510,6 +520,13 @@ def _each(
             f"{log.name} is read with {', '.join(log.guessed)}; [csv] of a column map overrides"
             for log in logs
             if isinstance(log, Log) and log.guessed
+        )
+        low, high = ctx.params.get("band") or (0.0, 0.0)
+        terminal.print_notes(
+            f"{log.name}: the band {low:g} to {high:g} Hz ends above {log.sample_rate / 2:g} Hz, "
+            "half the sample rate: nothing is seen there"
+            for log in logs
+            if isinstance(log, Log) and low < log.sample_rate / 2 < high
         )
         return logs
 

@@ -138,7 +138,11 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
     help="Another machine that shares a part with the first; see --shared.",
 )
 @click.option(
-    "--shared", multiple=True, metavar="PARAMETER", help="Parameter that the machines share."
+    "--shared",
+    multiple=True,
+    callback=options.once,
+    metavar="PARAMETER",
+    help="Parameter that the machines share.",
 )
 @options.ALLOW_FUTURE
 @options.EPOCHS
@@ -153,6 +157,9 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     if bool(given["others"]) != bool(given["shared"]):
         raise click.UsageError("--with and --shared need each other: which parameter is shared?")
+    tables_of = Counter(path.resolve() for path in (table, *(path for path, _ in given["others"])))
+    if repeated := [str(path) for path, times in tables_of.items() if times > 1]:
+        raise click.UsageError(f"{', '.join(repeated)} is named twice: its data would count twice.")
     with progress_bars(PATIENCE) as progress:
         found, lost = _infer_machines(table, given, progress)
     for health in found:

@@ -6,11 +6,17 @@ import os
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib import import_module
-from typing import Any
+from typing import Any, NoReturn
 
 import click
 
+from lmshealth._interrupts import INTERRUPTS
+from lmshealth.cli.streams import standard_streams
 from lmshealth.cli.terminal import print_errors
 from lmshealth.errors import LmshealthError
 
@@ -30,13 +36,43 @@ _COMMANDS = {
     "track": ("machine_commands", "Track modes through a table of estimates."),
     "watch": ("archive_commands", "Run over a folder of logs whenever logs arrive."),
 }
+# Python itself raises KeyboardInterrupt for SIGINT.
+_ENDS = INTERRUPTS - {signal.SIGINT}
 
 
-_INTERRUPTED = 130  # as shells report SIGINT
+class _Interrupted(KeyboardInterrupt):
+    """End that another process asks for, with the number of its signal; as Ctrl-C otherwise."""
+
+
+def _end(number: int, frame: object) -> NoReturn:
+    """Handle a signal; a second one, as `timeout` sends, must not disturb the end."""
+    for name in _ENDS:
+        signal.signal(name, signal.SIG_IGN)
+    raise _Interrupted(number)
+
+
+@contextmanager
+def _ended_by_signals() -> Iterator[None]:
+    """Treat SIGTERM and SIGHUP as interrupts."""
+    main = threading.current_thread() is threading.main_thread()
+    # `nohup` ignores SIGHUP; other handlers are of a program that calls this one.
+    handled = [name for name in _ENDS if main and signal.getsignal(name) == signal.SIG_DFL]
+    for name in handled:
+        signal.signal(name, _end)
+    try:
+        yield
+    finally:
+        for name in handled:
+            if signal.getsignal(name) is _end:
+                signal.signal(name, signal.SIG_DFL)
 
 
 class _Group(click.Group):
     """Group that reports errors in one line on standard error, with exit status 1."""
+
+    def main(self, *arguments: Any, **options: Any) -> Any:
+        with _ended_by_signals(), standard_streams():
+            return super().main(*arguments, **options)
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         return list(_COMMANDS)
@@ -57,16 +93,19 @@ class _Group(click.Group):
             return super().invoke(ctx)
         except LmshealthError as error:
             print_errors([str(error)])
-        except BrokenPipeError:
-            raise  # of `| head`: click ends without a word
         except OSError as error:
             print_errors([f"{error.filename or 'output'}: {error.strerror}"])
-        except KeyboardInterrupt:
+        except KeyboardInterrupt as error:
+            asked = isinstance(error, _Interrupted)
+            number = error.args[0] if asked else signal.SIGINT
+            if ctx.invoked_subcommand == "watch" and number == signal.SIGTERM:
+                ctx.exit(0)  # as a service ends
+            by = f" by {signal.Signals(number).name}" if asked else ""
             # Only a run keeps what is finished.
             runs = ctx.invoked_subcommand in ("run", "watch")
             kept = "; run again to continue" if runs else ""
-            print_errors([f"interrupted{kept}"])
-            ctx.exit(_INTERRUPTED)
+            print_errors([f"interrupted{by}{kept}"])
+            ctx.exit(128 + number)  # as shells report it
         ctx.exit(1)
 
 
@@ -74,7 +113,7 @@ class _Group(click.Group):
     cls=_Group,
     context_settings={"help_option_names": ["-h", "--help"], "show_default": True},
     epilog="Exit status: 0 done, 1 failed (one line on standard error gives the reason), 2 wrong "
-    "usage, 3 done but some logs were refused, 130 interrupted.",
+    "usage, 3 done but some logs were refused, 130 interrupted (129 by SIGHUP, 143 by SIGTERM).",
 )
 @click.version_option(package_name="lmshealth")
 def main() -> None:

@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import shlex
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from datetime import date, datetime
 from functools import partial, reduce
 from importlib.util import find_spec
@@ -57,14 +57,22 @@ def day(value: str) -> date:
 
 
 def _band(
-    ctx: click.Context, option: click.Parameter, band: tuple[float, float] | None
+    ctx: click.Context, option: click.Parameter, bands: tuple[tuple[float, float], ...]
 ) -> tuple[float, float] | None:
-    """Reject a band whose ends are not in ascending order."""
-    if band and not 0 <= band[0] < band[1]:
-        raise click.BadParameter(
-            f"needs 0 <= LOW < HIGH, got {band[0]:g} {band[1]:g}", param_hint="--band"
-        )
-    return band
+    """Reject a band whose ends are not in ascending order, and a second one."""
+    given = dict.fromkeys(bands)
+    if len(given) > 1:
+        raise click.BadParameter("is given several times; needed is one band", param_hint="--band")
+    for low, high in given:
+        if not 0 <= low < high:
+            detail = f"needs 0 <= LOW < HIGH, got {low:g} {high:g}"
+            raise click.BadParameter(detail, param_hint="--band")
+    return next(iter(given), None)
+
+
+def once(ctx: click.Context, option: click.Parameter, values: Iterable[Any]) -> tuple[Any, ...]:
+    """Use a value that is given several times once."""
+    return tuple(dict.fromkeys(values))
 
 
 def _words(ctx: click.Context, option: click.Parameter, command: str | None) -> tuple[str, ...]:
@@ -222,7 +230,13 @@ def format_option(*styles: str) -> Callable[[Any], Any]:
 def band_option(text: str) -> Callable[[Any], Any]:
     """Return the option of a frequency band."""
     return click.option(
-        "--band", nargs=2, type=float, metavar="LOW HIGH", callback=_band, help=text
+        "--band",
+        nargs=2,
+        type=Finite(),
+        multiple=True,
+        metavar="LOW HIGH",
+        callback=_band,
+        help=text,
     )
 
 

@@ -36,9 +36,9 @@ def _detections(
     ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
 ) -> list[tuple[str, float]]:
     """Parse NAME=LOSS, without duplicates."""
-    pairs = [value.split("=") for value in dict.fromkeys(values)]
+    pairs = [value.split("=") for value in values]
     try:
-        return [(name, float(loss)) for name, loss in pairs]
+        return list(dict.fromkeys((name, float(loss)) for name, loss in pairs))
     except ValueError as error:
         raise click.BadParameter(f"needs NAME=LOSS with a number, got {values}") from error
 
@@ -68,6 +68,7 @@ def _detections(
     "--seconds",
     type=options.Finite(0, 1e9, min_open=True),
     multiple=True,
+    callback=options.once,
     help="Length of a log in s; may be given several times. Default 10 to 600 s.",
 )
 @options.format_option("table", "json")

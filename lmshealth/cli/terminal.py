@@ -2,36 +2,44 @@
 
 from __future__ import annotations
 
+import io
+import json
 import logging
+import re
 import shutil
 import sys
 import time
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from string import Formatter
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TextIO
 
 import click
 import msgspec
 from rich import box, progress
+from rich.cells import cell_len
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from lmshealth.cli import streams
 from lmshealth.io.log import WARNINGS
-from lmshealth.report.text import fixed, number, percent, plain
+from lmshealth.report.text import GAP, fixed, number, percent, plain
 
 if TYPE_CHECKING:  # so that --help does not import pandas and scipy
     from lmshealth.report.tables import Row
 
 # Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
 _WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000
+_NARROWEST = 12  # columns of a terminal: the text of a narrower one is as wide as this
 PATIENCE = 2.0  # seconds without a progress bar
 _REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
-# Names up to this length are not split in a table that is too wide.
-_NAME = 16
+# Names up to this length are not split in a table that is too wide; the last text becomes as
+# narrow as the other.
+_NAME, _SHORT = 16, 10
 
 
 _logger = logging.getLogger(__name__)
@@ -54,15 +62,22 @@ def start_log(context: click.Context, handler: logging.Handler) -> None:
 
 
 def _columns() -> int | None:
-    """Return the width of the terminal; None for a pipe or a file."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else None
+    """Return the width of standard output; None for a pipe or a file."""
+    return _width(sys.stdout)
+
+
+def _width(stream: TextIO) -> int | None:
+    return max(shutil.get_terminal_size().columns, _NARROWEST) if stream.isatty() else None
 
 
 def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
     """Print JSON with null where a number is missing; with a negative indent in one line."""
     # msgspec writes null for NaN and infinity.
     encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
-    click.echo(msgspec.json.format(encoded, indent=indent))
+    text = msgspec.json.format(encoded, indent=indent).decode()
+    if not streams.is_unicode():
+        text = re.sub(r"[^\0-\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
+    click.echo(text)
 
 
 def print_notes(notes: Iterable[str]) -> None:
@@ -70,28 +85,41 @@ def print_notes(notes: Iterable[str]) -> None:
     for note in notes:
         _logger.info("note: %s", note, extra=_PRINTED)
         if not quiet():
-            click.echo(f"note: {note}", err=True)
+            print_line(f"note: {note}", err=True)
 
 
 def print_errors(errors: Iterable[str]) -> None:
     """Print on standard error what has no result, and why."""
     for error in errors:
         _logger.info("%s", error, extra=_PRINTED)
-        click.echo(f"lmshealth: {error}", err=True)
+        print_line(f"lmshealth: {error}", err=True)
+
+
+def print_line(text: str, *, err: bool = False) -> None:
+    """Print a line that a terminal gets in parts which fit, and a pipe whole."""
+    width = _width(sys.stderr) if err else _columns()
+    lines = _wrapped(streams.readable(text), width) if width else [text]
+    click.echo(plain("\n".join(lines)), err=err)
 
 
 def print_text(text: str, mark: str = "") -> None:
     """Print text in lines that fit, indented below the mark."""
-    width = min((_columns() or _WIDTH + 2) - 2, _WIDEST)
-    for paragraph in (mark + text).split("\n"):
-        lines = wrap(
-            paragraph,
-            width,
-            subsequent_indent=" " * len(mark),
-            break_long_words=False,
-            break_on_hyphens=False,
+    terminal = _columns()
+    width = min((terminal or _WIDTH + 2) - 2, _WIDEST)
+    indent = " " * len(mark)
+    lines = _wrapped(streams.readable(mark + text), width, indent, fold=terminal is not None)
+    click.echo(plain("\n".join(lines)))
+
+
+def _wrapped(text: str, width: int, indent: str = "", *, fold: bool = True) -> Iterator[str]:
+    """Split text into lines between words, and with ``fold`` words that are longer than a line."""
+    joint = "\u2060"  # makes a character of two columns count twice
+    counted = "".join(one + joint * (cell_len(one) - 1) for one in text)
+    for line in counted.split("\n"):
+        parts = wrap(
+            line, width, subsequent_indent=indent, break_long_words=fold, break_on_hyphens=False
         )
-        click.echo(plain("\n".join(lines)))
+        yield from (part.replace(joint, "") for part in parts or [""])
 
 
 def print_refused(rows: Sequence[Row]) -> None:
@@ -130,31 +158,83 @@ def cells(columns: str, rows: Iterable[Row]) -> list[dict[str, str]]:
     return [{head: fill(form, (), row) for head, form in forms.items()} for row in rows]
 
 
+@dataclass(frozen=True, slots=True)
+class _Column:
+    """Column of a table: its heading, cells as texts or numbers, least and natural width."""
+
+    name: str
+    cells: list[str]
+    is_text: bool
+    least: int
+    widest: int
+
+    @classmethod
+    def of(cls, name: str, cells: list[str], *, is_text: bool, is_last: bool) -> _Column:
+        """Measure a column."""
+        splits = is_text or not any(map(str.isdecimal, "".join(cells)))
+        words = [*name.split(), *(word for cell in cells for word in cell.split())]
+        least = max(map(cell_len, words if splits else [*name.split(), *cells]), default=1)
+        # Names of usual length are not split, and the last text is the longest.
+        least = min(least, _SHORT if is_last else _NAME) if is_text else least
+        lines = [line for text in (name, *cells) for line in text.split("\n")]
+        return cls(name, cells, is_text, max(least, 1), max(1, *map(cell_len, lines)))
+
+
 def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:
     """Print rows under their keys: texts left-aligned, then numbers right-aligned.
 
-    On a terminal texts are wrapped to its width; in a pipe every row is one line.
+    On a terminal texts are wrapped to its width; where that is not enough, a row takes a line for
+    each cell. In a pipe every row is one line.
     """
+    print_line(title)
+    columns = [
+        _Column.of(
+            streams.readable(name),
+            [plain(streams.readable(row[name])) for row in rows],
+            is_text=place < n_texts,
+            is_last=place == n_texts - 1,
+        )
+        for place, name in enumerate(rows[0])
+    ]
+    width = _columns() or _UNLIMITED
+    widths = _fitting(columns, width - 2 * len(columns))
+    if widths is None:
+        _print_records(columns, width)
+        return
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for place, name in enumerate(rows[0]):
-        if place < n_texts:
-            # The last text is the longest and is wrapped first; names before it are not split.
-            words = " ".join([name, *(row[name] for row in rows)]).split()
-            least = min(max(map(len, words), default=0), _NAME) if place < n_texts - 1 else None
-            table.add_column(name, overflow="fold", min_width=least)
-        else:
-            longest = max((len(plain(row[name])) for row in rows), default=0)
-            least = max(longest, *map(len, name.split() or [""]), 1)
-            table.add_column(name, justify="right", min_width=least)
-    for row in rows:
-        table.add_row(*map(plain, row.values()))
-    click.echo(plain(title))
+    for column, own in zip(columns, widths, strict=True):
+        justify: Any = "left" if column.is_text else "right"
+        table.add_column(column.name, overflow="fold", justify=justify, width=own)
+    for row in zip(*(column.cells for column in columns), strict=True):
+        table.add_row(*row)
     # Brackets in the cells are not markup.
-    console = Console(markup=False, emoji=False, highlight=False, width=_columns() or _UNLIMITED)
-    # A table that does not fit is wrapped by the terminal, not cut.
-    free = console.options.update(max_width=_UNLIMITED)
-    console.width = max(console.width, console.measure(table, options=free).minimum)
-    console.print(table)
+    console = Console(file=io.StringIO(), markup=False, emoji=False, highlight=False, width=width)
+    with console.capture() as captured:
+        console.print(table)
+    click.echo(captured.get(), nl=False)
+
+
+def _fitting(columns: Sequence[_Column], room: int) -> list[int] | None:
+    """Return widths of columns, the widest of them reduced first; None if the least do not fit."""
+    widths = [column.widest for column in columns]
+    if sum(column.least for column in columns) > room:
+        return None
+    while sum(widths) > room:
+        reducible = [k for k, column in enumerate(columns) if widths[k] > column.least]
+        widths[max(reducible, key=widths.__getitem__)] -= 1
+    return widths
+
+
+def _print_records(columns: Sequence[_Column], width: int) -> None:
+    """Print each row of a table as lines of heading and cell; numbers stay whole."""
+    for row in range(len(columns[0].cells)):
+        for column in columns:
+            cell = column.cells[row]
+            cell = cell if column.is_text else cell.replace(" ", GAP)
+            line = f"{column.name}: {cell}" if column.name else cell
+            if cell.strip():
+                click.echo(plain("\n".join(_wrapped(line, width, " "))))
+        click.echo()
 
 
 def short_names(rows: Sequence[Row], others: Sequence[Row] = ()) -> list[Row]:

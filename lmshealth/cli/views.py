@@ -5,9 +5,14 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
 
-import click
-
-from lmshealth.cli.terminal import cells, print_refused, print_table, print_text, short_names
+from lmshealth.cli.terminal import (
+    cells,
+    print_line,
+    print_refused,
+    print_table,
+    print_text,
+    short_names,
+)
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
@@ -185,7 +190,7 @@ def print_frf(
     """Print frequency responses at some of their lines, their averages and their modes."""
     for fit in fits:
         if len(fits) > 1:
-            click.echo(fit["log"])
+            print_line(fit["log"])
         _print_response(fit, [row for row in frf if row["log"] == fit["log"]])
     print_modes(rows, refused)
 
@@ -267,7 +272,7 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
         own = [row for row in rows if (row["stage"], row["channel"]) == (stage, channel)]
         _print_channel(f"{stage or 'unknown machine'}, {channel}", own)
     if rows:
-        click.echo(
+        print_line(
             "grows: slope of ln level over ln velocity ± its standard deviation;\n"
             "* significantly positive (one-sided, 5 % per row);\n"
             "– fewer than two velocities or three logs: no slope;\n"
@@ -376,8 +381,8 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
     print_table(title, list(modes.values()))
     for row in content["correlations"]:
         pair = f"{row['parameter_a']} and {row['parameter_b']}"
-        click.echo(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
-    click.echo()
+        print_line(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
+    print_line("")
 
 
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
@@ -397,7 +402,7 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
         print_table(title, cells(columns, rows), 0)
         alone = asked["seconds_for_one_log"]
         enough = "A single log of up to an hour is not enough."
-        click.echo(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
+        print_line(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
     for kind in dict.fromkeys(row["hindrance"] for row in plan if row["hindrance"]):
         print_text(": ".join(_HINDRANCES[kind]))
     print_text(
@@ -534,7 +539,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     title = f"{n}, most urgent first (medians with 90 % intervals)"
     print_table(title, shown, 5)
     if rest := len(summaries) - len(shown):
-        click.echo(f"{count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
+        print_line(f"{count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
 
 
 def _parameter(one: ParameterHealth) -> str:
@@ -589,7 +594,7 @@ def print_life(
         print_text(f"Not included: the limit of {names}, which the modes cannot determine.")
     for sentence in _advice(life, service):
         print_text(sentence)
-    click.echo()
+    print_line("")
 
 
 def _limit_cells(

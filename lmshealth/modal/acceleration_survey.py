@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.identification import identify
+from lmshealth.modal.targets import check_band
 from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.constants import LEVEL_BAND_RANGE
 from lmshealth.signal.segments import Part
@@ -31,6 +32,7 @@ def survey(
     Without a stage a grid of bands is read; ``band`` in Hz restricts modes, grid and lines.
     `BadLog` as `read_magnitudes` does.
     """
+    check_band(log, band)
     accelerometers = [c for c in log.channels if c.kind == "acceleration"]
     identified: dict[str, float] | None = None
     if stage is not None and accelerometers:

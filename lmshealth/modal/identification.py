@@ -36,6 +36,7 @@ from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import (
     Target,
+    check_band,
     choose_channels,
     choose_targets,
     clusters,
@@ -146,6 +147,7 @@ def read_ambient(
     progress: Callable[[str, int, int], None] = lambda step, done, total: None,
 ) -> AmbientReading:
     """Identify modes as `identify` does; return them with the spectra and their fit."""
+    check_band(log, band)
     log = limit_channels(log, channels)
     used = choose_channels(log)
     targets, short = () if stage is None else choose_targets(stage, band), list[Refusal]()

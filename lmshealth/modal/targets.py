@@ -69,6 +69,15 @@ def limit_channels(log: Log, names: Sequence[str] | None = None) -> Log:
     return replace(log, channels=kept, refused=(*log.refused, *surplus))
 
 
+def check_band(log: Log, band: tuple[float, float] | None) -> None:
+    """Refuse (``sample-rate``) a band in Hz that begins above what a log can show."""
+    top = constants.USABLE * log.sample_rate
+    if band is not None and band[0] >= top:
+        asked = f"the band is {band[0]:g} to {band[1]:g} Hz"
+        found = f"a log of {log.sample_rate:g} Hz shows nothing above {top:.4g} Hz; {asked}"
+        raise BadLog(log.name, "sample-rate", f"{found}: choose a lower one, or check the rate")
+
+
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
     """Return the modes of a description in a band in Hz, ascending; `BadStage` if none is left."""
     low, high = band or (0.0, np.inf)

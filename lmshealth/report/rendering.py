@@ -2,9 +2,13 @@
 
 import hashlib
 import inspect
+import io
+import os
 import re
+import warnings
 from base64 import b64encode
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, redirect_stdout
 from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
@@ -67,7 +71,7 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     The bytes are reproducible, and nothing is loaded from the network or other files. `PdfError` if
     WeasyPrint is missing or cannot lay out a page.
     """
-    html, fetcher = _library()
+    html, fetcher = load_pdf_library()
     style, written = read("pdf.css"), []
     for page in pages:
         source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
@@ -75,7 +79,8 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
         source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", source)
         target = page.with_suffix(".pdf")
         try:
-            content = html(string=source, url_fetcher=fetcher).write_pdf()
+            with _reproducible():
+                content = html(string=source, url_fetcher=fetcher).write_pdf()
         except Exception as error:  # any failure: the HTML page exists
             found = f"cannot be made: {type(error).__name__} {error}"
             raise PdfError(f"{target}: {found}; print {page} from a browser instead") from error
@@ -84,11 +89,30 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     return written
 
 
-def _library() -> tuple[Any, Any]:
-    """Import WeasyPrint, with a fetcher that allows nothing outside of a page."""
+@contextmanager
+def _reproducible() -> Iterator[None]:
+    """Fix the time in fonts by fontTools, which WeasyPrint uses without HarfBuzz-Subset."""
+    name = "SOURCE_DATE_EPOCH"
+    before = os.environ.get(name)
+    os.environ[name] = before or "0"
     try:
-        from weasyprint import HTML
-        from weasyprint.urls import URLFetcher
+        yield
+    finally:
+        if before is None:
+            del os.environ[name]
+
+
+def load_pdf_library() -> tuple[Any, Any]:
+    """Import WeasyPrint, with a fetcher that allows nothing outside of a page.
+
+    `PdfError` names what to install where it, or a library of the system that it needs, is missing.
+    """
+    try:
+        # It works without HarfBuzz-Subset, but announces that a later version will not.
+        with warnings.catch_warnings(), redirect_stdout(io.StringIO()):
+            warnings.simplefilter("ignore", DeprecationWarning)
+            from weasyprint import HTML
+            from weasyprint.urls import URLFetcher
     except ImportError as error:
         raise PdfError(
             'PDFs need WeasyPrint: pip install "lmshealth[pdf]"; the pages are written, and '
@@ -96,7 +120,8 @@ def _library() -> tuple[Any, Any]:
         ) from error
     except OSError as error:
         raise PdfError(
-            "WeasyPrint does not find its libraries; install libpangoft2-1.0-0 and "
-            f"libharfbuzz-subset0 (Debian); the pages are written ({error})"
+            "PDFs need libraries of the system, which WeasyPrint does not find; install "
+            "libpangoft2-1.0-0 and libharfbuzz-subset0 (Debian, Ubuntu) or pango (Homebrew, MSYS2)"
+            f"; the pages are written ({str(error).partition('.  ')[0]})"
         ) from error
     return HTML, URLFetcher(allowed_protocols=("data",))

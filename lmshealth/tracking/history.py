@@ -30,20 +30,6 @@ _SOURCES = ("joint", "acc", "frf", "delta_e")
 _KINDS: dict[str, StepKind] = {"regrease": "regreasing", "servo": "servo", "sensor": "sensor"}
 LEFT_OUT = ("odometer", "date", "odd-rate")
 """Reasons for which a log as a whole is left out of a history."""
-_RATE_NOTICES: tuple[tuple[str, Literal["note", "caution"], str, str], ...] = (
-    (
-        "odd-rate",
-        "caution",
-        "logs have another sample rate, which their frequencies follow: they are left out.",
-        "Find out which rate is right (refused.csv has both), and correct manifest.csv.",
-    ),
-    (
-        "rate",
-        "note",
-        "logs have another sample rate than the others, by little.",
-        "Check whether it is right (refused.csv has both).",
-    ),
-)
 EXCITATION = "excitation_db"
 """Covariate that the identification measures: needed where frequencies depend on the amplitude."""
 _NO_MOMENT = datetime.max.replace(tzinfo=UTC)
@@ -661,13 +647,13 @@ def _line_up(
 
 
 def rate_notices(refused: Sequence[Refusal]) -> list[Notice]:
-    """List the logs of another sample rate that were left out, or may have to be."""
-    notices = []
-    for reason, severity, what, to_do in _RATE_NOTICES:
-        logs = [one.log for one in refused if one.reason == reason and not one.mode]
-        if logs:
-            notices.append(Notice("odd-rate", severity, logs[0], f"{len(logs)} {what}", to_do))
-    return notices
+    """List the logs of another sample rate that were left out."""
+    logs = [one.log for one in refused if one.reason == "odd-rate"]
+    if not logs:
+        return []
+    what = f"{len(logs)} logs have another sample rate, which their frequencies follow: "
+    to_do = "Find out which rate is right (refused.csv has both), and correct manifest.csv."
+    return [Notice("odd-rate", "caution", logs[0], f"{what}they are left out.", to_do)]
 
 
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:

@@ -19,7 +19,6 @@ Run time
 from __future__ import annotations
 
 import json
-import resource
 import subprocess
 import sys
 import tempfile
@@ -113,6 +112,8 @@ def measured(
 
 def run(command: list[str], target: Path) -> tuple[str, float, float]:
     """Run Python with arguments; return its output, processor time in s and peak memory in MB."""
+    import resource  # POSIX
+
     before, peak = resource.getrusage(resource.RUSAGE_CHILDREN), 0.0
     with target.open("wb") as stream:
         process = subprocess.Popen([sys.executable, *command], stdout=stream, env=one_thread())

@@ -22,7 +22,6 @@ from __future__ import annotations
 import html
 import json
 import os
-import resource
 import socket
 import subprocess
 import sys
@@ -299,6 +298,8 @@ def bombs(folder: Path, base: Columns) -> list[Row]:
 
 def _weigh(path: Path) -> Row:
     """Read a log in a process of its own; return why it is refused, and its peak memory in MB."""
+    import resource  # POSIX
+
     script = (
         "import json, resource, sys\nfrom lmshealth.io.reading import read_log\n"
         "from lmshealth.errors import BadLog\n"

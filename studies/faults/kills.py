@@ -39,7 +39,6 @@ SEED = 20261122
 HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}
 # Number of kills, mean number in the time that a run takes, and shares of their kinds.
 WANTED, QUICK_WANTED = (100, 5.0, HOWS), (1, 10.0, {"main": 1.0})
-ENDS = {"main": -signal.SIGKILL, "SIGTERM": -signal.SIGTERM}
 IMPORTED_S = 2.0  # before, while Python imports, it reports an interrupt in its own way
 MOST_OTHER = 20  # other ends of runs before the study is given up
 
@@ -145,7 +144,9 @@ def killed(
                     "last": messages[-1:],
                 }
             elif not (
-                status in (driving.SOME_REFUSED, ENDS.get(how)) or (how and one_line(messages))
+                status == driving.SOME_REFUSED
+                or (how == "main" and status == -signal.SIGKILL)
+                or (how and one_line(messages))
             ):
                 other_ends.append(f"{how or 'not killed'}: {status}: {messages[-3:]}")
                 if len(other_ends) > MOST_OTHER:

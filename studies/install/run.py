@@ -18,7 +18,6 @@ Run time
 from __future__ import annotations
 
 import json
-import resource
 import shutil
 import subprocess
 import sys
@@ -128,6 +127,8 @@ def started(python: Path, folder: Path, turns: int, *, warm: bool = True) -> Row
 
 def spent(python: Path, words: tuple[str, ...], folder: Path) -> float:
     """Processor time in s of one interpreter."""
+    import resource  # POSIX
+
     before = resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run([python, *words], check=True, capture_output=True, cwd=folder)
     after = resource.getrusage(resource.RUSAGE_CHILDREN)

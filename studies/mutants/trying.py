@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import resource
 import shutil
 import signal
 import subprocess
@@ -144,12 +143,16 @@ def _run(tree: Path, words: Iterable[str], limit_s: float) -> Outcome:
 
 def _limit(seconds: float) -> None:
     """Limit the program that is to be started, and what it starts."""
+    import resource  # POSIX
+
     resource.setrlimit(resource.RLIMIT_CPU, (int(seconds), int(seconds) + 5))
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY, MEMORY))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 
 
 def _spent() -> float:
+    import resource  # POSIX
+
     used = resource.getrusage(resource.RUSAGE_CHILDREN)
     return used.ru_utime + used.ru_stime
 

@@ -97,13 +97,15 @@ def claims(record: Row) -> list[Claim]:
     found = []
     for kind in KINDS:
         rows = [row for row in record["rows"] if row["kind"] == kind]
-        right, controls = (sum(row[key] for row in rows) for key in ("right_now", "control_right"))
+        right, before, controls = (
+            sum(row[key] for row in rows) for key in ("right_now", "right_before", "control_right")
+        )
         found.append(
             Claim(
                 f"faulty inputs answered right: {kind}",
                 f"{right} of {len(rows)}",
                 "",
-                f"{sum(row['right_before'] for row in rows)} before; controls {controls} of {len(rows)}",
+                f"{before} before; controls {controls} of {len(rows)}",
                 right == controls == len(rows),
             )
         )

@@ -20,7 +20,6 @@ Run time
 from __future__ import annotations
 
 import json
-import resource
 import tempfile
 import time
 from collections.abc import Iterator
@@ -77,6 +76,8 @@ class Meter(Steps):
 
 def one_run(folder: Path) -> Row:
     """Analyse an archive in this process and return the costs."""
+    import resource  # POSIX
+
     stage = load_stage(str(folder / "stage.toml"))
     meter = Meter(sorted((folder / "logs").rglob("*.h5")), stage)
     out = folder / "out"

@@ -1005,6 +1005,27 @@ def test_an_interrupt_has_its_status(
     assert ("run again to continue" in result.stderr) is kept
 
 
+def test_bands_beyond_the_log_and_repeated_names_are_noticed(tmp_path: Path) -> None:
+    """A band above what the log shows is refused, one that ends there noted; names count once."""
+    noise = np.random.default_rng(0).standard_normal((4000, 2))
+    head = "# sample_rate_hz: 1000\nacc_x_m_s2,acc_y_m_s2"
+    np.savetxt(tmp_path / "a.csv", noise, delimiter=",", header=head, comments="")
+    for command in ("modes", "spectrum"):
+        lost = call(command, tmp_path / "a.csv", "--band", 600, 900)
+        assert (lost.exit_code, lost.stdout) == (1, "")
+        assert "1000 Hz shows nothing above 450 Hz; the band is 600 to 900 Hz" in lost.stderr
+    half = call("modes", tmp_path / "a.csv", "--band", 300, 900)
+    assert "300 to 900 Hz ends above 500 Hz" in half.stderr
+    assert "ends above" not in call("modes", tmp_path / "a.csv", "--band", 300, 400).stderr
+    words = ["modes", tmp_path / "a.csv", "--format", "json", "--band", 300, 400]
+    twice = json.loads(call(*words, tmp_path / "a.csv").stdout)
+    assert twice == json.loads(call(*words).stdout)
+    assert len({row["log"] for row in twice["refused"]}) == 1
+    both = ("--channels", "acc_x", "--channels", "acc_y, acc_x")
+    assert json.loads(call(*words, *both).stdout) == twice
+    assert call(*words, "--channels", "acc_x,,acc_y").exit_code == 2
+
+
 # Proposals
 
 

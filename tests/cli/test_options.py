@@ -60,6 +60,16 @@ def test_a_day_is_in_the_calendar() -> None:
             options.day(wrong)
 
 
+@pytest.mark.parametrize("band", [("nan", "10"), ("1", "inf"), ("-inf", "1")])
+def test_a_band_is_finite_and_one(band: tuple[str, str]) -> None:
+    """A second band is refused, unless it is the same."""
+    run = CliRunner().invoke
+    assert "is not a finite number" in run(echo, ["--band", *band]).output
+    twice = run(echo, ["--band", "1", "10", "--band", "20", "30"])
+    assert (twice.exit_code, "needed is one band" in twice.output) == (2, True)
+    assert run(echo, 2 * ["--band", "1", "10"]).output == "{'band': (1.0, 10.0)}\n"
+
+
 def test_examples_are_one_per_line_and_not_wrapped() -> None:
     """They end the help, as they were written."""
     lines = CliRunner().invoke(echo, ["--help"]).output.splitlines()

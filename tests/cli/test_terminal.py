@@ -12,6 +12,7 @@ import time
 from pathlib import Path
 
 import pytest
+from rich.cells import cell_len
 
 from lmshealth.cli import options, terminal
 from lmshealth.cli.terminal import print_json, print_refused, print_text, progress_bars
@@ -107,6 +108,39 @@ def test_a_table_is_as_wide_as_its_terminal_and_never_cut(
     assert len(lines) == 2 if columns is None else len(lines) > 2
     if columns in (80, 200):
         assert columns - 20 < max(map(len, out.splitlines())) <= columns
+
+
+LONG = "a-name-without-blanks-" * 4
+WIDE = {
+    "log": LONG, "mode": "mode_1", "channel": "加速度計_左", "frequency Hz": "12 126.649 ± 0.262",
+    "damping %": "1.55 ± 0.21", "SNR": "1 770", "flags": "resolution-limited unsteady loose-fit",
+}  # fmt: skip
+MANY = {f"column {k}": f"{k}.25 ± 0.5" for k in range(30)}
+
+
+@pytest.mark.parametrize("columns", [12, 40, 60, 80, 100, 200])
+@pytest.mark.parametrize(("row", "n_texts"), [(WIDE, 3), (MANY, 0), ({"a": LONG, "b": LONG}, 2)])
+def test_nothing_is_wider_than_the_terminal(
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    columns: int,
+    row: dict[str, str],
+    n_texts: int,
+) -> None:
+    """Texts are wrapped, or a row has a line for each cell; numbers are whole, nothing is cut."""
+    monkeypatch.setattr(terminal, "_columns", lambda: columns)
+    terminal.print_table(f"Title of {LONG}", [row, row], n_texts)
+    print_text(f"Text about {LONG} and 加速度計 " * 3, "! ")
+    terminal.print_line(f"Report: {LONG}")
+    out = capsys.readouterr().out
+    assert max(map(cell_len, out.splitlines())) <= columns
+    assert "…" not in out
+    letters = "".join(out.split())
+    for name, cell in row.items():
+        fits = name not in ("log", "a", "b") and cell_len(cell) <= columns - 1
+        if fits and name != "flags":
+            assert out.count(cell) >= 2, cell
+        assert letters.count(cell.replace(" ", "")[:8]) >= 2 or not fits
 
 
 def test_a_log_file_has_events_notes_and_errors_and_ends_with_its_command(

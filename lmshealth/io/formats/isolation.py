@@ -28,6 +28,7 @@ from typing import IO, Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 
+from lmshealth._interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
 from lmshealth.io.buffers import Spool
@@ -253,7 +254,7 @@ if hasattr(os, "register_at_fork"):
 
 def serve(file: str) -> None:
     """Read files until standard input ends; samples are handed over in the mapped file."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles interrupts
+    ignore_interrupts()
     faulthandler.disable()
     answers = os.fdopen(os.dup(1), "wb")
     # What a library prints is no answer.

@@ -25,7 +25,13 @@ from lmshealth.modal.free_decay.decay_fit import (
 from lmshealth.modal.free_decay.transient_likelihood import transform_decays
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
 from lmshealth.modal.naming import assign, is_near
-from lmshealth.modal.targets import Target, choose_channels, choose_targets, limit_channels
+from lmshealth.modal.targets import (
+    Target,
+    check_band,
+    choose_channels,
+    choose_targets,
+    limit_channels,
+)
 from lmshealth.signal.segments import Segment, select_segments
 from lmshealth.stage.description import Stage
 
@@ -104,6 +110,7 @@ def identify_decays(
     >>> print(f"{modes.damping_ratio[0]:.2%} ± {modes.damping_ratio_std[0]:.2%}")
     0.97% ± 0.03%
     """
+    check_band(log, band)
     log = limit_channels(log, channels)
     used = choose_channels(log)
     segments = select_segments(log, "settling") if segments is None else segments

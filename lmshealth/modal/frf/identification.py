@@ -21,6 +21,7 @@ from lmshealth.modal.frf.response_fit import (
 )
 from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
+from lmshealth.modal.targets import check_band
 from lmshealth.signal.segments import find_phases
 from lmshealth.signal.spectral_lines import Line, name_lines
 
@@ -103,12 +104,10 @@ def read_frf(
     source, response = _channel(log, input), _channel(log, output)
     if input == output:
         raise BadLog(log.name, "channel", f"{input} is both input and output; needed are two")
+    check_band(log, band)
     pair = _longest_segment(log, (source, response))
     rate, top = log.sample_rate, constants.USABLE * log.sample_rate
     low, high = band or (0.0, top)
-    if low >= top:
-        detail = f"{rate:g} Hz shows nothing above {top:.4g} Hz; the band begins at {low:g}"
-        raise BadLog(log.name, "sample-rate", detail)
     if impact or (impact is None and period is None):
         blows = find_hits(pair[0], rate, certain=not impact)
         if blows:

@@ -186,7 +186,8 @@ def from_measured(
         needed = f"needed {fewest} to {constants.FRF_MOST_LINES}"
         if not known:
             needed += f" ({constants.FRF_LINES} suffice with coherence and --averages)"
-        found = f"{response.output} has {f.size} lines in the band, {use.size} in all; {needed}"
+        where = f"in the band of {band[0]:g} to {band[1]:g} Hz"
+        found = f"{response.output} has {f.size} lines {where}, {use.size} in all; {needed}"
         raise BadLog(response.name, reason, f"{found}: choose another band, or measure more lines")
     noise, freedom = np.full(f.size, constants.UNKNOWN_NOISE * np.mean(np.abs(h) ** 2)), 0.0
     if known and averages is not None:

@@ -2,7 +2,6 @@
 
 import importlib.util
 import os
-import resource
 import signal
 from pathlib import Path
 
@@ -14,6 +13,9 @@ from hypothesis import strategies as st
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io.reading import read_log
+
+# Windows has no such measure of memory, and no alarm.
+resource = pytest.importorskip("resource")
 
 _SPEC = importlib.util.spec_from_file_location(
     "_writers", Path(__file__).parents[1] / "conftest.py"
