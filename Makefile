@@ -19,7 +19,7 @@ demo: .venv/installed
 # The picture in the README: a screenshot of the report of the demo.
 picture: .venv/installed
 	@test -d $(DEMO)/result || $(MAKE) demo
-	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
+	$(BIN)/python -m tests.tools.picture $(DEMO)/result
 
 # The notebooks with the results of their cells, as pages in demo/notebooks.
 notebooks: .venv/installed

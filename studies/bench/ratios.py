@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -10,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from studies.harness.study import STUDIES, Row
+from studies.harness.study import Row
 
 # Largest probability that a figure exactly on its bound counts as missed.
 FALSE_ALARM = 0.01
@@ -60,11 +59,3 @@ def table(rows: Mapping[str, Mapping[str, Any]]) -> Iterable[str]:
         numbers = "".join(f"{row[key]:>10.4g}" for key in ("ratio", "least", "largest", "at_most"))
         yield f"{name:<58}{numbers}{row['turns']:>7}{'  MISSED' if row['missed'] else ''}"
         yield f"    beside {row['peer']}"
-
-
-def recorded(study: str, *keys: str | int) -> Any:
-    """Look up what a study recorded."""
-    found: Any = json.loads((STUDIES / study).read_text(encoding="utf-8"))
-    for key in keys:
-        found = found[key]
-    return found

@@ -1,12 +1,10 @@
 """Is every figure of speed still met, relative to a peer or a lower bound in the same turn?
 
 Method
-    ``tests/bench`` with pytest-benchmark: identification, sampling, lives, remaining life,
-    tracking, reading, simulation, batches. Peer and program take turns in one process; the figure
-    is the median ratio of their processor times (wall times for workers). It is missed if more
-    turns exceed the bound than chance allows at 1 % for a median on the bound. A requirement in
-    seconds is expressed in times of the peer, as the study of that step recorded both. Figures
-    without an installed peer are left out.
+    ``tests/bench`` with pytest-benchmark: identification, sampling, lives, tracking, batches. Peer
+    and program take turns in one process; the figure is the median ratio of their processor times
+    (wall times for workers). It is missed if more turns exceed the bound than chance allows at 1 %
+    for a median on the bound. A requirement in seconds is expressed in times of the peer.
 Run time
     Ten minutes.
 """
@@ -27,7 +25,10 @@ from studies.harness.study import Row, Study
 STEP = "batch"
 
 ROOT = Path(__file__).parents[2]
-QUICK = "simulation"
+QUICK = "walker"
+# Recorded before reading and simulation were left out: `read_throughput` counts the processor time
+# of the process that reads for ours, and a simulation is no part of the method.
+LEFT_OUT = ("reading a minute", "a second of a simulated log")
 
 
 def main() -> None:
@@ -57,6 +58,8 @@ def main() -> None:
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim the cost of every step in times of a peer."""
     for name, row in answer["figures"].items():
+        if name.startswith(LEFT_OUT):
+            continue
         yield Claim(
             name,
             f"{number(row['ratio'])} times",

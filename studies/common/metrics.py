@@ -8,8 +8,7 @@ there: a count of what lies beyond cannot be computed, and to leave such lives o
 
 References
 ----------
-Saxena2008, Saxena2010 for α-λ accuracy and horizons, Gneiting2007 and Gneiting2011 for the score,
-Czado2009 for places, Clopper1934 for intervals of shares, Susto2015 for services.
+Gneiting2007 and Gneiting2011 for the score, Czado2009 for places, Clopper1934 for intervals of shares, Susto2015 for services.
 """
 
 from __future__ import annotations
@@ -19,61 +18,6 @@ from numpy.typing import ArrayLike
 from scipy.stats import beta as beta_distribution
 
 from lmshealth._arrays import BoolArray, FloatArray
-
-
-def mass_within(draws: FloatArray, truth: ArrayLike, margin: ArrayLike) -> FloatArray:
-    """Return the share of draws within a margin of the truth; of an infinite truth, of infinite."""
-    draws, truth = np.asarray(draws, float), np.asarray(truth, float)
-    with np.errstate(invalid="ignore"):  # infinite minus infinite
-        near = np.abs(draws - truth) <= np.asarray(margin, float)
-    return np.asarray(np.mean(np.where(np.isfinite(truth), near, draws == truth), axis=0))
-
-
-def within(
-    draws: FloatArray, truth: ArrayLike, margin: ArrayLike, *, mass: float | None = None
-) -> BoolArray:
-    """Return whether the median is within a margin of the truth, or a share ``mass`` of draws."""
-    if mass is None:
-        return np.asarray(mass_within(np.median(draws, axis=0)[None], truth, margin) == 1)
-    return np.asarray(mass_within(draws, truth, margin) >= mass)
-
-
-def alpha_lambda(
-    draws: FloatArray, truth: ArrayLike, alpha: float, *, mass: float | None = None
-) -> BoolArray:
-    """Return `within` for a margin that is the share α of the true remaining life."""
-    left = _left(truth)
-    return within(draws, left, alpha * left, mass=mass)
-
-
-def relative_accuracy(draws: FloatArray, truth: ArrayLike) -> FloatArray:
-    """Return one minus the relative error of the median: -inf where only the median is infinite."""
-    left, median = _left(truth), np.median(draws, axis=0)
-    with np.errstate(invalid="ignore"):
-        accuracy = 1 - np.abs(median - left) / left
-    # The limit for ever longer lives.
-    never = np.where(np.isfinite(median), 0.0, 1.0)
-    return np.asarray(np.where(np.isfinite(left), accuracy, never))
-
-
-def cumulative_relative_accuracy(
-    accuracy: FloatArray, weights: FloatArray | None = None
-) -> FloatArray:
-    """Average relative accuracies ``(n_moments, n)`` over the moments of prediction."""
-    return np.asarray(np.average(accuracy, axis=0, weights=weights))
-
-
-def prognostic_horizon(held: BoolArray, left: FloatArray) -> FloatArray:
-    """Return the remaining life from which on a criterion is met at all later moments.
-
-    ``held`` and ``left``, the true remaining life, have the shape ``(n_moments, n)``, in order of
-    time. The result is 0 where the last prediction misses. Saxena2010 count from the first moment
-    that meets the criterion; one that is met once by chance warns of nothing.
-    """
-    held, left = np.asarray(held, bool), np.asarray(left, float)
-    lasting = np.logical_and.accumulate(held[::-1], axis=0)[::-1]
-    first = np.take_along_axis(left, np.argmax(lasting, axis=0)[None], axis=0)[0]
-    return np.where(lasting.any(axis=0), first, 0.0)
 
 
 def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) -> FloatArray:
@@ -124,20 +68,3 @@ def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -
 def unexpected_breaks(service: FloatArray, truth: ArrayLike) -> BoolArray:
     """Return which lives end before their service."""
     return np.asarray(np.asarray(truth) < service)
-
-
-def unexploited_life(
-    service: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf
-) -> FloatArray:
-    """Return the life up to the horizon that a service discards; 0 where it ends before."""
-    return np.asarray(np.maximum(np.minimum(truth, horizon) - service, 0.0))
-
-
-def _left(truth: ArrayLike) -> FloatArray:
-    left = np.asarray(truth, float)
-    if not (left > 0).all():
-        raise ValueError(
-            f"remaining lives must be positive, got {left.min():g}: a share of what is left means "
-            "nothing once a life is over; leave such moments out"
-        )
-    return left

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from studies.read_throughput import samples
+from studies.common import samples
 
 Array = np.ndarray[Any, Any]
 

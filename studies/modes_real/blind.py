@@ -33,6 +33,7 @@ from lmshealth.io.log import Log
 from studies.blind_modes.peers import pyoma2, toolbox
 from studies.blind_modes.worlds import World
 from studies.common.cost import one_thread
+from studies.common.samples import MAPS
 from studies.harness.claims import Claim
 from studies.harness.study import Row, Study, real_data
 from studies.modes_real.sets import (
@@ -47,7 +48,6 @@ from studies.modes_real.sets import (
     WEIMAR_RATE,
     to_log,
 )
-from studies.read_throughput.samples import MAPS
 
 STEP = "identify"
 

@@ -16,8 +16,8 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Description, ModeSpec, Stage
+from studies.common.samples import MAPS
 from studies.harness.study import Row
-from studies.read_throughput.samples import MAPS
 
 Z95 = float(norm.isf(0.025))
 

@@ -18,7 +18,7 @@ import tempfile
 from importlib import import_module
 from pathlib import Path
 
-from studies.harness.checkout import checkout
+from studies.harness.checkout import ROOT, checkout
 from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
 from studies.outside_faults.case import Case, Program, Seen
@@ -26,7 +26,6 @@ from studies.outside_faults.case import Case, Program, Seen
 STEP = "read"
 SCRIPTS = ("run", "case", "figure")
 
-ROOT = Path(__file__).parents[2]
 # Modules beside this one, each with its CASES.
 KINDS = tuple(
     path.stem for path in sorted(Path(__file__).parent.glob("*.py")) if path.stem not in SCRIPTS
@@ -97,13 +96,15 @@ def claims(record: Row) -> list[Claim]:
     found = []
     for kind in KINDS:
         rows = [row for row in record["rows"] if row["kind"] == kind]
-        right, controls = (sum(row[key] for row in rows) for key in ("right_now", "control_right"))
+        right, before, controls = (
+            sum(row[key] for row in rows) for key in ("right_now", "right_before", "control_right")
+        )
         found.append(
             Claim(
                 f"faulty inputs answered right: {kind}",
                 f"{right} of {len(rows)}",
                 "",
-                f"{sum(row['right_before'] for row in rows)} before; controls {controls} of {len(rows)}",
+                f"{before} before; controls {controls} of {len(rows)}",
                 right == controls == len(rows),
             )
         )

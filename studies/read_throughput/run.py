@@ -38,10 +38,10 @@ from lmshealth.io.formats import isolation
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
 from studies.common.cost import cpu_s, in_own_process, in_turns
+from studies.common.samples import MAPS
 from studies.harness.claims import Claim, span
 from studies.harness.study import Row, Study, real_data
 from studies.read_throughput.files import BARE, RATE, signals, write
-from studies.read_throughput.samples import MAPS
 
 STEP = "read"
 _SHARED = "samples come from another process through shared pages, which takes 10 ms for a minute"

@@ -49,8 +49,3 @@ class Steps:
         now = self._clock()
         self.seconds[self._step] = self.seconds.get(self._step, 0.0) + now - self._since
         self._step, self._since = what, self._clock()
-
-
-def size_mb(folder: Path, pattern: str) -> float:
-    """Return the size of some files of a folder in MB."""
-    return sum(path.stat().st_size for path in folder.glob(pattern)) / 1e6

@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import numpy as np
 from scipy import stats
+from studies.readings.growth import COVERAGE, GRID, SIGNIFICANCE, fit, quantile
 
 from lmshealth.signal.acceleration_levels import choose_bands
-from studies.readings.growth import COVERAGE, GRID, SIGNIFICANCE, fit, quantile
 from tests.claims import Claims
 from tests.statistical.evidence import as_often
 
