@@ -17,15 +17,15 @@ import pytest
 
 import lmshealth
 from studies.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
-from studies.scale import speedup
+from studies.scale.speedup import judged
 
 pytestmark = pytest.mark.study
 PARTS = ("preload", "mount")
 
 
-def run_study(root: Path, name: str, part: str = "run") -> str:
-    """Run the quick form of a study, or of a part of it, in this process: most is then imported."""
-    study = import_module(f"studies.{name}.{part}")
+def run_study(root: Path, name: str) -> str:
+    """Run the quick form of a study in this process: most of what it needs is then imported."""
+    study = import_module(name)
     printed = io.StringIO()
     with (
         patch.object(sys, "argv", [study.__file__, "--quick"]),
@@ -38,7 +38,7 @@ def run_study(root: Path, name: str, part: str = "run") -> str:
 
 def test_foreign_files(root: Path) -> None:
     """Foreign files are read right or refused, and the comparison finds a reader that errs."""
-    answer = json.loads(run_study(root, "foreign_files"))
+    answer = json.loads(run_study(root, "studies.foreign_files.run"))
     assert all(answer["passed"].values())
     assert answer["control"]["wrong"] == answer["control"]["files"] > 0
 
@@ -46,7 +46,7 @@ def test_foreign_files(root: Path) -> None:
 def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     """Real records give what is known of them; what is not met is known to be."""
     needs("data")
-    answer = json.loads(run_study(root, "modes_real"))
+    answer = json.loads(run_study(root, "studies.modes_real.run"))
     failed = {name for name, held in answer["passed"].items() if not held}
     assert failed == set(answer["not_met"])
     assert answer["building"]["verdict"] == "healthy"
@@ -56,13 +56,13 @@ def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
 def test_modes_real_without_a_description(root: Path, needs: Callable[[str], None]) -> None:
     """A search without a description finds the known modes of real records."""
     needs("data")
-    answer = json.loads(run_study(root, "modes_real", "blind"))
+    answer = json.loads(run_study(root, "studies.modes_real.blind"))
     assert all(answer["passed"].values())
 
 
 def test_drawn_machines(root: Path) -> None:
     """Drawn machines are off the description, nominal ones are not; all questions have rows."""
-    answer = json.loads(run_study(root, "drawn_machines"))
+    answer = json.loads(run_study(root, "studies.drawn_machines.run"))
     healthy = answer["healthy"]
     assert healthy["drawn"]["doubt"]["hits"] > healthy["nominal"]["doubt"]["hits"] == 0
     assert healthy["nominal"]["alarm"]["hits"] == 0
@@ -76,7 +76,7 @@ def test_drawn_machines(root: Path) -> None:
 
 def test_blind_modes(root: Path) -> None:
     """Modes that nobody described are found, harmonics that wander are none, peaks fall short."""
-    families = json.loads(run_study(root, "blind_modes"))["families"].values()
+    families = json.loads(run_study(root, "studies.blind_modes.run"))["families"].values()
     assert sum(one["found"] for one in families) >= 0.97 * sum(one["there"] for one in families)
     assert not any(one["wandering_called_modes"] for one in families)
     controls = [one["others"]["peaks of single channels"] for one in families]
@@ -86,7 +86,7 @@ def test_blind_modes(root: Path) -> None:
 
 def test_tracking_filter(root: Path) -> None:
     """Errors of the filter are as large as it says, and its numbers are those of filterpy."""
-    answer = json.loads(run_study(root, "tracking_filter"))
+    answer = json.loads(run_study(root, "studies.tracking_filter.run"))
     assert all(answer["passed"].values())
     programs = {row["program"] for row in answer["speed"]["programs"]}
     # Peers are compared where they are installed.
@@ -95,7 +95,7 @@ def test_tracking_filter(root: Path) -> None:
 
 def test_three_methods(root: Path) -> None:
     """FRF, following error and accelerometers agree on guide modes, and controls do not."""
-    answer = json.loads(run_study(root, "three_methods"))
+    answer = json.loads(run_study(root, "studies.three_methods.run"))
     assert all(answer["passed"].values())
     pitch = answer["stages"]["lms-y"]["modes"]["pitch"]
     assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]
@@ -103,12 +103,12 @@ def test_three_methods(root: Path) -> None:
 
 def test_three_methods_with_friction(root: Path) -> None:
     """A sweep that turns the stage back has pitch too high; moving, or without friction, not."""
-    assert all(json.loads(run_study(root, "three_methods", "friction"))["passed"].values())
+    assert all(json.loads(run_study(root, "studies.three_methods.friction"))["passed"].values())
 
 
 def test_paper_tables(root: Path) -> None:
     """One seed gives most of the paper's tables, and constant velocity alone less."""
-    answer = json.loads(run_study(root, "paper_tables"))
+    answer = json.loads(run_study(root, "studies.paper_tables.run"))
 
     def hits(plant: str, summary: str, key: str) -> tuple[int, int]:
         found, count = answer[plant][summary][key].split(" of ")
@@ -128,19 +128,19 @@ def test_paper_tables(root: Path) -> None:
 
 def test_mislabelled_modes(root: Path) -> None:
     """No wrong name is published without a warning; the control publishes some."""
-    answer = json.loads(run_study(root, "mislabelled_modes"))
+    answer = json.loads(run_study(root, "studies.mislabelled_modes.run"))
     assert all(answer["passed"].values())
 
 
 def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
-    answer = json.loads(run_study(root, "line_test"))
+    answer = json.loads(run_study(root, "studies.line_test.run"))
     assert all(answer["passed"].values())
 
 
 def test_off_model(root: Path) -> None:
     """Two lives of some worlds raise no false alarm; without wander in the model they do."""
-    answer = json.loads(run_study(root, "off_model"))
+    answer = json.loads(run_study(root, "studies.off_model.run"))
     checks = answer["passed"]
     assert all(fine for name, fine in checks.items() if name.startswith("alarms"))
     assert checks["a loss of 5 % is found"]
@@ -149,7 +149,7 @@ def test_off_model(root: Path) -> None:
 
 def test_foreign_errors(root: Path) -> None:
     """Close modes are kept though errors are stated 8 times too wide; as stated they are lost."""
-    answer = json.loads(run_study(root, "off_model", "foreign"))
+    answer = json.loads(run_study(root, "studies.off_model.foreign"))
     checks = answer["passed"]
     assert checks["modes kept: 8.0"]
     assert checks["labels right: 8.0"]
@@ -181,7 +181,7 @@ def test_worlds_off_the_model_are_drawn_with_their_truth(name: str) -> None:
 
 def test_identification(root: Path) -> None:
     """Some records of three kinds are covered as stated, and no mode of them is refused."""
-    answer = json.loads(run_study(root, "identification"))
+    answer = json.loads(run_study(root, "studies.identification.run"))
     assert all(answer["passed"].values())
     assert not [line for line in answer["not_met"] if "refused" in line]
     # All errors together are as large as is said of them.
@@ -192,7 +192,7 @@ def test_identification(root: Path) -> None:
 
 def test_decays(root: Path) -> None:
     """Intervals of f and ζ from some decays cover, those of white noise less."""
-    answer = json.loads(run_study(root, "decays"))
+    answer = json.loads(run_study(root, "studies.decays.run"))
     assert all(answer["passed"].values())
     assert answer["machines"]["n_modes"] > sum(answer["machines"]["refused"].values())
     (case,) = answer["cases"].values()
@@ -207,7 +207,7 @@ def test_decays(root: Path) -> None:
 def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
     """A few seeds per case cover, and two real benches give what is known of them."""
     needs("data")
-    answer = json.loads(run_study(root, "frf_modes"))
+    answer = json.loads(run_study(root, "studies.frf_modes.run"))
     failed = {name for name, fine in answer["passed"].items() if not fine}
     assert failed <= set(answer["not_met"])
     # Intervals 1.5 times as narrow hold less, which so few seeds tell only all together.
@@ -220,14 +220,14 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_frf_lines(root: Path) -> None:
     """A mode with three lines is found, one with fewer is refused as that."""
-    answer = json.loads(run_study(root, "frf_lines"))
+    answer = json.loads(run_study(root, "studies.frf_lines.run"))
     assert all(answer["passed"].values())
     assert answer["found"]["n"] and answer["refused"]["n"]
 
 
 def test_single_logs(root: Path) -> None:
     """A few plain logs have no flag, most of an unsteady or coloured force have one."""
-    answer = json.loads(run_study(root, "single_logs"))
+    answer = json.loads(run_study(root, "studies.single_logs.run"))
     flagged = ("bursts", "log-normal", "ramp", "hump")
     assert answer["passed"]["no flag where the model holds"]
     assert all(answer["passed"][f"most modes have the flag, {world}"] for world in flagged)
@@ -235,7 +235,7 @@ def test_single_logs(root: Path) -> None:
 
 def test_impact_tests(root: Path) -> None:
     """Every double hit of a few tests is refused, no other blow is, and no mode is false."""
-    answer = json.loads(run_study(root, "impact_tests"))
+    answer = json.loads(run_study(root, "studies.impact_tests.run"))
     exact = ("no mode is false", "double hits", "no other blow is refused")
     assert all(answer["passed"][name] for name in exact)
     assert answer["double_hits"]["n"] and answer["found"]["hits"] > 5
@@ -243,7 +243,7 @@ def test_impact_tests(root: Path) -> None:
 
 def test_crossings(root: Path) -> None:
     """Some lives of each kind are never swapped silently, and both controls may be."""
-    answer = json.loads(run_study(root, "crossings"))
+    answer = json.loads(run_study(root, "studies.crossings.run"))
     few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
     assert all(fine for name, fine in answer["passed"].items() if name not in few)
     assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 2
@@ -252,13 +252,13 @@ def test_crossings(root: Path) -> None:
 def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
     """The tracked state of a real beam returns to its start, told and not told of the roller."""
     needs("data")
-    answer = json.loads(run_study(root, "beam_track"))
+    answer = json.loads(run_study(root, "studies.beam_track.run"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
 
 
 def test_detectability(root: Path) -> None:
     """The posterior finds planned losses, and hardly any of none; the mount of X is not shown."""
-    answer = json.loads(run_study(root, "detectability"))
+    answer = json.loads(run_study(root, "studies.detectability.run"))
     assert all(answer["passed"].values())
     # So few draws of a point tell only all together.
     planned = [row for row in answer["checks"] if row["arm"] == "as planned"]
@@ -273,7 +273,7 @@ def test_detectability(root: Path) -> None:
 def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     """A roller under a real beam is where the posterior says, and two wrong ways lose it."""
     needs("data")
-    answer = json.loads(run_study(root, "movable_roller"))
+    answer = json.loads(run_study(root, "studies.movable_roller.run"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
     assert answer["inside"]["inferred"] == 3
     (control,) = answer["controls"].values()
@@ -282,7 +282,7 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_sbc_epoch(root: Path) -> None:
     """Ranks of health at some epochs may be uniform; a map taken for exact covers much less."""
-    answer = json.loads(run_study(root, "sbc_epoch"))
+    answer = json.loads(run_study(root, "studies.sbc_epoch.run"))
     assert all(answer["passed"].values())
 
     def hits(kind: str) -> int:
@@ -294,7 +294,7 @@ def test_sbc_epoch(root: Path) -> None:
 
 def test_sbc_life(root: Path) -> None:
     """Ranks of health and remaining life are uniform; who takes every part to lose is found out."""
-    answer = json.loads(run_study(root, "sbc_life"))
+    answer = json.loads(run_study(root, "studies.sbc_life.run"))
     assert all(answer["passed"].values())
     assert answer["not_converged"] == 0
     # A part that keeps its health lies below all draws of who says that it cannot.
@@ -309,7 +309,7 @@ def test_sbc_life(root: Path) -> None:
 
 def test_cost_of_a_log(root: Path) -> None:
     """After a new log answers are those from nothing, and a machine without one costs nothing."""
-    passed = json.loads(run_study(root, "cost_of_a_log"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost_of_a_log.run"))["passed"]
     assert passed["epochs are those of a run from nothing"]
     assert passed["lives are those of a run from nothing"]
     assert passed["another life differs"]
@@ -318,14 +318,14 @@ def test_cost_of_a_log(root: Path) -> None:
 
 def test_cost_of_a_log_of_a_fleet(root: Path) -> None:
     """Nothing new costs nothing; lives by the prior of the fleet are those from nothing."""
-    passed = json.loads(run_study(root, "cost_of_a_log", "fleet"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost_of_a_log.fleet"))["passed"]
     names = ("nothing new", "some take the prior of the fleet", "lives are those from nothing")
     assert all(passed[name] for name in names)
 
 
 def test_blind_lives(root: Path) -> None:
     """A sound machine and one that is too young are told as such, and none as what it is not."""
-    answer = json.loads(run_study(root, "blind_lives"))
+    answer = json.loads(run_study(root, "studies.blind_lives.run"))
     assert all(answer["passed"].values())
     told = answer["verdicts"]["all"]
     # The third is of a drawn machine, from estimates.
@@ -336,7 +336,7 @@ def test_blind_lives(root: Path) -> None:
 
 def test_remaining_life_of_unknown_courses(root: Path) -> None:
     """Two lives that accelerate late are held; the named laws alone service both too late."""
-    answer = json.loads(run_study(root, "off_model", "remaining"))
+    answer = json.loads(run_study(root, "studies.off_model.remaining"))
     found = answer["courses"]["late"]["all"]
     assert found["n"] == 2
     assert (found["now"]["held"], found["now"]["late"]) == (2, 0)
@@ -345,26 +345,26 @@ def test_remaining_life_of_unknown_courses(root: Path) -> None:
 
 def test_one_guide(root: Path) -> None:
     """The preload of a shared guide is known better, and the mount of X is not claimed."""
-    answer = json.loads(run_study(root, "one_guide"))
+    answer = json.loads(run_study(root, "studies.one_guide.run"))
     assert all(answer["passed"].values())
 
 
 def test_errors_of_the_map(root: Path) -> None:
     """A mode that drifts by 30 % more is named with its size, and none with the exact map."""
-    worlds = json.loads(run_study(root, "off_model", "map_errors"))["worlds"]
+    worlds = json.loads(run_study(root, "studies.off_model.map_errors"))["worlds"]
     assert (worlds["exact"]["n"], worlds["exact"]["warned"]) == (1, 0)
     assert (worlds["pitch"]["n"], worlds["pitch"]["named"]) == (1, 1)
 
 
 def test_calibration_by_ended_lives(root: Path) -> None:
     """A fleet with one ended life and one machine is predicted, and too small to be judged."""
-    answer = json.loads(run_study(root, "fleet_prior", "conformal"))
+    answer = json.loads(run_study(root, "studies.fleet_prior.conformal"))
     assert (answer["ended"], answer["running"], "ways" in answer) == (1, 1, False)
 
 
 def test_fleet_prior(root: Path) -> None:
     """What a fleet teaches is nearer to what can be known; what another fleet teaches is not."""
-    answer = json.loads(run_study(root, "fleet_prior"))
+    answer = json.loads(run_study(root, "studies.fleet_prior.run"))
     assert all(answer["passed"].values())
     lost = {way: found["lost_km"][0] for way, found in answer["ways"].items()}
     assert lost["known"] == 0
@@ -375,7 +375,7 @@ def test_fleet_prior(root: Path) -> None:
 def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
     """A batch whose run is killed ends as if uninterrupted, and a wrong one is seen."""
     needs("postgres")
-    answer = json.loads(run_study(root, "faults", "kills"))
+    answer = json.loads(run_study(root, "studies.faults.kills"))
     assert all(answer["passed"].values())
     assert {kind: found["how"] for kind, found in answer["kills"].items()} == {
         "postgres": {"main": 1}
@@ -385,7 +385,7 @@ def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
 def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
     """A full disk and a lost database are told in one line, and nothing is lost by them."""
     needs("postgres")
-    answer = json.loads(run_study(root, "faults", "losses"))
+    answer = json.loads(run_study(root, "studies.faults.losses"))
     assert all(answer["passed"].values())
     assert answer["lost database"]["failed"] == 1
     # Not every place lets a file system be made.
@@ -394,7 +394,7 @@ def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_bad_inputs_damaged(root: Path) -> None:
     """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
-    answer = json.loads(run_study(root, "bad_inputs", "damaged"))
+    answer = json.loads(run_study(root, "studies.bad_inputs.damaged"))
     assert all(answer["passed"].values())
     assert answer["good_analysed"] == answer["good"] == 8
     assert answer["damaged_told_right"] == answer["damaged"] > 12
@@ -402,20 +402,20 @@ def test_bad_inputs_damaged(root: Path) -> None:
 
 def test_bad_inputs_time_axes(root: Path) -> None:
     """Of some odd time axes and degenerate sets none is wrong unnamed, and unchecked ones are."""
-    answer = json.loads(run_study(root, "bad_inputs", "time_axes"))
+    answer = json.loads(run_study(root, "studies.bad_inputs.time_axes"))
     assert all(answer["passed"].values())
     assert answer["sets_named_right"] == answer["sets"] >= 2
 
 
 def test_bad_inputs_channels(root: Path) -> None:
     """A log of many channels stays within bounds, and a wrong rate is seen."""
-    answer = json.loads(run_study(root, "bad_inputs", "channels"))
+    answer = json.loads(run_study(root, "studies.bad_inputs.channels"))
     assert all(answer["passed"].values())
 
 
 def test_scale_speedup(root: Path) -> None:
     """One and two workers of this machine are timed beside bare processes."""
-    answer = json.loads(run_study(root, "scale", "speedup"))
+    answer = json.loads(run_study(root, "studies.scale.speedup"))
     # A log takes the main process some milliseconds, and workers find many in a second.
     assert 0 < answer["serial_ms"]["local"][1] < 1e3
     assert answer["rate"]["local"] > 0
@@ -430,10 +430,10 @@ def test_the_model_of_scale_speedup(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {n: own / (1 + serial_ms / log_ms) for n, own in bound.items()} | {"1": 10.0}
     turn: dict[str, Any] = {"bound": bound, "local": rates, "scheduler_ms": {}}
     turn["serial_ms"] = {"local": {"2": serial_ms, "4": serial_ms}}
-    found = speedup.judged([turn], ("local",))
+    found = judged([turn], ("local",))
     assert found["model"]["local"] == {"2": 1.863, "4": 1.961}
     assert found["passed"]["local: model of 2"]
     assert found["passed"]["local: model of 4"]
     assert not found["passed"]["local: at most 1 ms per log"]
     slow = turn | {"local": rates | {"4": 14.0}}
-    assert not speedup.judged([slow], ("local",))["passed"]["local: model of 4"]
+    assert not judged([slow], ("local",))["passed"]["local: model of 4"]

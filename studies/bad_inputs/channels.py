@@ -36,8 +36,6 @@ from studies.common.cost import memory_bytes, one_thread
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
-STEP = "batch"
-
 MODES, DAMPING, NOISE = {"roll": 126.4, "pitch": 136.6, "yaw": 154.9}, 0.012, 0.3
 MOST_MB, MOST_S, MOST_SIGMA = 1000.0, 30.0, 4.0
 # Format, channels, rate in Hz, seconds, options of the command.

@@ -36,8 +36,6 @@ from studies.bad_inputs.logfiles import MACHINES, SUFFIXES
 from studies.harness.claims import Claim, controls_seen, counted
 from studies.harness.study import Row, Study
 
-STEP = "batch"
-
 N_GOOD, N_GOOD_QUICK, N_BASES = 1000, 8, 4
 _SEED = 20261122
 # Of the quick form: every so many of the kinds, each in one format, without those that swell, and

@@ -44,7 +44,6 @@ from studies.harness.study import Row, Study
 Floats = NDArray[np.float64]
 Rng = np.random.Generator
 
-STEP = "batch"
 
 RATE, N, BASE = 500.0, 12_000, 4000.0
 N_EACH, N_SETS, N_QUICK, QUICK_KINDS = 8, 10, 1, 5

@@ -36,8 +36,6 @@ from studies.decays.beam import BEAM, REPEATS, one_beam
 from studies.harness.claims import Claim, counted, span
 from studies.harness.study import Row, Study, real_data
 
-STEP = "track"
-
 BEGIN = datetime(2026, 1, 1, tzinfo=UTC)
 SECONDS_A_DWELL = 1.2
 # ln f rises by a quarter per volt, and not quite in a straight line.

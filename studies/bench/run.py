@@ -19,12 +19,10 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from studies.harness.checkout import ROOT
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
-STEP = "batch"
-
-ROOT = Path(__file__).parents[2]
 QUICK = "walker"
 # Recorded before reading and simulation were left out: `read_throughput` counts the processor time
 # of the process that reads for ours, and a simulation is no part of the method.

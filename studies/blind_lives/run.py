@@ -50,7 +50,6 @@ from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, number, share
 from studies.harness.study import LEVEL, Row, Study, read_record
 
-STEP = "all of it, from raw logs to the report"
 NAMES = {
     "guide_preload": "preload",
     "mount_stiffness": "mount stiffness",

@@ -38,8 +38,6 @@ from studies.common.metrics import clopper_pearson
 from studies.harness.claims import Claim, span
 from studies.harness.study import Study, judge_scores
 
-STEP = "identify"
-
 # Records of each family, and those on which peers run, too.
 SEEDS = {"four modes": 64, "varied": 64, "eight modes": 40, "turbine": 16}
 PEER_SEEDS = {"four modes": 16, "varied": 16, "eight modes": 6, "turbine": 2}

@@ -8,7 +8,8 @@ there: a count of what lies beyond cannot be computed, and to leave such lives o
 
 References
 ----------
-Gneiting2007 and Gneiting2011 for the score, Czado2009 for places, Clopper1934 for intervals of shares, Susto2015 for services.
+Gneiting2007 and Gneiting2011 for the score, Czado2009 for places, Clopper1934 for intervals of
+shares, Susto2015 for services.
 """
 
 from __future__ import annotations

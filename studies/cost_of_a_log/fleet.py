@@ -45,8 +45,6 @@ from studies.harness.command_line import no_pictures, quick_posteriors
 from studies.harness.study import Row, Study
 from studies.scale.archive import Steps
 
-STEP = "batch"
-
 KINDS = ("healthy", "both", "temperature-only")
 MACHINES, LOGS, QUICK_MACHINES, QUICK_LOGS = 12, 60, 4, 5
 WORKERS, FLEET = 2, 1000

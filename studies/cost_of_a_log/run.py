@@ -37,7 +37,6 @@ from studies.cost_of_a_log.life import NAME, SEED
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
-STEP = "batch"
 LENGTHS, QUICK_LENGTHS = (60, 600, 6000), (8,)
 # Asked: s of processor time of a new log and of a first run of 60 logs; growth; memory in MB.
 MOST_NEW, MOST_FIRST, MOST_GROWTH, MOST_MB = 5.0, 45.0, 1.5, 350.0

@@ -42,8 +42,6 @@ from studies.decays.cases import CASES, QUIET, RATE, Case, one_machine, simulate
 from studies.harness.claims import Claim, percents, span
 from studies.harness.study import Row, Study, Trials
 
-STEP = "identify, after stops"
-
 LEVEL, Z = 0.999, 1.959963984540054
 NOMINAL = 0.95
 # Factors on the intervals: the second and third are negative controls.

@@ -42,7 +42,6 @@ from studies.common.lives import Array, identified, life_of, rng_of
 from studies.harness.claims import Claim, covered, percents, span
 from studies.harness.study import Row, Study, judge_coverage
 
-STEP = "plan"
 SHORT, LONG = (1, 20.0), (20, 300.0)  # logs, and seconds of each
 
 POWER, FALSE_ALARM = 0.95, 0.01

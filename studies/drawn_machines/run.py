@@ -49,8 +49,6 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.provenance import code_of
 from studies.harness.study import Row, Study, judge_places, judge_scores, share_row
 
-STEP = "health, on machines outside the model"
-
 FIRST_SEED = 1000
 # Machines with all answers, healthy ones, per circumstance, raw, of the control; logs; raw logs.
 FULL = {"machines": 100, "healthy": 60, "each": 15, "raw": 8, "control": 16,

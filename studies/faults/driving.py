@@ -26,6 +26,7 @@ import numpy as np
 from scipy.signal import lfilter
 from sqlalchemy import create_engine, inspect, make_url, text
 
+from studies.harness.checkout import ROOT
 from studies.harness.command_line import call_here
 from studies.harness.servers import MARK, Popen, marked, missing_postgres, postgres
 
@@ -56,7 +57,7 @@ class Run:
             signal.signal(signal.SIGINT, signal.default_int_handler)
         self._process: Popen = subprocess.Popen(
             command, stdout=subprocess.DEVNULL, stderr=self._messages, start_new_session=True,
-            env={**os.environ, MARK: self.mark}, cwd=Path(__file__).parents[2],
+            env={**os.environ, MARK: self.mark}, cwd=ROOT,
         )  # fmt: skip
 
     def status(self, within_s: float = LONG_S) -> int | None:

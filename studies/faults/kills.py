@@ -33,8 +33,6 @@ from studies.faults.driving import Reference, Stores, one_line
 from studies.harness.claims import Claim, controls_seen
 from studies.harness.study import Row, Study
 
-STEP = "batch"
-
 SEED = 20261122
 HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15}
 # Number of kills, mean number in the time that a run takes, and shares of their kinds.

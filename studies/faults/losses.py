@@ -31,8 +31,6 @@ from studies.harness.claims import Claim
 from studies.harness.servers import missing_postgres, postgres
 from studies.harness.study import Row, Study
 
-STEP = "batch"
-
 SEED = 20261122
 MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 4}
 # Fractions of the space that output, and store where it is there too, need.

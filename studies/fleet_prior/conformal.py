@@ -47,7 +47,6 @@ from studies.harness.study import Row, Study
 from studies.off_model.remaining import course
 from studies.off_model.worlds import LN_F, LN_ZETA, MODES, STD_F, STD_ZETA, Array
 
-STEP = "prognose, young machines"
 SEED = 20261125
 FLEETS, N_ENDED, N_RUNNING = 2, 9, 8
 LOGS_ENDED, LOGS_RUNNING = 16, 12

@@ -39,8 +39,6 @@ from studies.foreign_files.writers import WRITERS, Held
 from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study
 
-STEP = "read"
-
 N_EACH, N_FUZZ, N_CONTROL = 12, 2000, 400
 BLOCK = 100
 # Files that have two readings, or hold no log: content, and what the refusal must name.

@@ -25,8 +25,6 @@ from studies.frf_modes.records import BAND, RATE, Machine, multisine
 from studies.harness.claims import Claim, counted, covered
 from studies.harness.study import Row, Study, judge_scores
 
-STEP = "identify FRF logs"
-
 SPACINGS = (0.5, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 8.0)  # Hz
 DAMPINGS = (0.005, 0.01, 0.02, 0.03, 0.05)
 LINES, BANDWIDTHS = 3, 3  # what is asked for

@@ -45,8 +45,6 @@ from studies.frf_modes.records import Array, Machine
 from studies.harness.claims import Claim, covered, number, percents, span
 from studies.harness.study import Row, Study, judge_scores, real_data
 
-STEP = "identify FRF logs"
-
 NOT_MET = {
     "both modes always": "one of 400 records of the distorting motor gives another number of them",
     "wide sweeps: z below 2 on average": "in X modes too weak to be seen bias pitch: give a band",

@@ -29,8 +29,6 @@ from studies.harness.claims import Claim, counted, covered
 from studies.harness.study import Row, Study, judge_scores
 from studies.impact_tests.hammer import RATE, Array, Hammer, strike
 
-STEP = "identify FRF logs"
-
 BAND = (20.0, 500.0)
 DAMPING, FREQUENCY = (0.003, 0.05), (30.0, 400.0)
 LEFT = 0.3  # most of a decay that is left at the next blow

@@ -42,8 +42,6 @@ from studies.line_test.signals import (
     tested,
 )
 
-STEP = "lines"
-
 DECLARED = (0.05, 0.01, 0.001)
 RESONANT = {share: resonances(share / 100, 40) for share in (2, 0.5, 0.2)}
 KINDS = {f"resonances of {share:g} %": density for share, density in RESONANT.items()}

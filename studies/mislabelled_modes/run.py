@@ -28,14 +28,8 @@ from lmshealth.modal.modes import Modes
 from lmshealth.modal.naming import compare
 from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.common.logs import make_log
-from studies.harness.claims import Claim, Older, counted
+from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study
-
-STEP = "identify"
-
-OLDER = {
-    "result": Older("cd08d25c991b", "modes were averaged over coloured forces"),
-}
 
 Array = NDArray[np.float64]
 

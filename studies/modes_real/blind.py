@@ -49,8 +49,6 @@ from studies.modes_real.sets import (
     to_log,
 )
 
-STEP = "identify"
-
 HALF_HOUR, BUILDING_RATE, BUILDING = 180_000, 100.0, (1.882, 2.422, 2.687)
 
 # Name, log, band, known frequencies and tolerances in Hz, and whether nothing else is there.

@@ -36,8 +36,6 @@ from studies.harness.command_line import call
 from studies.harness.study import Row, Study, read_record, real_data
 from studies.movable_roller import roller
 
-STEP = "infer"
-
 NEW = 2  # the repeat that map and description do not know
 LEAST_INSIDE = 8
 ALL_EPOCHS, QUICK_EPOCHS = 40, 3  # more than there are, and few

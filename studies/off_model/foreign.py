@@ -42,9 +42,6 @@ from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import Array
 
-STEP = "track"
-
-
 SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50
 FACTORS = (0.25, 1.0, 4.0, 8.0, 15.0)
 NAMES = ("unnamed", "named", "named and described", "described")

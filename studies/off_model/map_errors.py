@@ -30,7 +30,6 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.study import Row, Study
 from studies.off_model.worlds import LN_F, LN_ZETA, MODES, STD_F, STD_ZETA
 
-STEP = "prognose"
 SEED, N_LOGS, LENGTH_M = 20261126, 20, 2e6
 N_EXACT, N_WRONG, SIZE = 60, 12, 0.3
 MOST_FALSE, LEAST_NAMED = 0.02, 0.8

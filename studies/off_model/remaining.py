@@ -41,8 +41,6 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.study import Row, Study
 from studies.off_model.worlds import LN_F, LN_ZETA, LOST_AT_LIMIT, MODES, STD_F, STD_ZETA, Array
 
-STEP = "prognose"
-
 SEED, N_LIVES, N_LOGS = 20261123, 60, 40
 SHARES, MAIN = (0.5, 0.7, 0.9), 0.7
 BROKEN, RIGHT = ("late", "bathtub", "onset"), ("linear", "power")

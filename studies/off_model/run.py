@@ -39,8 +39,6 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.study import Row, Study, share_row
 from studies.off_model.worlds import COURSES, DISTURBANCES, MODES, Array, life_of
 
-STEP = "track"
-
 LIVES, QUICK_LIVES = 100, 2
 LOSING = ", losing 5 %"
 # Worlds that lose 5 % of preload: what detection costs, and whether drifts are held.

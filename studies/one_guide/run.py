@@ -8,10 +8,6 @@ Method
     of 50 and 90 % intervals (99.9 % Clopper-Pearson), the width of the 90 % interval of the
     preload, and how often a parameter is claimed as determined. Controls that must fail: two guides
     whose preloads are drawn apart taken for one; intervals of the preload of half the width.
-Answer
-    Both together determine the preload twice as well as Y alone; the mount of Y then to 4.1 instead
-    of 5.6 %. The lowest coverage, of the preload's 50 % interval from X, is 37 %. The mount of X is
-    never claimed: its interval of 76 % is four fifths of its prior's.
 Run time
     A quarter of an hour of one processor.
 """
@@ -31,15 +27,9 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.read_tables import Drifts
 from models.dynamics.modal_map import guide_frequencies
 from models.dynamics.stages import stage_named
-from studies.harness.claims import Claim, Older, at_level, covered, percents
+from studies.harness.claims import Claim, at_level, covered, percents
 from studies.harness.command_line import short_chains
 from studies.harness.study import Row, Study, judge_places
-
-STEP = "infer"
-
-OLDER = {
-    "result": Older("bc0037068c58", "a map could be wrong by more than it declares"),
-}
 
 Array = NDArray[np.float64]
 SEED = 20261123

@@ -23,7 +23,6 @@ from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
 from studies.outside_faults.case import Case, Program, Seen
 
-STEP = "read"
 SCRIPTS = ("run", "case", "figure")
 
 # Modules beside this one, each with its CASES.

@@ -28,7 +28,6 @@ from studies.harness.claims import Claim, percents
 from studies.harness.study import Row, Study
 from studies.paper_tables import tables
 
-STEP = "simulated plants"
 COUNTS = {
     "table_3_std_within_1.5": "standard deviations of Δe within a factor 1.5 (Table 3)",
     "table_4_max_magnitude_within_1.5": "largest harmonics within a factor 1.5 (Table 4)",

@@ -43,7 +43,6 @@ from studies.harness.claims import Claim, span
 from studies.harness.study import Row, Study, real_data
 from studies.read_throughput.files import BARE, RATE, signals, write
 
-STEP = "read"
 _SHARED = "samples come from another process through shared pages, which takes 10 ms for a minute"
 NOT_MET = dict.fromkeys(("log.h5", "log.tdms", "plain.mat", "packed.mat"), _SHARED)
 

@@ -13,9 +13,6 @@ Method
     Controls that must fail: half of all covariances is stated, those of the drifts and of the map's
     error; a map is taken as exact that is wrong by 5 %. Beside them: half of the covariance of the
     drifts alone.
-Answer
-    Yes. Half the covariance of the drifts alone is not detected in 1,000 lives: of what is unknown
-    after so many logs most is the error of the map.
 Run time
     Of one processor some 25 lives a second, and a second for each of the chains of `infer`.
     The recorded time is that after an interruption.
@@ -37,15 +34,9 @@ from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, thinned, uniform
-from studies.harness.claims import Claim, Older, ranked
+from studies.harness.claims import Claim, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import Life, believing, draw
-
-STEP = "infer"
-
-OLDER = {
-    "result": Older("8c3cb6ca9f93", "a map could be wrong by more than it declares"),
-}
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")

@@ -16,10 +16,6 @@ Method
     are compared with the simultaneous band of their distribution at 99.9 %, coverages with their
     99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as exact that is wrong by
     5 %; every parameter taken to degrade, while half of them do not.
-Answer
-    Yes. All eight ranks stay inside their bands, and a parameter degrades as often as its posterior
-    states. Run with the code before jumps were separated from logs at the same odometer, which
-    these lives do not have, and before a linear law could gain.
 Run time
     Of one processor one to two seconds a life, eight after a jump, five to thirty for chains.
     The recorded time is that after an interruption.
@@ -39,19 +35,10 @@ from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import parameters_with_limit, passages
 from lmshealth.stage.description import Stage, load_stage
 from studies.common.ranks import N_DRAWS, Array, bands, judge, rank, uniform
-from studies.harness.claims import Claim, Older, ranked
+from studies.harness.claims import Claim, ranked
 from studies.harness.study import Row, Study
 from studies.sbc_epoch.lives import believing
 from studies.sbc_life.lives import Life, draw
-
-STEP = "prognose"
-OLDER = {
-    "result": Older(
-        "f293e059ff09",
-        "jumps were parted from logs at the same odometer, which its lives have not, and a linear "
-        "law could gain",
-    )
-}
 
 SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"

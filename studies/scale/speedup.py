@@ -36,7 +36,6 @@ from studies.harness.servers import dask_cluster, postgres
 from studies.harness.study import Row, Study, spawn_pool
 from studies.scale.archive import make_archive
 
-STEP = "batch"
 _OVERLAP = (
     "the bound by bare processes differed by a quarter between the turns, on a shared machine"
 )

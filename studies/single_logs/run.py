@@ -36,8 +36,6 @@ from studies.harness.claims import Claim, percents, span
 from studies.harness.study import Row, Study, judge_scores
 from studies.single_logs.worlds import LOGS_OF_MACHINE, WORLDS, draw_machine, record
 
-STEP = "identify"
-
 LOGS, QUICK_LOGS = 150, 5
 LEAST, WIDEST = 0.90, 1.25
 NOT_MET = {

@@ -53,8 +53,6 @@ from studies.three_methods.run import (
     logged,
 )
 
-STEP = "simulated plants"
-
 # The description of the rigid stage: its guide modes are those of the full one within 0.03 %.
 STAGE, DESCRIBED, MODE = "lms-y-full", "lms-y", "pitch"
 FRICTION = {

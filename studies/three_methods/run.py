@@ -42,8 +42,6 @@ from studies.common.cost import one_thread
 from studies.harness.claims import Claim, number
 from studies.harness.study import Row, Study
 
-STEP = "simulated plants"
-
 SECONDS = 20.0
 # All of the travel at 10 mm/s, four periods long, around the guide modes; the amplitude is near
 # the largest at which the platform never turns back.

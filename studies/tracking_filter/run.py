@@ -39,8 +39,6 @@ from studies.tracking_filter.lives import stage
 from studies.tracking_filter.peers import deviation, speed
 from studies.tracking_filter.trials import averaged, known_setting, two_sources
 
-STEP = "track"
-
 SEED = 20260401
 # Largest differences from filterpy and from others, in standard deviations.
 SAME, SAME_AS_PEERS = 1e-9, 1e-6

@@ -3,11 +3,12 @@
 ``python -m tests.tools.same_numbers --before REVISION`` checks the earlier revision out into a
 temporary worktree. Its simulated stages write a life of logs with all their faults, an FRF log and
 a log with stops. Then both revisions run the same commands on the same files: `run` with its
-tables, `modes` (ambient, found without a description, after stops), `spectrum`, `error`, `frf`, `track` and
-`infer` and `prognose` from a table of another program, `stage`, `plan`, and those of the simulated
-stages. Every cell of every table and every number of every JSON answer is compared: numbers to 1e-9
-relative, texts to the letter. Where wording was changed on purpose, texts are counted and are no
-difference. It takes about 10 minutes for both revisions; ``--quick`` takes a twelfth of the logs.
+tables, `modes` (ambient, found without a description, after stops), `spectrum`, `error`, `frf`,
+`track` and `infer` and `prognose` from a table of another program, `stage`, `plan`, and those of
+the simulated stages. Every cell of every table and every number of every JSON answer is compared:
+numbers to 1e-9 relative, texts to the letter. Where wording was changed on purpose, texts are
+counted and are no difference. It takes about 10 minutes for both revisions; ``--quick`` takes a
+twelfth of the logs.
 """
 
 from __future__ import annotations
