@@ -65,14 +65,14 @@ coverage: .venv/installed
 statistics: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m statistical
 
-# Speed of every step relative to a peer, recorded in studies/bench/result.json.
+# Speed of every step relative to a peer, recorded in studies/cost/ratios/result.json.
 bench: .venv/installed
-	$(BIN)/python -m studies.bench.run
+	$(BIN)/python -m studies.cost.ratios.run
 
 # Damaged files of all formats, from another seed each time; what fails is kept and named.
 fuzz: .venv/installed
 	LMSHEALTH_FUZZ_EXAMPLES=$$(( 5 * $(SECONDS) )) $(BIN)/pytest -q -m slow tests/io/formats/test_fuzz.py
-	$(BIN)/python -m studies.bad_inputs.mutants --seconds $(SECONDS)
+	$(BIN)/python -m studies.inputs.damaged.mutants --seconds $(SECONDS)
 
 # Fast tests on other Pythons, lowest dependencies, kernels and threads, as far as they are here.
 compat: .venv/installed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.bench.ratios import FALSE_ALARM, Figure, table
+from studies.cost.ratios.ratios import FALSE_ALARM, Figure, table
 
 
 def figure(ratios: np.ndarray, at_most: float = 1.0) -> Figure:

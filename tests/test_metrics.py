@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.common.metrics import (
+from studies.harness.metrics import (
     clopper_pearson,
     crps,
     place,

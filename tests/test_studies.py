@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 import lmshealth
-from studies.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
-from studies.scale.speedup import judged
+from studies.cost.workers import judged
+from studies.robustness.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
 pytestmark = pytest.mark.study
 PARTS = ("preload", "mount")
@@ -38,7 +38,7 @@ def run_study(root: Path, name: str) -> str:
 
 def test_foreign_files(root: Path) -> None:
     """Foreign files are read right or refused, and the comparison finds a reader that errs."""
-    answer = json.loads(run_study(root, "studies.foreign_files.run"))
+    answer = json.loads(run_study(root, "studies.inputs.foreign_files.run"))
     assert all(answer["passed"].values())
     assert answer["control"]["wrong"] == answer["control"]["files"] > 0
 
@@ -46,7 +46,7 @@ def test_foreign_files(root: Path) -> None:
 def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     """Real records give what is known of them; what is not met is known to be."""
     needs("data")
-    answer = json.loads(run_study(root, "studies.modes_real.run"))
+    answer = json.loads(run_study(root, "studies.modes.real.run"))
     failed = {name for name, held in answer["passed"].items() if not held}
     assert failed == set(answer["not_met"])
     assert answer["building"]["verdict"] == "healthy"
@@ -56,13 +56,13 @@ def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
 def test_modes_real_without_a_description(root: Path, needs: Callable[[str], None]) -> None:
     """A search without a description finds the known modes of real records."""
     needs("data")
-    answer = json.loads(run_study(root, "studies.modes_real.blind"))
+    answer = json.loads(run_study(root, "studies.modes.real.blind"))
     assert all(answer["passed"].values())
 
 
 def test_drawn_machines(root: Path) -> None:
     """Drawn machines are off the description, nominal ones are not; all questions have rows."""
-    answer = json.loads(run_study(root, "studies.drawn_machines.run"))
+    answer = json.loads(run_study(root, "studies.robustness.drawn_machines.run"))
     healthy = answer["healthy"]
     assert healthy["drawn"]["doubt"]["hits"] > healthy["nominal"]["doubt"]["hits"] == 0
     assert healthy["nominal"]["alarm"]["hits"] == 0
@@ -76,7 +76,9 @@ def test_drawn_machines(root: Path) -> None:
 
 def test_blind_modes(root: Path) -> None:
     """Modes that nobody described are found, harmonics that wander are none, peaks fall short."""
-    families = json.loads(run_study(root, "studies.blind_modes.run"))["families"].values()
+    families = json.loads(run_study(root, "studies.modes.without_description.run"))[
+        "families"
+    ].values()
     assert sum(one["found"] for one in families) >= 0.97 * sum(one["there"] for one in families)
     assert not any(one["wandering_called_modes"] for one in families)
     controls = [one["others"]["peaks of single channels"] for one in families]
@@ -86,7 +88,7 @@ def test_blind_modes(root: Path) -> None:
 
 def test_tracking_filter(root: Path) -> None:
     """Errors of the filter are as large as it says, and its numbers are those of filterpy."""
-    answer = json.loads(run_study(root, "studies.tracking_filter.run"))
+    answer = json.loads(run_study(root, "studies.track.filter.run"))
     assert all(answer["passed"].values())
     programs = {row["program"] for row in answer["speed"]["programs"]}
     # Peers are compared where they are installed.
@@ -95,7 +97,7 @@ def test_tracking_filter(root: Path) -> None:
 
 def test_three_methods(root: Path) -> None:
     """FRF, following error and accelerometers agree on guide modes, and controls do not."""
-    answer = json.loads(run_study(root, "studies.three_methods.run"))
+    answer = json.loads(run_study(root, "studies.paper.three_methods.run"))
     assert all(answer["passed"].values())
     pitch = answer["stages"]["lms-y"]["modes"]["pitch"]
     assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]
@@ -103,12 +105,14 @@ def test_three_methods(root: Path) -> None:
 
 def test_three_methods_with_friction(root: Path) -> None:
     """A sweep that turns the stage back has pitch too high; moving, or without friction, not."""
-    assert all(json.loads(run_study(root, "studies.three_methods.friction"))["passed"].values())
+    assert all(
+        json.loads(run_study(root, "studies.paper.three_methods.friction"))["passed"].values()
+    )
 
 
 def test_paper_tables(root: Path) -> None:
     """One seed gives most of the paper's tables, and constant velocity alone less."""
-    answer = json.loads(run_study(root, "studies.paper_tables.run"))
+    answer = json.loads(run_study(root, "studies.paper.tables.run"))
 
     def hits(plant: str, summary: str, key: str) -> tuple[int, int]:
         found, count = answer[plant][summary][key].split(" of ")
@@ -128,19 +132,19 @@ def test_paper_tables(root: Path) -> None:
 
 def test_mislabelled_modes(root: Path) -> None:
     """No wrong name is published without a warning; the control publishes some."""
-    answer = json.loads(run_study(root, "studies.mislabelled_modes.run"))
+    answer = json.loads(run_study(root, "studies.modes.wrong_descriptions"))
     assert all(answer["passed"].values())
 
 
 def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
-    answer = json.loads(run_study(root, "studies.line_test.run"))
+    answer = json.loads(run_study(root, "studies.modes.lines.run"))
     assert all(answer["passed"].values())
 
 
 def test_off_model(root: Path) -> None:
     """Two lives of some worlds raise no false alarm; without wander in the model they do."""
-    answer = json.loads(run_study(root, "studies.off_model.run"))
+    answer = json.loads(run_study(root, "studies.robustness.off_model.run"))
     checks = answer["passed"]
     assert all(fine for name, fine in checks.items() if name.startswith("alarms"))
     assert checks["a loss of 5 % is found"]
@@ -149,7 +153,7 @@ def test_off_model(root: Path) -> None:
 
 def test_foreign_errors(root: Path) -> None:
     """Close modes are kept though errors are stated 8 times too wide; as stated they are lost."""
-    answer = json.loads(run_study(root, "studies.off_model.foreign"))
+    answer = json.loads(run_study(root, "studies.robustness.off_model.foreign"))
     checks = answer["passed"]
     assert checks["modes kept: 8.0"]
     assert checks["labels right: 8.0"]
@@ -181,7 +185,7 @@ def test_worlds_off_the_model_are_drawn_with_their_truth(name: str) -> None:
 
 def test_identification(root: Path) -> None:
     """Some records of three kinds are covered as stated, and no mode of them is refused."""
-    answer = json.loads(run_study(root, "studies.identification.run"))
+    answer = json.loads(run_study(root, "studies.modes.identification.run"))
     assert all(answer["passed"].values())
     assert not [line for line in answer["not_met"] if "refused" in line]
     # All errors together are as large as is said of them.
@@ -192,7 +196,7 @@ def test_identification(root: Path) -> None:
 
 def test_decays(root: Path) -> None:
     """Intervals of f and ζ from some decays cover, those of white noise less."""
-    answer = json.loads(run_study(root, "studies.decays.run"))
+    answer = json.loads(run_study(root, "studies.modes.decays.run"))
     assert all(answer["passed"].values())
     assert answer["machines"]["n_modes"] > sum(answer["machines"]["refused"].values())
     (case,) = answer["cases"].values()
@@ -207,7 +211,7 @@ def test_decays(root: Path) -> None:
 def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
     """A few seeds per case cover, and two real benches give what is known of them."""
     needs("data")
-    answer = json.loads(run_study(root, "studies.frf_modes.run"))
+    answer = json.loads(run_study(root, "studies.modes.frf.responses"))
     failed = {name for name, fine in answer["passed"].items() if not fine}
     assert failed <= set(answer["not_met"])
     # Intervals 1.5 times as narrow hold less, which so few seeds tell only all together.
@@ -220,14 +224,14 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_frf_lines(root: Path) -> None:
     """A mode with three lines is found, one with fewer is refused as that."""
-    answer = json.loads(run_study(root, "studies.frf_lines.run"))
+    answer = json.loads(run_study(root, "studies.modes.frf.lines"))
     assert all(answer["passed"].values())
     assert answer["found"]["n"] and answer["refused"]["n"]
 
 
 def test_single_logs(root: Path) -> None:
     """A few plain logs have no flag, most of an unsteady or coloured force have one."""
-    answer = json.loads(run_study(root, "studies.single_logs.run"))
+    answer = json.loads(run_study(root, "studies.modes.single_logs.run"))
     flagged = ("bursts", "log-normal", "ramp", "hump")
     assert answer["passed"]["no flag where the model holds"]
     assert all(answer["passed"][f"most modes have the flag, {world}"] for world in flagged)
@@ -235,7 +239,7 @@ def test_single_logs(root: Path) -> None:
 
 def test_impact_tests(root: Path) -> None:
     """Every double hit of a few tests is refused, no other blow is, and no mode is false."""
-    answer = json.loads(run_study(root, "studies.impact_tests.run"))
+    answer = json.loads(run_study(root, "studies.modes.frf.impacts"))
     exact = ("no mode is false", "double hits", "no other blow is refused")
     assert all(answer["passed"][name] for name in exact)
     assert answer["double_hits"]["n"] and answer["found"]["hits"] > 5
@@ -243,7 +247,7 @@ def test_impact_tests(root: Path) -> None:
 
 def test_crossings(root: Path) -> None:
     """Some lives of each kind are never swapped silently, and both controls may be."""
-    answer = json.loads(run_study(root, "studies.crossings.run"))
+    answer = json.loads(run_study(root, "studies.track.crossings.run"))
     few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
     assert all(fine for name, fine in answer["passed"].items() if name not in few)
     assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 2
@@ -252,13 +256,13 @@ def test_crossings(root: Path) -> None:
 def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
     """The tracked state of a real beam returns to its start, told and not told of the roller."""
     needs("data")
-    answer = json.loads(run_study(root, "studies.beam_track.run"))
+    answer = json.loads(run_study(root, "studies.track.beam"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
 
 
 def test_detectability(root: Path) -> None:
     """The posterior finds planned losses, and hardly any of none; the mount of X is not shown."""
-    answer = json.loads(run_study(root, "studies.detectability.run"))
+    answer = json.loads(run_study(root, "studies.health.detectability"))
     assert all(answer["passed"].values())
     # So few draws of a point tell only all together.
     planned = [row for row in answer["checks"] if row["arm"] == "as planned"]
@@ -273,7 +277,7 @@ def test_detectability(root: Path) -> None:
 def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     """A roller under a real beam is where the posterior says, and two wrong ways lose it."""
     needs("data")
-    answer = json.loads(run_study(root, "studies.movable_roller.run"))
+    answer = json.loads(run_study(root, "studies.health.movable_roller.run"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
     assert answer["inside"]["inferred"] == 3
     (control,) = answer["controls"].values()
@@ -282,7 +286,7 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_sbc_epoch(root: Path) -> None:
     """Ranks of health at some epochs may be uniform; a map taken for exact covers much less."""
-    answer = json.loads(run_study(root, "studies.sbc_epoch.run"))
+    answer = json.loads(run_study(root, "studies.health.calibration.run"))
     assert all(answer["passed"].values())
 
     def hits(kind: str) -> int:
@@ -294,7 +298,7 @@ def test_sbc_epoch(root: Path) -> None:
 
 def test_sbc_life(root: Path) -> None:
     """Ranks of health and remaining life are uniform; who takes every part to lose is found out."""
-    answer = json.loads(run_study(root, "studies.sbc_life.run"))
+    answer = json.loads(run_study(root, "studies.life.calibration.run"))
     assert all(answer["passed"].values())
     assert answer["not_converged"] == 0
     # A part that keeps its health lies below all draws of who says that it cannot.
@@ -309,7 +313,7 @@ def test_sbc_life(root: Path) -> None:
 
 def test_cost_of_a_log(root: Path) -> None:
     """After a new log answers are those from nothing, and a machine without one costs nothing."""
-    passed = json.loads(run_study(root, "studies.cost_of_a_log.run"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost.new_log.run"))["passed"]
     assert passed["epochs are those of a run from nothing"]
     assert passed["lives are those of a run from nothing"]
     assert passed["another life differs"]
@@ -318,14 +322,14 @@ def test_cost_of_a_log(root: Path) -> None:
 
 def test_cost_of_a_log_of_a_fleet(root: Path) -> None:
     """Nothing new costs nothing; lives by the prior of the fleet are those from nothing."""
-    passed = json.loads(run_study(root, "studies.cost_of_a_log.fleet"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost.new_log.fleet"))["passed"]
     names = ("nothing new", "some take the prior of the fleet", "lives are those from nothing")
     assert all(passed[name] for name in names)
 
 
 def test_blind_lives(root: Path) -> None:
     """A sound machine and one that is too young are told as such, and none as what it is not."""
-    answer = json.loads(run_study(root, "studies.blind_lives.run"))
+    answer = json.loads(run_study(root, "studies.robustness.blind_lives.run"))
     assert all(answer["passed"].values())
     told = answer["verdicts"]["all"]
     # The third is of a drawn machine, from estimates.
@@ -336,7 +340,7 @@ def test_blind_lives(root: Path) -> None:
 
 def test_remaining_life_of_unknown_courses(root: Path) -> None:
     """Two lives that accelerate late are held; the named laws alone service both too late."""
-    answer = json.loads(run_study(root, "studies.off_model.remaining"))
+    answer = json.loads(run_study(root, "studies.life.unknown_courses"))
     found = answer["courses"]["late"]["all"]
     assert found["n"] == 2
     assert (found["now"]["held"], found["now"]["late"]) == (2, 0)
@@ -345,26 +349,26 @@ def test_remaining_life_of_unknown_courses(root: Path) -> None:
 
 def test_one_guide(root: Path) -> None:
     """The preload of a shared guide is known better, and the mount of X is not claimed."""
-    answer = json.loads(run_study(root, "studies.one_guide.run"))
+    answer = json.loads(run_study(root, "studies.health.one_guide"))
     assert all(answer["passed"].values())
 
 
 def test_errors_of_the_map(root: Path) -> None:
     """A mode that drifts by 30 % more is named with its size, and none with the exact map."""
-    worlds = json.loads(run_study(root, "studies.off_model.map_errors"))["worlds"]
+    worlds = json.loads(run_study(root, "studies.robustness.off_model.map_errors"))["worlds"]
     assert (worlds["exact"]["n"], worlds["exact"]["warned"]) == (1, 0)
     assert (worlds["pitch"]["n"], worlds["pitch"]["named"]) == (1, 1)
 
 
 def test_calibration_by_ended_lives(root: Path) -> None:
     """A fleet with one ended life and one machine is predicted, and too small to be judged."""
-    answer = json.loads(run_study(root, "studies.fleet_prior.conformal"))
+    answer = json.loads(run_study(root, "studies.life.fleet.conformal"))
     assert (answer["ended"], answer["running"], "ways" in answer) == (1, 1, False)
 
 
 def test_fleet_prior(root: Path) -> None:
     """What a fleet teaches is nearer to what can be known; what another fleet teaches is not."""
-    answer = json.loads(run_study(root, "studies.fleet_prior.run"))
+    answer = json.loads(run_study(root, "studies.life.fleet.run"))
     assert all(answer["passed"].values())
     lost = {way: found["lost_km"][0] for way, found in answer["ways"].items()}
     assert lost["known"] == 0
@@ -375,7 +379,7 @@ def test_fleet_prior(root: Path) -> None:
 def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
     """A batch whose run is killed ends as if uninterrupted, and a wrong one is seen."""
     needs("postgres")
-    answer = json.loads(run_study(root, "studies.faults.kills"))
+    answer = json.loads(run_study(root, "studies.inputs.interruptions.kills"))
     assert all(answer["passed"].values())
     assert {kind: found["how"] for kind, found in answer["kills"].items()} == {
         "postgres": {"main": 1}
@@ -385,7 +389,7 @@ def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
 def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
     """A full disk and a lost database are told in one line, and nothing is lost by them."""
     needs("postgres")
-    answer = json.loads(run_study(root, "studies.faults.losses"))
+    answer = json.loads(run_study(root, "studies.inputs.interruptions.losses"))
     assert all(answer["passed"].values())
     assert answer["lost database"]["failed"] == 1
     # Not every place lets a file system be made.
@@ -394,7 +398,7 @@ def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_bad_inputs_damaged(root: Path) -> None:
     """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
-    answer = json.loads(run_study(root, "studies.bad_inputs.damaged"))
+    answer = json.loads(run_study(root, "studies.inputs.damaged.run"))
     assert all(answer["passed"].values())
     assert answer["good_analysed"] == answer["good"] == 8
     assert answer["damaged_told_right"] == answer["damaged"] > 12
@@ -402,20 +406,20 @@ def test_bad_inputs_damaged(root: Path) -> None:
 
 def test_bad_inputs_time_axes(root: Path) -> None:
     """Of some odd time axes and degenerate sets none is wrong unnamed, and unchecked ones are."""
-    answer = json.loads(run_study(root, "studies.bad_inputs.time_axes"))
+    answer = json.loads(run_study(root, "studies.inputs.time_axes"))
     assert all(answer["passed"].values())
     assert answer["sets_named_right"] == answer["sets"] >= 2
 
 
 def test_bad_inputs_channels(root: Path) -> None:
     """A log of many channels stays within bounds, and a wrong rate is seen."""
-    answer = json.loads(run_study(root, "studies.bad_inputs.channels"))
+    answer = json.loads(run_study(root, "studies.cost.channels"))
     assert all(answer["passed"].values())
 
 
 def test_scale_speedup(root: Path) -> None:
     """One and two workers of this machine are timed beside bare processes."""
-    answer = json.loads(run_study(root, "studies.scale.speedup"))
+    answer = json.loads(run_study(root, "studies.cost.workers"))
     # A log takes the main process some milliseconds, and workers find many in a second.
     assert 0 < answer["serial_ms"]["local"][1] < 1e3
     assert answer["rate"]["local"] > 0

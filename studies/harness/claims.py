@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from studies.common.metrics import clopper_pearson
+from studies.harness.metrics import clopper_pearson
 
 Row = Mapping[str, Any]
 STEPS = (

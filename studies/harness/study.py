@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from studies.common.metrics import clopper_pearson
+from studies.harness.metrics import clopper_pearson
 from studies.harness.provenance import code_of, name_of
 
 Row = dict[str, Any]

@@ -22,16 +22,16 @@ from lmshealth.batch.run import Settings
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.track import track
-from studies.bench.epochs import epoch_posterior, ours, walker_loop
-from studies.bench.identification import CASE, headline_log, parquet_log
-from studies.bench.lives import degrading_life, two_ways
-from studies.bench.steps import EVERY, Meter
-from studies.common.cost import cpu_s
-from studies.common.histories import START
-from studies.identification.records import describe
-from studies.scale.archive import make_archive
-from studies.scale.speedup import SPEEDUP, bare, identified
-from studies.tracking_filter.peers import filterpy_loop, long_life, one_setting
+from studies.cost.archive import make_archive
+from studies.cost.ratios.epochs import epoch_posterior, ours, walker_loop
+from studies.cost.ratios.identification import CASE, headline_log, parquet_log
+from studies.cost.ratios.lives import degrading_life, two_ways
+from studies.cost.ratios.steps import EVERY, Meter
+from studies.cost.workers import SPEEDUP, bare, identified
+from studies.harness.cost import cpu_s
+from studies.harness.data.histories import START
+from studies.modes.identification.records import describe
+from studies.track.filter.peers import filterpy_loop, long_life, one_setting
 from tests.bench.conftest import Race
 
 LOOP, FILTERPY = "emcee, plain loop over our surrogate", "a walker by a loop over filterpy"

@@ -10,7 +10,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 
-from studies.bad_inputs.logfiles import Archive, Columns, LogFile, log_of, write, write_table
+from studies.inputs.damaged.logfiles import Archive, Columns, LogFile, log_of, write, write_table
 
 SECRET = "what-nobody-may-see-7d1f"  # content of files that must not be read
 # What a name that is run as a command would make.

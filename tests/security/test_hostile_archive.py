@@ -25,9 +25,9 @@ import pandas as pd
 import pytest
 from sqlalchemy import create_engine
 
-from studies.bad_inputs.damage import KINDS, Kind
-from studies.bad_inputs.logfiles import DESCRIPTION, Archive, log_of, recordings
 from studies.harness import servers
+from studies.inputs.damaged.kinds import KINDS, Kind
+from studies.inputs.damaged.logfiles import DESCRIPTION, Archive, log_of, recordings
 from tests.security import guards, hostile
 from tests.security.guards import ADDRESSES
 

@@ -16,7 +16,7 @@ from lmshealth.signal.acceleration_levels import (
     read_magnitudes,
 )
 from models.recordings.strokes import VELOCITIES
-from studies.common.logs import make_log
+from studies.harness.data.logs import make_log
 from tests.claims import Claims
 from tests.statistical.evidence import as_often
 

@@ -12,7 +12,7 @@ from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.track import track
-from studies.common.lives import (
+from studies.harness.data.lives import (
     DAMAGED,
     HEALTHY,
     Estimates,
@@ -23,10 +23,10 @@ from studies.common.lives import (
     measured,
     plan_of,
 )
-from studies.crossings.lives import KINDS, judge, make_life, nearest
-from studies.crossings.run import labels_of
-from studies.tracking_filter.lives import QUANTITIES, alone, draw, mixture, stage
-from studies.tracking_filter.trials import errors, known_setting
+from studies.track.crossings.lives import KINDS, judge, make_life, nearest
+from studies.track.crossings.run import labels_of
+from studies.track.filter.lives import QUANTITIES, alone, draw, mixture, stage
+from studies.track.filter.trials import errors, known_setting
 from tests.claims import Claims
 from tests.statistical.evidence import all_of, as_often, at_least, at_most, sum_of_squares, uniform
 

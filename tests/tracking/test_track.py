@@ -31,7 +31,7 @@ from lmshealth.tracking.track import (
     continue_track,
     track,
 )
-from studies.off_model.run import of_world
+from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
     FREQUENCY,

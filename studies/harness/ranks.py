@@ -1,0 +1,133 @@
+"""Ranks of truths among posterior draws: whether they are uniform, and how they are drawn.
+
+If parameters are drawn from a prior, and data from the model with these parameters, then the truth
+is one more draw of the posterior: its rank among independent draws is uniform. Ties are broken at
+random, and the rank is spread evenly over its cell, so that what comes out is uniform from 0 to 1
+(probability integral transform).
+
+References
+----------
+Talts2018 for the ranks, Sailynoja2022 for the bands of their distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from functools import cache
+from typing import Any
+
+import numpy as np
+from arviz_stats.ecdf_utils import (
+    compute_ecdf,
+    get_pointwise_confidence_band,
+    simulate_confidence_bands,
+)
+from matplotlib.axes import Axes
+from numpy.typing import NDArray
+from scipy import stats
+
+from studies.harness.figures import BLACK, BLUE
+from studies.harness.metrics import place
+from studies.harness.study import LEVEL, judge_places
+
+Array = NDArray[np.float64]
+Row = dict[str, Any]
+
+# So few of the posterior's draws that they are as good as independent.
+N_DRAWS = 127
+N_BINS = 20
+_POINTS = np.arange(1, 64) / 64
+_SIMULATIONS = 20_000
+# Of fewer ranks, as quick forms have them, hardly anything is outside.
+_FEW, _FEW_SIMULATIONS = 20, 2_000
+_DASHES = ("-", "--")
+
+
+def thinned(draws: Array) -> Array:
+    """Take `N_DRAWS` draws, evenly spaced over the first axis."""
+    return np.asarray(draws[np.linspace(0, len(draws) - 1, N_DRAWS).round().astype(int)])
+
+
+def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
+    """Rank truths ``(n,)`` among draws ``(n_draws, n)``, as a share from 0 to 1."""
+    return [round(float(value), 6) for value in place(draws, truth, rng)]
+
+
+@cache
+def band(n: int) -> tuple[Array, Array]:
+    """Return the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
+    rng = np.random.default_rng(n)
+    simulations = _SIMULATIONS if n >= _FEW else _FEW_SIMULATIONS
+    prob = simulate_confidence_bands(n, 1, _POINTS, LEVEL, simulations, rng)
+    low, high = get_pointwise_confidence_band(prob, n, _POINTS)
+    return low - _POINTS, high - _POINTS
+
+
+def judge(ranks: Array) -> Row:
+    """Return whether ranks may be uniform: their band, a test of their histogram, coverages."""
+    n = ranks.size
+    low, high = band(n)
+    off = compute_ecdf(ranks, _POINTS) - _POINTS
+    counts = np.histogram(ranks, bins=N_BINS, range=(0, 1))[0]
+    return {
+        "n": n,
+        "inside_band": bool(np.all((low <= off) & (off <= high))),
+        "p_value": float(stats.chisquare(counts).pvalue),
+        "coverage": [judge_places(ranks, level) for level in (0.5, 0.9)],
+        "histogram": counts.tolist(),
+        "ecdf_difference": off.round(5).tolist(),
+    }
+
+
+def uniform(rows: Mapping[str, Row]) -> bool:
+    """Return whether all of several judgements are those of uniform ranks."""
+    return all(
+        row["inside_band"] and all(level["holds"] for level in row["coverage"])
+        for row in rows.values()
+    )
+
+
+def bands(rows: Iterable[Row]) -> dict[str, Any]:
+    """Return the bands of as many ranks as each of several judgements has."""
+    return {
+        str(n): {"low": band(n)[0].round(5).tolist(), "high": band(n)[1].round(5).tolist()}
+        for n in sorted({row["n"] for row in rows})
+    }
+
+
+def draw_histogram(ax: Axes, row: Row, title: str, colour: str = BLUE) -> None:
+    """Draw a rank histogram over the 99.9 % band of a single bar."""
+    n, counts = row["n"], np.array(row["histogram"])
+    low, high = stats.binom.interval(LEVEL, n, 1 / N_BINS)
+    ax.axhspan(low / n * N_BINS, high / n * N_BINS, color=BLACK, alpha=0.15, lw=0)
+    ax.axhline(1.0, color=BLACK, lw=0.8)
+    edges = np.linspace(0, 1, N_BINS + 1)
+    ax.stairs(counts / n * N_BINS, edges, color=colour, fill=True, alpha=0.7)
+    ax.set_xlim(0, 1)
+    ax.set_ylim(0, max(2.0, 1.05 * counts.max() / n * N_BINS))
+    ax.set_title(f"{title}, {n:,}", fontsize=8)
+    ax.tick_params(labelsize=7)
+
+
+def draw_ecdf(
+    ax: Axes,
+    rows: Mapping[str, Row],
+    bands_of: Mapping[str, Any],
+    title: str,
+    colours: Iterable[str],
+) -> None:
+    """Draw distributions of ranks minus the uniform one, over their simultaneous bands."""
+    grid = np.r_[0, _POINTS, 1]
+    for n in {str(row["n"]) for row in rows.values()}:
+        low, high = (np.r_[0, bands_of[n][side], 0] for side in ("low", "high"))
+        ax.fill_between(grid, low, high, color=BLACK, alpha=0.12, lw=0)
+    for i, ((name, row), colour) in enumerate(zip(rows.items(), colours, strict=False)):
+        off = np.r_[0, row["ecdf_difference"], 0]
+        ax.plot(grid, off, _DASHES[i % 2], lw=1.2, color=colour, label=name)
+    ax.axhline(0.0, color=BLACK, lw=0.6)
+    ax.set_xlim(0, 1)
+    ax.set_title(title, fontsize=9)
+    ax.set_xlabel("rank of the truth (share of draws below)", fontsize=8)
+    ax.set_ylabel("distribution minus uniform", fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2, frameon=False)
