@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz compat lock locked sbom clean
+.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -72,11 +72,6 @@ bench: .venv/installed
 # Damaged files of all formats, from another seed each time; what fails is kept and named.
 fuzz: .venv/installed
 	LMSHEALTH_FUZZ_EXAMPLES=$$(( 5 * $(SECONDS) )) $(BIN)/pytest -q -m slow tests/io/formats/test_fuzz.py
-	$(BIN)/python -m studies.inputs.damaged.mutants --seconds $(SECONDS)
-
-# Fast tests on other Pythons, lowest dependencies, kernels and threads, as far as they are here.
-compat: .venv/installed
-	$(BIN)/python -m studies.compat.run
 
 # Versions and hashes of all that development needs; `make locked` installs just these.
 lock: .venv/installed

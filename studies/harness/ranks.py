@@ -1,4 +1,4 @@
-"""Ranks of truths among posterior draws: whether they are uniform, and how they are drawn.
+"""Ranks of truths among posterior draws: whether they are uniform.
 
 If parameters are drawn from a prior, and data from the model with these parameters, then the truth
 is one more draw of the posterior: its rank among independent draws is uniform. Ties are broken at
@@ -22,11 +22,9 @@ from arviz_stats.ecdf_utils import (
     get_pointwise_confidence_band,
     simulate_confidence_bands,
 )
-from matplotlib.axes import Axes
 from numpy.typing import NDArray
 from scipy import stats
 
-from studies.harness.figures import BLACK, BLUE
 from studies.harness.metrics import place
 from studies.harness.study import LEVEL, judge_places
 
@@ -40,7 +38,6 @@ _POINTS = np.arange(1, 64) / 64
 _SIMULATIONS = 20_000
 # Of fewer ranks, as quick forms have them, hardly anything is outside.
 _FEW, _FEW_SIMULATIONS = 20, 2_000
-_DASHES = ("-", "--")
 
 
 def thinned(draws: Array) -> Array:
@@ -93,41 +90,3 @@ def bands(rows: Iterable[Row]) -> dict[str, Any]:
         str(n): {"low": band(n)[0].round(5).tolist(), "high": band(n)[1].round(5).tolist()}
         for n in sorted({row["n"] for row in rows})
     }
-
-
-def draw_histogram(ax: Axes, row: Row, title: str, colour: str = BLUE) -> None:
-    """Draw a rank histogram over the 99.9 % band of a single bar."""
-    n, counts = row["n"], np.array(row["histogram"])
-    low, high = stats.binom.interval(LEVEL, n, 1 / N_BINS)
-    ax.axhspan(low / n * N_BINS, high / n * N_BINS, color=BLACK, alpha=0.15, lw=0)
-    ax.axhline(1.0, color=BLACK, lw=0.8)
-    edges = np.linspace(0, 1, N_BINS + 1)
-    ax.stairs(counts / n * N_BINS, edges, color=colour, fill=True, alpha=0.7)
-    ax.set_xlim(0, 1)
-    ax.set_ylim(0, max(2.0, 1.05 * counts.max() / n * N_BINS))
-    ax.set_title(f"{title}, {n:,}", fontsize=8)
-    ax.tick_params(labelsize=7)
-
-
-def draw_ecdf(
-    ax: Axes,
-    rows: Mapping[str, Row],
-    bands_of: Mapping[str, Any],
-    title: str,
-    colours: Iterable[str],
-) -> None:
-    """Draw distributions of ranks minus the uniform one, over their simultaneous bands."""
-    grid = np.r_[0, _POINTS, 1]
-    for n in {str(row["n"]) for row in rows.values()}:
-        low, high = (np.r_[0, bands_of[n][side], 0] for side in ("low", "high"))
-        ax.fill_between(grid, low, high, color=BLACK, alpha=0.12, lw=0)
-    for i, ((name, row), colour) in enumerate(zip(rows.items(), colours, strict=False)):
-        off = np.r_[0, row["ecdf_difference"], 0]
-        ax.plot(grid, off, _DASHES[i % 2], lw=1.2, color=colour, label=name)
-    ax.axhline(0.0, color=BLACK, lw=0.6)
-    ax.set_xlim(0, 1)
-    ax.set_title(title, fontsize=9)
-    ax.set_xlabel("rank of the truth (share of draws below)", fontsize=8)
-    ax.set_ylabel("distribution minus uniform", fontsize=8)
-    ax.tick_params(labelsize=7)
-    ax.legend(fontsize=6, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncol=2, frameon=False)

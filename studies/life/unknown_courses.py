@@ -197,7 +197,7 @@ def verdicts(courses: Row) -> dict[str, bool]:
     return checks
 
 
-def claims_remaining(answer: Row) -> Iterator[Claim]:
+def claims(answer: Row) -> Iterator[Claim]:
     """Claim intervals and services in courses of no law, and the price where a law holds."""
     passed = answer["passed"]
     for kind, found in answer["courses"].items():

@@ -212,7 +212,7 @@ def verdicts(ways: Row) -> dict[str, bool]:
     return checks
 
 
-def claims_conformal(answer: Row) -> Iterator[Claim]:
+def claims(answer: Row) -> Iterator[Claim]:
     """Claim how many running machines outlive the calibrated travel, before and after."""
     for way, found in answer["ways"].items():
         for kind, row in found.items():

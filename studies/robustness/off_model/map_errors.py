@@ -109,7 +109,7 @@ def verdicts(worlds: Row) -> dict[str, bool]:
     return checks
 
 
-def claims_map_errors(answer: Row) -> Iterator[Claim]:
+def claims(answer: Row) -> Iterator[Claim]:
     """Claim false warnings, and the power to name a mode."""
     for world, row in answer["worlds"].items():
         if world == EXACT:
