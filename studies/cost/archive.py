@@ -15,21 +15,15 @@ LOGS_PER_MACHINE, SECONDS = 100, 10.0
 _N_BASES = 8
 
 
-def make_archive(folder: Path, n_logs: int, *, longer: bool = False) -> None:
-    """Write ``stage.toml`` and ``logs``: so many of machines that do not age, 100 to a machine.
-
-    With ``longer`` the later half is three times as long.
-    """
+def make_archive(folder: Path, n_logs: int) -> None:
+    """Write ``stage.toml`` and ``logs``: so many of machines that do not age, 100 to a machine."""
     (folder / "stage.toml").write_text(DESCRIPTION.replace("damaged-?-Y", "many-*-Y"))
     archive = Archive(folder / "logs")
     n_bases = min(_N_BASES, -(-n_logs // 2))
     bases = recordings(n_bases, SECONDS)
-    if longer:
-        bases += recordings(n_bases, 3 * SECONDS)
     for k in range(n_logs):
         machine, own = divmod(k, LOGS_PER_MACHINE)
-        late = n_bases if longer and k >= n_logs // 2 else 0
-        log = log_of(bases[late + k % n_bases], 0, np.random.default_rng([20261122, k]))
+        log = log_of(bases[k % n_bases], 0, np.random.default_rng([20261122, k]))
         moment = datetime(2026, 1, 1, tzinfo=UTC) + timedelta(hours=own)
         log.metadata["stage"] = f"many-{machine:04d}-Y"
         log.metadata["recorded_at"] = moment.isoformat()

@@ -12,7 +12,7 @@ Talts2018 for the ranks, Sailynoja2022 for the bands of their distribution.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache
 from typing import Any
 
@@ -72,7 +72,6 @@ def judge(ranks: Array) -> Row:
         "p_value": float(stats.chisquare(counts).pvalue),
         "coverage": [judge_places(ranks, level) for level in (0.5, 0.9)],
         "histogram": counts.tolist(),
-        "ecdf_difference": off.round(5).tolist(),
     }
 
 
@@ -82,11 +81,3 @@ def uniform(rows: Mapping[str, Row]) -> bool:
         row["inside_band"] and all(level["holds"] for level in row["coverage"])
         for row in rows.values()
     )
-
-
-def bands(rows: Iterable[Row]) -> dict[str, Any]:
-    """Return the bands of as many ranks as each of several judgements has."""
-    return {
-        str(n): {"low": band(n)[0].round(5).tolist(), "high": band(n)[1].round(5).tolist()}
-        for n in sorted({row["n"] for row in rows})
-    }

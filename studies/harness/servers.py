@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import os
 import pwd
-import random
 import secrets
 import shutil
 import signal
@@ -227,12 +226,6 @@ class Cluster:
                   "--memory-limit", "0", "--death-timeout", str(WAIT_S),
                   "--local-directory", self.folder)
         )  # fmt: skip
-
-    def replace_worker(self, rng: random.Random) -> None:
-        """Kill one of the living workers, and start another."""
-        living = [worker for worker in self.workers if worker.poll() is None]
-        rng.choice(living).kill()
-        self.add_worker()
 
     def await_workers(self, n: int) -> None:
         """Wait until so many workers have registered."""

@@ -107,17 +107,6 @@ def life_of(plan: Plan) -> Life:
     return life_with(plan, schedule(plan))
 
 
-def losing_life(plan: Plan) -> Life:
-    """Take a life from its plan, and let the guide lose preload evenly from log to log."""
-    visits = schedule(plan)
-    step = LOSS / (len(visits) - 1)
-    lost = [
-        replace(visit, condition=replace(visit.condition, guide_preload=1 - step * visit.index))
-        for visit in visits
-    ]
-    return life_with(plan, lost)
-
-
 def life_with(plan: Plan, visits: Sequence[Visit]) -> Life:
     """Take a life whose visits are those of its plan, with other conditions."""
     machine, drawn_life = plan.machine().stage, plan.draw_life()
@@ -239,18 +228,6 @@ def _declared(life: Life) -> tuple[Step, ...]:
         k = life.event
         steps.append(Step("servo", k, after >= k, name=str(life.servo[k])))
     return tuple(steps)
-
-
-def drawn_history(
-    stage: str, plant_seed: int, *, kind: str = "drawn", logs: int = 30, seed: int = 0
-) -> tuple[History, Life]:
-    """Draw a machine, the true modes of its logs, and estimates of them: no signal is simulated.
-
-    The covariances are those of `recorded`; ``seed`` draws the schedule and the errors.
-    """
-    life = life_of(replace(plan_of(stage, kind, seed, logs), plant_seed=plant_seed))
-    estimates = drawn(life, *recorded(stage), rng_of(41, plant_seed, seed))
-    return history_of(life, estimates), life
 
 
 def measured(stage: str, logs: int, kept: Path | None = None) -> tuple[Estimates, Life]:

@@ -34,7 +34,7 @@ from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
-from studies.harness.ranks import N_DRAWS, Array, bands, judge, rank, thinned, uniform
+from studies.harness.ranks import N_DRAWS, Array, judge, rank, thinned, uniform
 from studies.harness.study import Row, Study
 from studies.health.calibration.lives import Life, believing, draw
 
@@ -64,7 +64,6 @@ def main() -> None:
     rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer: Row = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
-    answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
     study.conclude(answer)
 
 

@@ -35,7 +35,7 @@ from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import parameters_with_limit, passages
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
-from studies.harness.ranks import N_DRAWS, Array, bands, judge, rank, uniform
+from studies.harness.ranks import N_DRAWS, Array, judge, rank, uniform
 from studies.harness.study import Row, Study
 from studies.health.calibration.lives import believing
 from studies.life.calibration.lives import Life, draw
@@ -62,7 +62,6 @@ def main() -> None:
     rows = [{"kind": kind} | row for (kind, _), row in zip(tasks, found, strict=True)]
     answer: Row = {"seed": SEED, "lives": plan} | judged(rows)
     answer["passed"] = verdicts(answer["ranks"])
-    answer["bands"] = bands(row for part in answer["ranks"].values() for row in part.values())
     study.conclude(answer)
 
 

@@ -99,10 +99,10 @@ def main() -> None:
             name: trials.collect(one_sweep, [(name, seed) for seed in range(8)]) for name in SWEEPS
         }
         answer["sweeps"] = {name: summarise_sweeps(rows) for name, rows in swept.items()}
-    benches, pictures = read_benches(real_data(), quick=quick)
+    benches = read_benches(real_data(), quick=quick)
     answer |= benches
     answer["passed"] = judge(answer, quick=quick)
-    study.conclude(answer, details={"pictures": pictures, "sweep_rows": swept}, not_met=NOT_MET)
+    study.conclude(answer, details={"sweep_rows": swept}, not_met=NOT_MET)
 
 
 def one_seed(name: str, seed: int) -> Row:
@@ -253,23 +253,19 @@ def summarise_sweeps(rows: list[Row]) -> Row:
     return found
 
 
-def read_benches(data: Path, *, quick: bool) -> tuple[Row, Row]:
-    """Return what the benches say, and pictures of two of their responses."""
+def read_benches(data: Path, *, quick: bool) -> Row:
+    """Return what the benches say."""
     guide = {}
-    pictures = {}
     for name in records.GUIDE:
         log = mapped(data, name)
         for output in ("delta_e_motor", "delta_e_load"):
             reading = read_frf(log, "current_input", output, period=5.0)
             guide[f"{Path(name).stem} {output}"] = told(reading)
-            if output == "delta_e_load":
-                pictures[f"linear guide, {Path(name).stem}"] = pictured(reading)
     log = mapped(data, records.BENCH)
     bench: dict[str, Row] = {}
     for output in ("delta_e_motor", "delta_e_load"):
         reading = read_frf(log, "current", output)
         bench[output] = told(reading)
-        pictures[f"two inertias, {output.removeprefix('delta_e_')}"] = pictured(reading)
         frequency = reading.fit.ordinates.frequency
         inside = (frequency > 40) & (frequency < 70)
         lowest = np.argmin(np.abs(reading.fit.response[inside]))
@@ -278,7 +274,7 @@ def read_benches(data: Path, *, quick: bool) -> tuple[Row, Row]:
             bench[output]["scatter"] = scatter_over_periods(log, output, None)
             narrow = scatter_over_periods(log, output, (40.0, 120.0))
             bench[output]["scatter_40_to_120_hz"] = narrow
-    return {"linear_guide": guide, "two_inertias": bench}, pictures
+    return {"linear_guide": guide, "two_inertias": bench}
 
 
 def mapped(data: Path, name: str) -> Log:
@@ -306,18 +302,6 @@ def told(reading: FrfReading) -> Row:
         "period_s": reading.frf.period,
         "refused": [[r.mode, r.reason] for r in modes.refused],
     }
-
-
-def pictured(reading: FrfReading) -> dict[str, list[float]]:
-    """Return a response and its fit, for the figure."""
-    columns: dict[str, Array] = {
-        "frequency_hz": reading.frf.frequency,
-        "gain": np.abs(reading.frf.response),
-        "std": reading.frf.std,
-        "fit_hz": reading.fit.ordinates.frequency,
-        "fit": np.abs(reading.fit.response),
-    }
-    return {key: [float(f"{x:.5g}") for x in values] for key, values in columns.items()}
 
 
 def scatter_over_periods(

@@ -92,8 +92,7 @@ def main() -> None:
             ),
         },
     }
-    example = None if study.quick else example_response("lms-y")
-    study.conclude(answer, details={"example": example, "rows": rows})
+    study.conclude(answer, details={"rows": rows})
 
 
 def logged(recording: Recording, folder: Path) -> Log:
@@ -233,27 +232,6 @@ def controls(rows: list[Row], pitch: Row) -> Row:
     for control in found.values():
         control["disagrees"] = bool(control["n"] and control["p"] < LEVEL)
     return found
-
-
-def example_response(name: str) -> Row:
-    """Return the responses of one log with their fits, for the figure."""
-    with tempfile.TemporaryDirectory() as scratch:
-        log = swept(name, 0, Path(scratch))
-    (names,) = BANDS[name]
-    example: Row = {"stage": name}
-    for sensor in ("delta_e", "acc_pitch"):
-        reading = read(name, log, "current_excitation", sensor, names)
-        columns = {
-            "frequency_hz": reading.frf.frequency,
-            "gain": np.abs(reading.frf.response),
-            "missing_coherence": 1 - reading.frf.coherence,
-            "fit_hz": reading.fit.ordinates.frequency,
-            "fit": np.abs(reading.fit.response),
-        }
-        example[sensor] = {
-            key: [float(f"{x:.5g}") for x in values] for key, values in columns.items()
-        }
-    return example
 
 
 def claims(answer: Row) -> Iterator[Claim]:

@@ -30,7 +30,6 @@ from studies.track.crossings.lives import KINDS, Life, judge, make_life, nearest
 
 SEED = 20261124
 N_LIVES = 200
-EXAMPLES = ("crossing, named by order", "veering, with shapes", "merging")
 
 
 def main() -> None:
@@ -44,8 +43,7 @@ def main() -> None:
         "best_guess_where_nothing_tells": study.trials.once(guessed, n),
     }
     answer["passed"] = verdicts(answer)
-    examples = {} if study.quick else {name: example(name) for name in EXAMPLES}
-    study.conclude(answer, details={"examples": examples}, quick_may_fail=True)
+    study.conclude(answer, quick_may_fail=True)
 
 
 def life_of(name: str, seed: int) -> Life:
@@ -134,19 +132,6 @@ def verdicts(answer: Row) -> dict[str, bool]:
         <= 0.005 * sum(row["lives_swapped"]["n"] for row in kinds.values()),
     }
     return {name: bool(passed) for name, passed in checks.items()}
-
-
-def example(name: str) -> Row:
-    """Return estimates and labels of the first life."""
-    life = life_of(name, 0)
-    found = labels_of(life)
-    return {
-        "modes": list(found.modes),
-        "clock": life.clock.round(4).tolist(),
-        "ln_f": [epoch.ln_frequency.round(5).tolist() for epoch in life.epochs],
-        "true_ln_f": life.ln_f.round(5).tolist(),
-        "labels": [list(labels) for labels in found.assigned],
-    }
 
 
 def claims(answer: Row) -> Iterator[Claim]:
