@@ -23,16 +23,16 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.track import track
 from studies.cost.archive import make_archive
-from studies.cost.ratios.epochs import epoch_posterior, ours, walker_loop
-from studies.cost.ratios.identification import CASE, headline_log, parquet_log
-from studies.cost.ratios.lives import degrading_life, two_ways
-from studies.cost.ratios.steps import EVERY, Meter
 from studies.cost.workers import SPEEDUP, bare, identified
 from studies.harness.cost import cpu_s
 from studies.harness.data.histories import START
 from studies.modes.identification.records import describe
 from studies.track.filter.peers import filterpy_loop, long_life, one_setting
 from tests.bench.conftest import Race
+from tests.bench.epochs import epoch_posterior, ours, walker_loop
+from tests.bench.identification import CASE, headline_log, parquet_log
+from tests.bench.lives import degrading_life, two_ways
+from tests.bench.meter import EVERY, Meter
 
 LOOP, FILTERPY = "emcee, plain loop over our surrogate", "a walker by a loop over filterpy"
 # What both take on the machine on which seconds were asked for: effective draws a second, and s.
