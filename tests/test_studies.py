@@ -151,6 +151,16 @@ def test_off_model(root: Path) -> None:
     assert checks["without wander healthy lives alarm (control)"]
 
 
+def test_raw_logs_of_drawn_machines(root: Path) -> None:
+    """Raw logs of a nominal and of a drawn machine raise no false alarm and hold their drifts."""
+    answer = json.loads(run_study(root, "studies.robustness.off_model.raw"))
+    checks = answer["passed"]
+    assert all(fine for name, fine in checks.items() if name.startswith(("false", "wrong")))
+    assert answer["drawn machines"]["drift_held"]["n"] == 3
+    narrow, held = (answer["drawn machines"][f"drift_held{key}"] for key in ("_narrow", ""))
+    assert narrow["hits"] < held["hits"]
+
+
 def test_foreign_errors(root: Path) -> None:
     """Close modes are kept though errors are stated 8 times too wide; as stated they are lost."""
     answer = json.loads(run_study(root, "studies.robustness.off_model.foreign"))
