@@ -169,7 +169,7 @@ def main() -> None:
     """Run the study; ``--quick`` does a small archive and records nothing."""
     study = Study(__file__, __doc__)
     quick = study.quick
-    # Batches on Dask are in the quick form of `faults.workers`.
+    # Batches on Dask have tests of their own.
     kinds = ("local",) if quick else tuple(_KINDS)
     workers, n_logs = (QUICK_WORKERS, QUICK_LOGS) if quick else (WORKERS, N_LOGS)
     with tempfile.TemporaryDirectory() as name:

@@ -7,7 +7,7 @@ Method
     all, then nothing new. Then the machine is assessed from nothing. Epochs are drawn from seeds
     that depend on their content only and must be equal; of the remaining travel both answers are
     random, and its means up to the horizon must agree within four standard errors, from the
-    published effective sample sizes; twenty updates in a row are in `sbc_life/updated`. Control,
+    published effective sample sizes. Control,
     which must fail: the life without the last third of its logs.
 Answer
     A fifth of the first run: 4.6 and 5.0 s of 60 and 600 logs, 6.5 s of 6,000, where 5 s were

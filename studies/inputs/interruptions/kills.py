@@ -58,7 +58,7 @@ def main() -> None:
             "kills": {},
         }
         with driving.backends(folder) as kinds:
-            # Both kinds are in the quick form of `together`.
+            # The quick form takes one of them, PostgreSQL where it is there.
             for kind, new_store in list(kinds.items())[-1 if quick else 0 :]:
                 work = partial(killed, reference, new_store, per_run, hows)
                 batches: list[Row] = []

@@ -8,7 +8,7 @@ Method
     two recorders took. A mode is found within its published tolerance. What else is reported is
     false in simulated sets; a real structure may have more modes than are published. Beside:
     presets of pyOMA2's clustering and the automatic selections of pyoma-toolbox, with the settings
-    of `blind_modes`.
+    of `without_description`.
 Run time
     About two minutes on one processor. Needs the extra ``peers``.
 Data

@@ -5,8 +5,8 @@ Method
     of the record. Three quarters of the lives are of machines that differ from the shipped map
     (`simulate --plant-seed`), half have laws of wear of their own, most of which no description
     has; the description has the frequencies of the new machine, as its user would enter them. For
-    most lives estimates are drawn about the true modes with the covariances recorded by
-    tracking_lives, and go through track, names, health at the last log, remaining life (by
+    most lives estimates are drawn about the true modes with the covariances of
+    identified logs, and go through track, names, health at the last log, remaining life (by
     importance sampling), pool and verdict as in `assess`. A few lives of the nominal machine are
     simulated at 20 kHz, moved apart from their truth, and analysed by `lmshealth run`, of which
     tables and front page are read.

@@ -5,7 +5,7 @@ Method
     self-heating, sensor, wander, amplitude dependence, running-in, lubrication and laws of wear,
     of which about half are in no description (models/lives, "Machines that differ"). Each has 20
     logs of 20 s over at most 2,000 km, of which the last is before the first limit. Estimates are
-    drawn about the true modes, with the covariances recorded by tracking_lives and without signals.
+    drawn about the true modes, with the covariances of identified logs and without signals.
     They are tracked, health is inferred at the last epoch only, and the remaining life by
     importance sampling, with the shipped description, map and laws. Truths are those of the
     machine, over the first log. Ties and lives beyond the horizon are broken at random; intervals
