@@ -1,4 +1,4 @@
-"""Does reading a log cost more than the library that reads its format, and what is refused?
+"""Does reading a log cost more than the library that reads its format?
 
 Method
     One minute of four signals at 20 kHz with the metadata of a log, written once in each format.
@@ -8,9 +8,7 @@ Method
     reader. The time of the process that reads HDF5, Parquet and MAT counts. Then ten minutes of the
     same signals, read in a process of its own by the reader and by the bare call, which holds all
     of the log (control): the peak of its memory, less what it had after a short file, in minutes of
-    the log (8 bytes for each sample of each channel), and the processor time. Then every UFF58,
-    TDMS, MAT and delimited file of the real samples is read
-    without and with its column map.
+    the log (8 bytes for each sample of each channel), and the processor time.
 Answer
     CSV and Parquet cost at most 1.3 times the library. HDF5, TDMS and MAT cost 1.4 to 2.2 times:
     they are read in a process that may die, and its samples come through pages that both share,
@@ -18,21 +16,15 @@ Answer
     is an eighth of the log's at most, except UFF58, whose library holds the whole file.
 Run time
     About ten minutes, and 2 GB of disk.
-Data
-    All folders of LMSHEALTH_DATA; ``--quick`` measures times and memory alone and needs none.
 """
 
 from __future__ import annotations
 
 import tempfile
-import tomllib
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 
-import msgspec
-
-from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats import isolation
 from lmshealth.io.formats.registry import load
@@ -40,8 +32,7 @@ from lmshealth.io.reading import read_log
 from studies.cost.reading.files import BARE, RATE, signals, write
 from studies.harness.claims import Claim, span
 from studies.harness.cost import cpu_s, in_own_process, in_turns
-from studies.harness.data.samples import MAPS
-from studies.harness.study import Row, Study, real_data
+from studies.harness.study import Row, Study
 
 _SHARED = "samples come from another process through shared pages, which takes 10 ms for a minute"
 NOT_MET = dict.fromkeys(("log.h5", "log.tdms", "plain.mat", "packed.mat"), _SHARED)
@@ -57,14 +48,12 @@ QUICK_MEMORY = ("log.h5", "log.parquet")
 # The others are decoded as a whole, up to --max-memory.
 STREAMED = ("log.h5", "log.parquet", "log.csv", "log.csv.gz")
 ROUNDS = 9
-SUFFIXES = (".uff", ".tdms", ".mat", ".csv", ".gz")
 
 
 def main() -> None:
-    """Run the study; ``--quick`` reads less of fewer formats, no samples, and records nothing."""
+    """Run the study; ``--quick`` reads less of fewer formats, and records nothing."""
     study = Study(__file__, __doc__)
     quick, collect = study.quick, study.trials.collect
-    data = None if quick else real_data()
     names, how = (BOUNDED, (8, 3)) if quick else (tuple(BARE), (60, ROUNDS))
     found = collect(timed, [(name, *how) for name in names])
     times = dict(zip(names, found, strict=True))
@@ -88,7 +77,6 @@ def main() -> None:
             for name in STREAMED
             if name in memory
         },
-        "samples": samples(data) if data else None,
     }
     study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 
@@ -147,31 +135,8 @@ def long_log(name: str, n_minutes: int, chosen: tuple[str, ...]) -> dict[str, fl
     }
 
 
-def samples(data: Path) -> dict[str, dict[str, str]]:
-    """Read every sample without and with its column map."""
-    found = {}
-    for path in sorted(path for path in data.rglob("*") if path.suffix in SUFFIXES):
-        name = path.relative_to(data).as_posix()
-        found[name] = {"as it is": outcome(path, ColumnMap(), name)}
-        if name in MAPS:
-            columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
-            found[name]["with its map"] = outcome(path, columns, name)
-    return found
-
-
-def outcome(path: Path, columns: ColumnMap, name: str) -> str:
-    """Return in a line what `read_log` makes of a file."""
-    try:
-        log = read_log(path, columns=columns, name=name)
-    except BadLog as error:
-        return f"refused, {error.reason}: {error.detail}"
-    n_samples = log.channels[0].values.size
-    refused = "".join(f"; {r.channel} refused, {r.reason}" for r in log.refused)
-    return f"read: {len(log.channels)} x {n_samples} at {log.sample_rate:.7g} Hz{refused}"
-
-
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim times and memory beside the bare libraries, and what becomes of real files."""
+    """Claim times and memory beside the bare libraries."""
     times, memory = answer["times"], answer["memory"]
     bounded = [times[name]["ratio"] for name in answer["passed"]]
     yield Claim(
@@ -191,14 +156,6 @@ def claims(answer: Row) -> Iterator[Claim]:
         "",
         f"the libraries take {span(row['minutes_of_library'] for row in memory.values())}",
         all(answer["memory_passed"].values()),
-    )
-    samples = answer["samples"].values()
-    told = sum(any(text.startswith("read") for text in sample.values()) for sample in samples)
-    yield Claim(
-        "real files that are read, as they are or by a column map",
-        f"{told} of {len(samples)}",
-        "",
-        "the others are refused with a reason",
     )
 
 
