@@ -386,26 +386,6 @@ def test_fleet_prior(root: Path) -> None:
     assert lost["learned"] < lost["another fleet teaches"]
 
 
-def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
-    """A batch whose run is killed ends as if uninterrupted, and a wrong one is seen."""
-    needs("postgres")
-    answer = json.loads(run_study(root, "studies.inputs.interruptions.kills"))
-    assert all(answer["passed"].values())
-    assert {kind: found["how"] for kind, found in answer["kills"].items()} == {
-        "postgres": {"main": 1}
-    }
-
-
-def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
-    """A full disk and a lost database are told in one line, and nothing is lost by them."""
-    needs("postgres")
-    answer = json.loads(run_study(root, "studies.inputs.interruptions.losses"))
-    assert all(answer["passed"].values())
-    assert answer["lost database"]["failed"] == 1
-    # Not every place lets a file system be made.
-    assert answer["full disk"] is None or answer["full disk"]["failed"] == 1
-
-
 def test_bad_inputs_damaged(root: Path) -> None:
     """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
     answer = json.loads(run_study(root, "studies.inputs.damaged.run"))

@@ -1,16 +1,10 @@
-"""What happens to a run whose disk is full, or whose database stops?
+"""A full disk and a lost database are reported in one line, and nothing is lost by them.
 
-Method
-    Full disk: output and store, or output alone, on a file system that is too small and grows with
-    each run until everything fits. Lost database: PostgreSQL is stopped at a random moment after
-    the first log and started before the next run. Each failed run must exit with status 1 and one
-    line without the password; the final output must equal that of a run without failure. Control:
-    see `kills`.
-Answer
-    Twelve runs on full disks (six with output and store, six with output alone) and five without
-    database report it in one line, without the password; all final outputs are equal.
-Run time
-    Four to fifteen minutes.
+Full disk: output and store, or output alone, on a file system that is too small and grows with each
+run until everything fits. Lost database: PostgreSQL is stopped at a random moment after the first
+log and started before the next run. Each failed run must exit with status 1 and one line without
+the password; the final output must equal that of a run without failure. `LMSHEALTH_KILLS=5` or more
+tries a larger batch, more sizes, and five lost databases.
 """
 
 from __future__ import annotations
@@ -21,54 +15,56 @@ import re
 import signal
 import subprocess
 import tempfile
-from collections.abc import Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
-from studies.harness.claims import Claim
-from studies.harness.servers import missing_postgres, postgres
-from studies.harness.study import Row, Study
-from studies.inputs.interruptions import driving
-from studies.inputs.interruptions.driving import SOME_REFUSED, Reference, one_line
+import pytest
+
+from studies.harness.servers import postgres
+from tests.batch.interruptions import driving
+from tests.batch.interruptions.driving import N_KILLS, SOME_REFUSED, Reference, one_line
+
+pytestmark = pytest.mark.slow
+Row = dict[str, Any]
 
 SEED = 20261122
-MACHINES, QUICK_MACHINES = {"WORN-A": 40, "WATCHED-A": 40}, {"WATCHED-A": 4}
+FEW = N_KILLS == 1
+MACHINES = driving.FEW if FEW else {"WORN-A": 40, "WATCHED-A": 40}
 # Fractions of the space that output, and store where it is there too, need.
-SIZES, QUICK_SIZES = (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0), (0.4, 4.0)
+SIZES = (0.4, 4.0) if FEW else (0.05, 0.2, 0.4, 0.6, 0.75, 0.9, 4.0)
 # Failed runs, and the latest end of the database after the first log, over the time of a run.
-LOST, QUICK_LOST = (5, 0.5), (1, 0.0)
+N_LOST, LATEST = (1, 0.0) if FEW else (5, 0.5)
 Ends = list[tuple[int | None, list[str]]]  # statuses and messages
 
 
-def main() -> None:
-    """Run the study; ``--quick`` does a small part and records nothing."""
-    study = Study(__file__, __doc__)
-    quick, once = study.quick, partial(study.trials.once, also=driving.PROGRAM)
+@pytest.fixture(scope="module")
+def reference() -> Iterator[Reference]:
+    """Analyse a batch without interruption."""
     with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        machines = QUICK_MACHINES if quick else MACHINES
-        reference = driving.reference_of(folder, machines, quick=quick)
-        both = partial(full_disk, reference, folder / "both", with_store=True)
-        output = partial(full_disk, reference, folder / "output", with_store=False)
-        lost = partial(lost_database, reference, quick=quick)
-        answer: Row = {
-            "seed": SEED,
-            "full disk": once(both, QUICK_SIZES if quick else SIZES),
-            "full disk, output alone": None if quick else once(output, SIZES),
-            "lost database": once(lost, *(QUICK_LOST if quick else LOST)),
-        }
-    # What this machine does not allow is left out.
-    tried = {name: found for name, found in answer.items() if isinstance(found, dict)}
-    answer["passed"] = {
-        f"{check}, {name}": held
-        for name, found in tried.items()
-        for check, held in {
-            "it did fail": found["failed"] > 0,
-            "told in one line": not found["other_ends"],
-            "as uninterrupted": not found["differences"],
-        }.items()
-    }
-    study.conclude(answer)
+        yield driving.reference_of(Path(name), MACHINES, quick=FEW)
+
+
+@pytest.mark.parametrize("with_store", [True, False], ids=["with-store", "output-alone"])
+def test_a_full_disk(reference: Reference, tmp_path: Path, with_store: bool) -> None:
+    """Runs fail in one line until all fits, and the last one has everything."""
+    found = full_disk(reference, tmp_path, SIZES, with_store=with_store)
+    if found is None:
+        pytest.skip("no file system can be made here")
+    check(found)
+
+
+def test_a_lost_database(reference: Reference, needs: Callable[[str], None]) -> None:
+    """A run whose database stops fails in one line, and the next one has everything."""
+    needs("postgres")
+    check(lost_database(reference, N_LOST, LATEST, quick=FEW))
+
+
+def check(found: Row) -> None:
+    """Require that runs failed, each in one line, and that nothing differs in the end."""
+    assert found["failed"] > 0
+    assert found["other_ends"] == []
+    assert found["differences"] == []
 
 
 def full_disk(
@@ -102,13 +98,11 @@ def full_disk(
     return {"sizes_of_what_is_needed": sizes, **failures(ends), "differences": differences}
 
 
-def lost_database(reference: Reference, n: int, latest: float, *, quick: bool) -> Row | None:
+def lost_database(reference: Reference, n: int, latest: float, *, quick: bool) -> Row:
     """Stop the database server in the middle of runs, start it, and run again.
 
     Runs that did not need it any more are not counted, until n have failed.
     """
-    if missing_postgres() is not None:
-        return None
     rng = random.Random(SEED)
     ends: Ends = []
     differences: list[str] = []
@@ -139,24 +133,3 @@ def failures(ends: Ends) -> Row:
     ]
     reported = {re.sub(r"\w+:/\S+|'?/\S+", "…", line) for line in failed}
     return {"failed": len(failed), "said": sorted(reported), "other_ends": other}
-
-
-def claims(answer: Row) -> Iterator[Claim]:
-    """Claim that a full disk and a lost database are reported, and lose nothing."""
-    for name in ("full disk", "full disk, output alone", "lost database"):
-        row = answer[name]
-        if row is None:
-            yield Claim(name, "not tried: this machine does not allow it", met=False)
-            continue
-        fine = all(held for what, held in answer["passed"].items() if what.endswith(f", {name}"))
-        yield Claim(
-            f"{name}: what is not as without it",
-            str(len(row["differences"])),
-            f"{row['failed']} runs failed",
-            "each in one line",
-            fine,
-        )
-
-
-if __name__ == "__main__":
-    main()

@@ -35,10 +35,11 @@ _RATE_HZ, _SECONDS = 500.0, 4.0
 
 # 200 logs; enough for a fleet prior of three machines for a fourth, young one.
 MACHINES = {"WORN-A": 50, "WORN-B": 46, "WORN-C": 46, "WORN-D": 8, "WATCHED-A": 50}
+FEW = {"WATCHED-A": 4}
 LONG_S = 1200.0  # no run takes as long
+# `LMSHEALTH_KILLS=100` interrupts as many runs of all of them; by default one small run.
+N_KILLS = int(os.environ.get("LMSHEALTH_KILLS", "1"))
 ENDED_S = 60.0  # by then every process of a killed run has to be gone, on a busy machine too
-# What is started, and what its result depends on.
-PROGRAM = ("lmshealth.__main__",)
 _PROGRAM = (sys.executable, "-m", "lmshealth")
 SOME_REFUSED = 3  # exit status of a run over the batch, which has damaged logs
 
