@@ -7,7 +7,6 @@ kernel signals it (`setpriv --pdeathsig`). All listen on this machine alone.
 from __future__ import annotations
 
 import os
-import pwd
 import secrets
 import shutil
 import signal
@@ -65,6 +64,8 @@ def _child(
     """Start a process in a session of its own that gets the signal `end` when this one dies."""
     as_user = []
     if user:
+        import pwd  # POSIX
+
         as_user = [f"--reuid={user}", f"--regid={pwd.getpwnam(user).pw_gid}", "--clear-groups"]
     return subprocess.Popen(
         ["setpriv", *as_user, "--pdeathsig", end, *command],
@@ -200,6 +201,8 @@ def _unprivileged() -> str:
     """Name whom the server runs as where that must not be us: it refuses root."""
     if os.geteuid():
         return ""
+    import pwd
+
     names = {entry.pw_name for entry in pwd.getpwall()}
     return next(name for name in ("postgres", "nobody") if name in names)
 
