@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz compat lock locked sbom clean
+.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -19,7 +19,7 @@ demo: .venv/installed
 # The picture in the README: a screenshot of the report of the demo.
 picture: .venv/installed
 	@test -d $(DEMO)/result || $(MAKE) demo
-	$(BIN)/python -m studies.demo_life.picture $(DEMO)/result
+	$(BIN)/python -m tests.tools.picture $(DEMO)/result
 
 # The notebooks with the results of their cells, as pages in demo/notebooks.
 notebooks: .venv/installed
@@ -65,18 +65,13 @@ coverage: .venv/installed
 statistics: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m statistical
 
-# Speed of every step relative to a peer, recorded in studies/bench/result.json.
+# Speed of every step relative to a peer, recorded in studies/cost/ratios/result.json.
 bench: .venv/installed
-	$(BIN)/python -m studies.bench.run
+	$(BIN)/python -m studies.cost.ratios.run
 
 # Damaged files of all formats, from another seed each time; what fails is kept and named.
 fuzz: .venv/installed
 	LMSHEALTH_FUZZ_EXAMPLES=$$(( 5 * $(SECONDS) )) $(BIN)/pytest -q -m slow tests/io/formats/test_fuzz.py
-	$(BIN)/python -m studies.bad_inputs.mutants --seconds $(SECONDS)
-
-# Fast tests on other Pythons, lowest dependencies, kernels and threads, as far as they are here.
-compat: .venv/installed
-	$(BIN)/python -m studies.compat.run
 
 # Versions and hashes of all that development needs; `make locked` installs just these.
 lock: .venv/installed

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from studies.bench.ratios import FALSE_ALARM, Figure, recorded, table
+from studies.cost.ratios.ratios import FALSE_ALARM, Figure, table
 
 
 def figure(ratios: np.ndarray, at_most: float = 1.0) -> Figure:
@@ -46,8 +46,3 @@ def test_rows_tell_ratio_scatter_and_bound() -> None:
     assert head.split() == ["figure", "ratio", "least", "largest", "at", "most", "turns"]
     assert line.split() == ["something", "1.4", "1.1", "1.7", "1", "7", "MISSED"]
     assert beside.strip() == "beside something else"
-
-
-def test_what_a_study_recorded_is_looked_up() -> None:
-    """Bounds in times of a peer come from the recorded numbers of studies."""
-    assert recorded("simulation_cost/result.json", "stages", "lms-y", "record_60s_cpu_s") > 0

@@ -15,8 +15,8 @@ from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
 from lmshealth.report.fleet_page import file_names
 from lmshealth.stage.description import load_stage
-from studies.bad_inputs.guards import acting, bad_names
-from studies.bad_inputs.hostile import BAD_STAGES, MACHINES, SECRET
+from tests.security.guards import acting, bad_names
+from tests.security.hostile import BAD_STAGES, MACHINES, SECRET
 from tests.signals import write_archive, write_archive_stage
 
 _UNSAFE = {"pickle", "cPickle", "dill", "cloudpickle", "shelve", "marshal"}

@@ -8,19 +8,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.common.metrics import (
-    alpha_lambda,
+from studies.harness.metrics import (
     clopper_pearson,
     crps,
-    cumulative_relative_accuracy,
-    mass_within,
     place,
-    prognostic_horizon,
-    relative_accuracy,
     service_at,
     unexpected_breaks,
-    unexploited_life,
-    within,
 )
 from studies.harness.study import judge_places
 from tests.oracles import check_coverage
@@ -41,61 +34,6 @@ def integrated_crps(draws: np.ndarray, truth: float, horizon: float) -> float:
     for a, b in pairwise(cuts):
         total += (np.mean(draws <= a) - (truth <= a)) ** 2 * (b - a)
     return total
-
-
-def test_mass_within_counts_draws() -> None:
-    """The share of draws in a closed margin; of a finite truth infinite draws never are."""
-    draws = np.array([[80.0], [90.0], [120.0], [121.0], [NEVER]])
-    assert mass_within(draws, [100.0], 20.0) == 3 / 5
-    assert mass_within(draws, [NEVER], NEVER) == 1 / 5
-
-
-def test_alpha_lambda_of_points_and_of_mass() -> None:
-    """The median may be right while too little mass is, and the other way round."""
-    wide = np.array([10.0, 60.0, 100.0, 140.0, 190.0])
-    beside = np.array([85.0, 100.0, 125.0, 125.0, 125.0])
-    draws = np.column_stack([wide, beside])
-    truth = np.array([100.0, 100.0])
-    assert alpha_lambda(draws, truth, 0.2).tolist() == [True, False]
-    assert alpha_lambda(draws, truth, 0.2, mass=0.4).tolist() == [False, True]
-    assert (alpha_lambda(draws, truth, 0.2) == within(draws, truth, 20.0)).all()
-
-
-def test_alpha_lambda_of_lives_without_end() -> None:
-    """A life that never ends is predicted by draws that never do, and by no others."""
-    draws = np.array([[NEVER, 5.0], [NEVER, NEVER], [3.0, 7.0]])
-    assert alpha_lambda(draws, [NEVER, NEVER], 0.2).tolist() == [True, False]
-
-
-def test_shares_of_lives_that_are_over_are_refused() -> None:
-    """What is left of a life that is over has no share: the error says what to do."""
-    draws = np.ones((4, 2))
-    for metric in (lambda x, y: alpha_lambda(x, y, 0.2), relative_accuracy):
-        with pytest.raises(ValueError, match=r"got -2: .* leave such moments out"):
-            metric(draws, [1.0, -2.0])
-
-
-def test_relative_accuracy() -> None:
-    """One for a right median, less by its relative error, by limits where something never ends."""
-    draws = np.array([[90.0, 90.0, 10.0, NEVER, 10.0, NEVER]] * 3)
-    truth = [90.0, 100.0, 100.0, 100.0, NEVER, NEVER]
-    expected = [1.0, 0.9, 0.1, -NEVER, 0.0, 1.0]
-    np.testing.assert_allclose(relative_accuracy(draws, truth), expected)
-
-
-def test_cumulative_relative_accuracy() -> None:
-    """The mean over moments, or the weighted one."""
-    accuracy = np.array([[0.5, 1.0], [0.9, 0.0]])
-    np.testing.assert_allclose(cumulative_relative_accuracy(accuracy), [0.7, 0.5])
-    weighted = cumulative_relative_accuracy(accuracy, np.array([1, 3]))
-    np.testing.assert_allclose(weighted, [0.8, 0.25])
-
-
-def test_prognostic_horizon_asks_for_all_later_moments() -> None:
-    """It begins where a criterion is met for good, and is nothing where it fails at last."""
-    held = np.array([[1, 0, 1, 0], [1, 1, 0, 0], [1, 1, 1, 0]], dtype=bool)
-    left = np.array([[70.0], [50.0], [30.0]]) * np.ones(4)
-    assert prognostic_horizon(held, left).tolist() == [70.0, 50.0, 30.0, 0.0]
 
 
 def test_crps_is_the_double_sum() -> None:
@@ -240,10 +178,3 @@ def test_breaks_happen_as_often_as_risked() -> None:
     assert low <= 0.1 <= high
     late = unexpected_breaks(service_at(2 * draws, 0.1), truth)
     assert clopper_pearson(int(late.sum()), late.size, 0.999)[0] > 0.1
-
-
-def test_unexploited_life() -> None:
-    """What is left at the service, up to the horizon; nothing of lives that have ended."""
-    service, truth = np.array([3.0, 3.0, 3.0]), [5.0, 2.0, NEVER]
-    assert unexploited_life(service, truth, horizon=10.0).tolist() == [2.0, 0.0, 7.0]
-    assert unexpected_breaks(service, truth).tolist() == [False, True, False]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import json
-import subprocess
 import sys
 from collections.abc import Callable
 from contextlib import chdir, redirect_stdout
@@ -17,17 +16,16 @@ import numpy as np
 import pytest
 
 import lmshealth
-from studies.new_machine.run import Step, follow, steps
-from studies.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
-from studies.scale import speedup
+from studies.cost.workers import judged
+from studies.robustness.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
 pytestmark = pytest.mark.study
 PARTS = ("preload", "mount")
 
 
-def run_study(root: Path, name: str, part: str = "run") -> str:
-    """Run the quick form of a study, or of a part of it, in this process: most is then imported."""
-    study = import_module(f"studies.{name}.{part}")
+def run_study(root: Path, name: str) -> str:
+    """Run the quick form of a study in this process: most of what it needs is then imported."""
+    study = import_module(name)
     printed = io.StringIO()
     with (
         patch.object(sys, "argv", [study.__file__, "--quick"]),
@@ -38,24 +36,9 @@ def run_study(root: Path, name: str, part: str = "run") -> str:
     return printed.getvalue()
 
 
-def run_alone(root: Path, name: str) -> str:
-    """Run the quick form of a study in a process of its own: it measures memory."""
-    command = [sys.executable, "-W", "error", "-m", f"studies.{name}.run", "--quick"]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert done.returncode == 0, done.stdout + done.stderr
-    return done.stdout
-
-
-def recorded(root: Path, name: str) -> dict[str, Any]:
-    """Read what the full form of a study has found."""
-    text = (root / "studies" / name / "result.json").read_text(encoding="utf-8")
-    found: dict[str, Any] = json.loads(text)
-    return found
-
-
 def test_foreign_files(root: Path) -> None:
     """Foreign files are read right or refused, and the comparison finds a reader that errs."""
-    answer = json.loads(run_study(root, "foreign_files"))
+    answer = json.loads(run_study(root, "studies.inputs.foreign_files.run"))
     assert all(answer["passed"].values())
     assert answer["control"]["wrong"] == answer["control"]["files"] > 0
 
@@ -63,7 +46,7 @@ def test_foreign_files(root: Path) -> None:
 def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     """Real records give what is known of them; what is not met is known to be."""
     needs("data")
-    answer = json.loads(run_study(root, "modes_real"))
+    answer = json.loads(run_study(root, "studies.modes.real.run"))
     failed = {name for name, held in answer["passed"].items() if not held}
     assert failed == set(answer["not_met"])
     assert answer["building"]["verdict"] == "healthy"
@@ -73,13 +56,13 @@ def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
 def test_modes_real_without_a_description(root: Path, needs: Callable[[str], None]) -> None:
     """A search without a description finds the known modes of real records."""
     needs("data")
-    answer = json.loads(run_study(root, "modes_real", "blind"))
+    answer = json.loads(run_study(root, "studies.modes.real.blind"))
     assert all(answer["passed"].values())
 
 
 def test_drawn_machines(root: Path) -> None:
     """Drawn machines are off the description, nominal ones are not; all questions have rows."""
-    answer = json.loads(run_study(root, "drawn_machines"))
+    answer = json.loads(run_study(root, "studies.robustness.drawn_machines.run"))
     healthy = answer["healthy"]
     assert healthy["drawn"]["doubt"]["hits"] > healthy["nominal"]["doubt"]["hits"] == 0
     assert healthy["nominal"]["alarm"]["hits"] == 0
@@ -93,7 +76,9 @@ def test_drawn_machines(root: Path) -> None:
 
 def test_blind_modes(root: Path) -> None:
     """Modes that nobody described are found, harmonics that wander are none, peaks fall short."""
-    families = json.loads(run_study(root, "blind_modes"))["families"].values()
+    families = json.loads(run_study(root, "studies.modes.without_description.run"))[
+        "families"
+    ].values()
     assert sum(one["found"] for one in families) >= 0.97 * sum(one["there"] for one in families)
     assert not any(one["wandering_called_modes"] for one in families)
     controls = [one["others"]["peaks of single channels"] for one in families]
@@ -101,56 +86,18 @@ def test_blind_modes(root: Path) -> None:
     assert found < 0.97 * there or false > 2
 
 
-def test_modes_peers(root: Path, needs: Callable[[str], None]) -> None:
-    """No peer is clearly more accurate on the same records, and decomposition is clearly less."""
-    needs("peers")
-    answer = json.loads(run_study(root, "modes_peers"))
-    assert all(held for name, held in answer["passed"].items() if name not in answer["not_met"])
-    tools = answer["cases"][0]["tools"]
-    assert all(
-        set(tools[name]["coverage"]) == {"ln f", "ln zeta"} for name in ("SSI-cov", "VarPLSCF")
-    )
-    assert tools["FDD"]["against_ours"]["ln f"]["it_is"] == "behind"
-
-
-def test_modes_peers_without_peers(root: Path) -> None:
-    """Without its peers the study fails and names the extra that brings them."""
-    script = (
-        "import sys; sys.modules |= {'pyoma2': None, 'pyOMA': None}; sys.argv = ['run', '--quick'];"
-        "from studies.modes_peers.run import main; main()"
-    )
-    command = [sys.executable, "-c", script]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
-    assert done.returncode == 1
-    assert "pyOMA-2 and pyoma-toolbox not installed" in done.stderr
-    assert ".[peers]" in done.stderr
-
-
 def test_tracking_filter(root: Path) -> None:
     """Errors of the filter are as large as it says, and its numbers are those of filterpy."""
-    answer = json.loads(run_study(root, "tracking_filter"))
+    answer = json.loads(run_study(root, "studies.track.filter.run"))
     assert all(answer["passed"].values())
     programs = {row["program"] for row in answer["speed"]["programs"]}
     # Peers are compared where they are installed.
     assert len(programs) == 5 - len(answer["speed"]["missing"])
 
 
-def test_demo_life(root: Path) -> None:
-    """A short degrading life is recognised, and its truth lies where the posterior does."""
-    (life,) = json.loads(run_study(root, "demo_life"))["lives"]
-    assert life["verdict"] == "both"
-    for name in ("guide_preload", "mount_stiffness"):
-        row = life[name]
-        # Twice the 90 % interval: a miss is a fault and not one life in ten.
-        reach = row["q95"] - row["q05"]
-        assert abs(row["truth"] - row["median"]) < reach
-        # Much narrower than the prior, whose 90 % interval is 1.0 wide, and no point.
-        assert 0.01 < reach < 0.3
-
-
 def test_three_methods(root: Path) -> None:
     """FRF, following error and accelerometers agree on guide modes, and controls do not."""
-    answer = json.loads(run_study(root, "three_methods"))
+    answer = json.loads(run_study(root, "studies.paper.three_methods.run"))
     assert all(answer["passed"].values())
     pitch = answer["stages"]["lms-y"]["modes"]["pitch"]
     assert pitch["seen_by"] == ["frf", "delta_e", "accelerometers"]
@@ -158,12 +105,14 @@ def test_three_methods(root: Path) -> None:
 
 def test_three_methods_with_friction(root: Path) -> None:
     """A sweep that turns the stage back has pitch too high; moving, or without friction, not."""
-    assert all(json.loads(run_study(root, "three_methods", "friction"))["passed"].values())
+    assert all(
+        json.loads(run_study(root, "studies.paper.three_methods.friction"))["passed"].values()
+    )
 
 
 def test_paper_tables(root: Path) -> None:
     """One seed gives most of the paper's tables, and constant velocity alone less."""
-    answer = json.loads(run_study(root, "paper_tables"))
+    answer = json.loads(run_study(root, "studies.paper.tables.run"))
 
     def hits(plant: str, summary: str, key: str) -> tuple[int, int]:
         found, count = answer[plant][summary][key].split(" of ")
@@ -181,60 +130,21 @@ def test_paper_tables(root: Path) -> None:
         assert answer[plant]["summary"]["std_of_x_below_y"] == "7 of 7"
 
 
-def test_friction(root: Path) -> None:
-    """Friction balances energy, converges, vanishes into the linear loop; controls fail."""
-    assert all(json.loads(run_study(root, "friction"))["passed"].values())
-
-
-def test_simulation_cost(root: Path) -> None:
-    """A minute of simulated log stays within its memory and costs less than stepping it."""
-    answer = json.loads(run_alone(root, "simulation_cost"))
-    (row,) = answer["stages"].values()
-    assert answer["passed"]["memory"]
-    assert row["peer_over_ours"] > 1.5
-    assert row["record_30s_cpu_s"] < 0.8 * row["record_60s_cpu_s"]
-
-
-def test_readings(root: Path) -> None:
-    """Readings are calibrated, slopes cover, and only what a file cannot give is not met."""
-    answer = json.loads(run_study(root, "readings"))
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    assert failed == set(answer["not_met"])
-
-
 def test_mislabelled_modes(root: Path) -> None:
     """No wrong name is published without a warning; the control publishes some."""
-    answer = json.loads(run_study(root, "mislabelled_modes"))
+    answer = json.loads(run_study(root, "studies.modes.wrong_descriptions"))
     assert all(answer["passed"].values())
 
 
 def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
-    answer = json.loads(run_study(root, "line_test"))
+    answer = json.loads(run_study(root, "studies.modes.lines.run"))
     assert all(answer["passed"].values())
-
-
-def test_tracking_lives(root: Path) -> None:
-    """One life of some kinds is tracked; a crash alarms, and so does what is not known."""
-    answer = json.loads(run_study(root, "tracking_lives"))
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    # One life tells no rate of alarms.
-    assert failed <= {"what is unknown alarms"}
-    # One life in a hundred alarms for nothing: no single one of these does.
-    alarms = {(row["stage"], row["name"]): row["alarms"]["hits"] for row in answer["lives"]}
-    assert {name for name, hits in alarms.items() if hits} == {("lms-y", "crash")}
-    # Of forty logs and three modes that depend on each other most lie inside.
-    assert all(row["coverage"]["90"]["share_of_all"] > 0.5 for row in answer["lives"])
-    assert {row["name"]: row["alarms"]["hits"] for row in answer["controls"]} == dict.fromkeys(
-        ("retuning unseen", "temperature unknown", "payload unknown"), 1
-    )
-    assert answer["power"]["alarms"]["hits"] == 1
-    assert answer["power"]["over_best_that_learns"] < 3
 
 
 def test_off_model(root: Path) -> None:
     """Two lives of some worlds raise no false alarm; without wander in the model they do."""
-    answer = json.loads(run_study(root, "off_model"))
+    answer = json.loads(run_study(root, "studies.robustness.off_model.run"))
     checks = answer["passed"]
     assert all(fine for name, fine in checks.items() if name.startswith("alarms"))
     assert checks["a loss of 5 % is found"]
@@ -243,7 +153,7 @@ def test_off_model(root: Path) -> None:
 
 def test_raw_logs_of_drawn_machines(root: Path) -> None:
     """Raw logs of a nominal and of a drawn machine raise no false alarm and hold their drifts."""
-    answer = json.loads(run_study(root, "off_model", "raw"))
+    answer = json.loads(run_study(root, "studies.robustness.off_model.raw"))
     checks = answer["passed"]
     assert all(fine for name, fine in checks.items() if name.startswith(("false", "wrong")))
     assert answer["drawn machines"]["drift_held"]["n"] == 3
@@ -253,7 +163,7 @@ def test_raw_logs_of_drawn_machines(root: Path) -> None:
 
 def test_foreign_errors(root: Path) -> None:
     """Close modes are kept though errors are stated 8 times too wide; as stated they are lost."""
-    answer = json.loads(run_study(root, "off_model", "foreign"))
+    answer = json.loads(run_study(root, "studies.robustness.off_model.foreign"))
     checks = answer["passed"]
     assert checks["modes kept: 8.0"]
     assert checks["labels right: 8.0"]
@@ -285,7 +195,7 @@ def test_worlds_off_the_model_are_drawn_with_their_truth(name: str) -> None:
 
 def test_identification(root: Path) -> None:
     """Some records of three kinds are covered as stated, and no mode of them is refused."""
-    answer = json.loads(run_study(root, "identification"))
+    answer = json.loads(run_study(root, "studies.modes.identification.run"))
     assert all(answer["passed"].values())
     assert not [line for line in answer["not_met"] if "refused" in line]
     # All errors together are as large as is said of them.
@@ -294,18 +204,9 @@ def test_identification(root: Path) -> None:
     assert 0.5 < (sum(squares) / len(squares)) ** 0.5 < 2
 
 
-def test_identification_speed(root: Path) -> None:
-    """A log of 15 s takes some times what reading it takes, and fits into memory."""
-    answer = json.loads(run_study(root, "identification_speed"))
-    assert answer["passed"]["three times the record's memory"]
-    # Of so short a log what every identification takes weighs most: it is about five. The figure
-    # asked is that of the whole study's log of 60 s.
-    assert answer["log"]["least_ratio"] < 10
-
-
 def test_decays(root: Path) -> None:
     """Intervals of f and ζ from some decays cover, those of white noise less."""
-    answer = json.loads(run_study(root, "decays"))
+    answer = json.loads(run_study(root, "studies.modes.decays.run"))
     assert all(answer["passed"].values())
     assert answer["machines"]["n_modes"] > sum(answer["machines"]["refused"].values())
     (case,) = answer["cases"].values()
@@ -320,7 +221,7 @@ def test_decays(root: Path) -> None:
 def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
     """A few seeds per case cover, and two real benches give what is known of them."""
     needs("data")
-    answer = json.loads(run_study(root, "frf_modes"))
+    answer = json.loads(run_study(root, "studies.modes.frf.responses"))
     failed = {name for name, fine in answer["passed"].items() if not fine}
     assert failed <= set(answer["not_met"])
     # Intervals 1.5 times as narrow hold less, which so few seeds tell only all together.
@@ -333,14 +234,14 @@ def test_frf_modes(root: Path, needs: Callable[[str], None]) -> None:
 
 def test_frf_lines(root: Path) -> None:
     """A mode with three lines is found, one with fewer is refused as that."""
-    answer = json.loads(run_study(root, "frf_lines"))
+    answer = json.loads(run_study(root, "studies.modes.frf.lines"))
     assert all(answer["passed"].values())
     assert answer["found"]["n"] and answer["refused"]["n"]
 
 
 def test_single_logs(root: Path) -> None:
     """A few plain logs have no flag, most of an unsteady or coloured force have one."""
-    answer = json.loads(run_study(root, "single_logs"))
+    answer = json.loads(run_study(root, "studies.modes.single_logs.run"))
     flagged = ("bursts", "log-normal", "ramp", "hump")
     assert answer["passed"]["no flag where the model holds"]
     assert all(answer["passed"][f"most modes have the flag, {world}"] for world in flagged)
@@ -348,7 +249,7 @@ def test_single_logs(root: Path) -> None:
 
 def test_impact_tests(root: Path) -> None:
     """Every double hit of a few tests is refused, no other blow is, and no mode is false."""
-    answer = json.loads(run_study(root, "impact_tests"))
+    answer = json.loads(run_study(root, "studies.modes.frf.impacts"))
     exact = ("no mode is false", "double hits", "no other blow is refused")
     assert all(answer["passed"][name] for name in exact)
     assert answer["double_hits"]["n"] and answer["found"]["hits"] > 5
@@ -356,7 +257,7 @@ def test_impact_tests(root: Path) -> None:
 
 def test_crossings(root: Path) -> None:
     """Some lives of each kind are never swapped silently, and both controls may be."""
-    answer = json.loads(run_study(root, "crossings"))
+    answer = json.loads(run_study(root, "studies.track.crossings.run"))
     few = {"a best guess swaps there", "most labels are recovered", "the nearest swaps"}
     assert all(fine for name, fine in answer["passed"].items() if name not in few)
     assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 2
@@ -365,29 +266,13 @@ def test_crossings(root: Path) -> None:
 def test_beam_track(root: Path, needs: Callable[[str], None]) -> None:
     """The tracked state of a real beam returns to its start, told and not told of the roller."""
     needs("data")
-    answer = json.loads(run_study(root, "beam_track"))
+    answer = json.loads(run_study(root, "studies.track.beam"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
-
-
-def test_health_robustness(root: Path) -> None:
-    """Health is covered on a few lives of each kind, and less without the error of a wrong map."""
-    answer = json.loads(run_study(root, "health_robustness"))
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    # So few lives tell narrow intervals by their share alone.
-    assert all(name.startswith("control") for name in failed)
-
-    def share(world: str, arm: str) -> float:
-        rows = [row for row in answer["fleets"]
-                if (row["world"], row["arm"], row["what"]) == (world, arm, "last")]  # fmt: skip
-        return sum(row["90"]["hits"] for row in rows) / sum(row["90"]["n"] for row in rows)
-
-    assert share("map 5 % wrong", "no error term") < share("map 5 % wrong", "coherent") - 0.1
-    assert answer["not_drawn"] == []
 
 
 def test_detectability(root: Path) -> None:
     """The posterior finds planned losses, and hardly any of none; the mount of X is not shown."""
-    answer = json.loads(run_study(root, "detectability"))
+    answer = json.loads(run_study(root, "studies.health.detectability"))
     assert all(answer["passed"].values())
     # So few draws of a point tell only all together.
     planned = [row for row in answer["checks"] if row["arm"] == "as planned"]
@@ -402,58 +287,16 @@ def test_detectability(root: Path) -> None:
 def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     """A roller under a real beam is where the posterior says, and two wrong ways lose it."""
     needs("data")
-    answer = json.loads(run_study(root, "movable_roller"))
+    answer = json.loads(run_study(root, "studies.health.movable_roller.run"))
     assert {name for name, fine in answer["passed"].items() if not fine} == set(answer["not_met"])
     assert answer["inside"]["inferred"] == 3
     (control,) = answer["controls"].values()
     assert control["inside"] < control["inferred"] == 3
 
 
-def test_new_machine(root: Path, needs: Callable[[str], None]) -> None:
-    """The tutorial's first steps do what it says; all its commands are those on record."""
-    needs("data")
-    answer = json.loads(run_study(root, "new_machine"))
-    assert all(answer["passed"].values())
-    assert [step["commands"] for step in answer["steps"]] == [
-        step["commands"] for step in recorded(root, "new_machine")["steps"][:3]
-    ]
-    # In what was followed something is shown that could fail to come out.
-    assert all(step.shown for step in steps()[:3])
-
-
-def test_the_tutorial_is_the_recorded_one(root: Path) -> None:
-    """The whole tutorial was followed as it now stands, and ended where the truth is."""
-    answer = recorded(root, "new_machine")
-    assert all(answer["passed"].values())
-    text = (root / "studies" / "new_machine" / "README.md").read_text(encoding="utf-8")
-    typed = [block.split("```")[0] for block in text.split("```sh\n")[1:]]
-    commands = [line for block in typed for line in block.replace("\\\n", "").splitlines()]
-    assert commands == [line for step in answer["steps"] for line in step["commands"]]
-    verbs = {line.split()[1] for line in commands if line.startswith("lmshealth")}
-    assert verbs == {"frf", "stage", "plan", "track", "infer", "prognose"}
-
-
-def test_a_line_of_the_tutorial_that_does_not_come_out_is_told(tmp_path: Path) -> None:
-    """Digits may differ, words may not; a command that fails ends the study with its error."""
-    shown = "one 1.25 of 3\ntwo 2.5\nthree words\n"
-    step = follow(Step("echo 'one 1.26   of 3'\necho 'three  words'\n", shown), tmp_path)
-    assert step["shown_and_not_come_out"] == ["two 2.5"]
-    with pytest.raises(SystemExit, match=r"(?s)ended with 2: .*no-such-command"):
-        follow(Step("lmshealth no-such-command\n", ""), tmp_path)
-
-
-def test_sampling_speed(root: Path) -> None:
-    """Posteriors are those of a grid and of filterpy, and no other way to them is faster."""
-    answer = json.loads(run_study(root, "sampling_speed"))
-    assert all(answer["passed"].values())
-    programs = {row["program"] for row in answer["epoch"]["programs"]}
-    # Peers are compared where they are installed.
-    assert len(programs) == 5 - len(answer["epoch"]["missing"])
-
-
 def test_sbc_epoch(root: Path) -> None:
     """Ranks of health at some epochs may be uniform; a map taken for exact covers much less."""
-    answer = json.loads(run_study(root, "sbc_epoch"))
+    answer = json.loads(run_study(root, "studies.health.calibration.run"))
     assert all(answer["passed"].values())
 
     def hits(kind: str) -> int:
@@ -465,7 +308,7 @@ def test_sbc_epoch(root: Path) -> None:
 
 def test_sbc_life(root: Path) -> None:
     """Ranks of health and remaining life are uniform; who takes every part to lose is found out."""
-    answer = json.loads(run_study(root, "sbc_life"))
+    answer = json.loads(run_study(root, "studies.life.calibration.run"))
     assert all(answer["passed"].values())
     assert answer["not_converged"] == 0
     # A part that keeps its health lies below all draws of who says that it cannot.
@@ -478,16 +321,9 @@ def test_sbc_life(root: Path) -> None:
     assert low["every part taken to lose"] > 0.25 * 2 * lives["every part taken to lose"]
 
 
-def test_sbc_life_updated(root: Path) -> None:
-    """A life updated twice is that from nothing; without the last logs it differs."""
-    answer = json.loads(run_study(root, "sbc_life", "updated"))
-    assert answer["passed"]["updates are fits from nothing"]
-    assert answer["passed"]["twenty logs make a difference (control)"]
-
-
 def test_cost_of_a_log(root: Path) -> None:
     """After a new log answers are those from nothing, and a machine without one costs nothing."""
-    passed = json.loads(run_study(root, "cost_of_a_log"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost.new_log.run"))["passed"]
     assert passed["epochs are those of a run from nothing"]
     assert passed["lives are those of a run from nothing"]
     assert passed["another life differs"]
@@ -496,25 +332,14 @@ def test_cost_of_a_log(root: Path) -> None:
 
 def test_cost_of_a_log_of_a_fleet(root: Path) -> None:
     """Nothing new costs nothing; lives by the prior of the fleet are those from nothing."""
-    passed = json.loads(run_study(root, "cost_of_a_log", "fleet"))["passed"]
+    passed = json.loads(run_study(root, "studies.cost.new_log.fleet"))["passed"]
     names = ("nothing new", "some take the prior of the fleet", "lives are those from nothing")
     assert all(passed[name] for name in names)
 
 
-def test_lifetimes_raw(root: Path) -> None:
-    """From raw logs to the remaining life: a life of four logs is told, and not refused."""
-    answer = json.loads(run_study(root, "lifetimes_raw"))
-    assert answer["refused"] == []
-    ranks = answer["ranks"]["map believed"]
-    assert {row["n"] for row in ranks.values()} == {1}
-    # Both healths together do not lie far out among their draws.
-    assert sum(sum(ranks[f"{name} now"]["histogram"][1:-1]) for name in PARTS) >= 1
-    assert all(answer["passed"].values())
-
-
 def test_blind_lives(root: Path) -> None:
     """A sound machine and one that is too young are told as such, and none as what it is not."""
-    answer = json.loads(run_study(root, "blind_lives"))
+    answer = json.loads(run_study(root, "studies.robustness.blind_lives.run"))
     assert all(answer["passed"].values())
     told = answer["verdicts"]["all"]
     # The third is of a drawn machine, from estimates.
@@ -525,7 +350,7 @@ def test_blind_lives(root: Path) -> None:
 
 def test_remaining_life_of_unknown_courses(root: Path) -> None:
     """Two lives that accelerate late are held; the named laws alone service both too late."""
-    answer = json.loads(run_study(root, "off_model", "remaining"))
+    answer = json.loads(run_study(root, "studies.life.unknown_courses"))
     found = answer["courses"]["late"]["all"]
     assert found["n"] == 2
     assert (found["now"]["held"], found["now"]["late"]) == (2, 0)
@@ -534,41 +359,26 @@ def test_remaining_life_of_unknown_courses(root: Path) -> None:
 
 def test_one_guide(root: Path) -> None:
     """The preload of a shared guide is known better, and the mount of X is not claimed."""
-    answer = json.loads(run_study(root, "one_guide"))
+    answer = json.loads(run_study(root, "studies.health.one_guide"))
     assert all(answer["passed"].values())
-
-
-def test_rul_metrics(root: Path) -> None:
-    """A life that wears and loosens is told before its end, by all ways that are installed."""
-    answer = json.loads(run_study(root, "rul_metrics"))
-    assert all(answer["passed"].values())
-    ways = {"lmshealth", "line", "a tenth of the spread"}
-    if not answer["missing"]:  # peers are compared where they are installed
-        ways |= {"progpy", "progpy, all runs kept"}
-    assert len(answer["cuts"]) == 1
-    for cut in answer["cuts"]:
-        assert set(cut["ways"]) == ways
-        # Knowing that the map is right can only help.
-        bounds = cut["bound"]
-        assert bounds["map right"]["accurate"] > bounds["map to 5 %"]["accurate"]
 
 
 def test_errors_of_the_map(root: Path) -> None:
     """A mode that drifts by 30 % more is named with its size, and none with the exact map."""
-    worlds = json.loads(run_study(root, "off_model", "map_errors"))["worlds"]
+    worlds = json.loads(run_study(root, "studies.robustness.off_model.map_errors"))["worlds"]
     assert (worlds["exact"]["n"], worlds["exact"]["warned"]) == (1, 0)
     assert (worlds["pitch"]["n"], worlds["pitch"]["named"]) == (1, 1)
 
 
 def test_calibration_by_ended_lives(root: Path) -> None:
     """A fleet with one ended life and one machine is predicted, and too small to be judged."""
-    answer = json.loads(run_study(root, "fleet_prior", "conformal"))
+    answer = json.loads(run_study(root, "studies.life.fleet.conformal"))
     assert (answer["ended"], answer["running"], "ways" in answer) == (1, 1, False)
 
 
 def test_fleet_prior(root: Path) -> None:
     """What a fleet teaches is nearer to what can be known; what another fleet teaches is not."""
-    answer = json.loads(run_study(root, "fleet_prior"))
+    answer = json.loads(run_study(root, "studies.life.fleet.run"))
     assert all(answer["passed"].values())
     lost = {way: found["lost_km"][0] for way, found in answer["ways"].items()}
     assert lost["known"] == 0
@@ -576,37 +386,9 @@ def test_fleet_prior(root: Path) -> None:
     assert lost["learned"] < lost["another fleet teaches"]
 
 
-def test_faults_kills(root: Path, needs: Callable[[str], None]) -> None:
-    """A batch whose run is killed ends as if uninterrupted, and a wrong one is seen."""
-    needs("postgres")
-    answer = json.loads(run_study(root, "faults", "kills"))
-    assert all(answer["passed"].values())
-    assert {kind: found["how"] for kind, found in answer["kills"].items()} == {
-        "postgres": {"main": 1}
-    }
-
-
-def test_faults_losses(root: Path, needs: Callable[[str], None]) -> None:
-    """A full disk and a lost database are told in one line, and nothing is lost by them."""
-    needs("postgres")
-    answer = json.loads(run_study(root, "faults", "losses"))
-    assert all(answer["passed"].values())
-    assert answer["lost database"]["failed"] == 1
-    # Not every place lets a file system be made.
-    assert answer["full disk"] is None or answer["full disk"]["failed"] == 1
-
-
-def test_faults_workers(root: Path, needs: Callable[[str], None]) -> None:
-    """A batch on Dask whose worker is killed ends as if nothing had happened."""
-    needs("distributed")
-    answer = json.loads(run_study(root, "faults", "workers"))
-    assert all(answer["passed"].values())
-    assert answer["workers killed"]["n"] == 1
-
-
 def test_bad_inputs_damaged(root: Path) -> None:
     """Of an archive with damage of many kinds every log is told right, and wrong tales are not."""
-    answer = json.loads(run_study(root, "bad_inputs", "damaged"))
+    answer = json.loads(run_study(root, "studies.inputs.damaged.run"))
     assert all(answer["passed"].values())
     assert answer["good_analysed"] == answer["good"] == 8
     assert answer["damaged_told_right"] == answer["damaged"] > 12
@@ -614,58 +396,20 @@ def test_bad_inputs_damaged(root: Path) -> None:
 
 def test_bad_inputs_time_axes(root: Path) -> None:
     """Of some odd time axes and degenerate sets none is wrong unnamed, and unchecked ones are."""
-    answer = json.loads(run_study(root, "bad_inputs", "time_axes"))
+    answer = json.loads(run_study(root, "studies.inputs.time_axes"))
     assert all(answer["passed"].values())
     assert answer["sets_named_right"] == answer["sets"] >= 2
 
 
 def test_bad_inputs_channels(root: Path) -> None:
     """A log of many channels stays within bounds, and a wrong rate is seen."""
-    answer = json.loads(run_study(root, "bad_inputs", "channels"))
+    answer = json.loads(run_study(root, "studies.cost.channels"))
     assert all(answer["passed"].values())
-
-
-def test_bad_inputs_mutants(root: Path) -> None:
-    """A few damaged files of all forms, texts and stores are refused or read right."""
-    answer = json.loads(run_study(root, "bad_inputs", "mutants"))
-    assert all(answer["passed"].values())
-    assert sum(row["mutants"] for row in answer["mutants_of_files"]) == 120
-
-
-def test_bad_inputs_injection(root: Path) -> None:
-    """Some hostile names, files and addresses are text, reach nothing, and show no password."""
-    answer = json.loads(run_study(root, "bad_inputs", "injection"))
-    assert all(answer["passed"].values())
-    # Beside the pages of machines there are that of all and that of examples.
-    assert answer["stores"]["sqlite"]["pages"] == answer["stores"]["sqlite"]["machines"] + 2
-
-
-def test_faults_together(root: Path) -> None:
-    """Of two runs that share a store one may be killed; both end as they do alone."""
-    answer = json.loads(run_study(root, "faults", "together"))
-    assert answer["pairs"]["sqlite"] == {"same logs, one killed": {"n": 1, "wrong": []}}
-
-
-def test_scale_index(root: Path, needs: Callable[[str], None]) -> None:
-    """The front page of many stages is light, and a row out of sight costs nothing."""
-    needs("chromium")
-    answer = json.loads(run_study(root, "scale", "index"))
-    assert all(answer["passed"].values())
-
-
-def test_scale_cost(root: Path) -> None:
-    """Archives of several sizes are analysed, and what a log costs is told."""
-    answer = json.loads(run_study(root, "scale", "cost"))
-    failed = {name for name, fine in answer["passed"].items() if not fine}
-    # The first of so few logs bears what is imported late.
-    assert failed <= {"flat", "little beside identification"}
-    assert [row["logs"] for row in answer["sizes"]] == [2, 4, 8]
-    assert all(min(row["yardstick_ms"]) > 0 for row in answer["sizes"])
 
 
 def test_scale_speedup(root: Path) -> None:
     """One and two workers of this machine are timed beside bare processes."""
-    answer = json.loads(run_study(root, "scale", "speedup"))
+    answer = json.loads(run_study(root, "studies.cost.workers"))
     # A log takes the main process some milliseconds, and workers find many in a second.
     assert 0 < answer["serial_ms"]["local"][1] < 1e3
     assert answer["rate"]["local"] > 0
@@ -680,41 +424,10 @@ def test_the_model_of_scale_speedup(monkeypatch: pytest.MonkeyPatch) -> None:
     rates = {n: own / (1 + serial_ms / log_ms) for n, own in bound.items()} | {"1": 10.0}
     turn: dict[str, Any] = {"bound": bound, "local": rates, "scheduler_ms": {}}
     turn["serial_ms"] = {"local": {"2": serial_ms, "4": serial_ms}}
-    found = speedup.judged([turn], ("local",))
+    found = judged([turn], ("local",))
     assert found["model"]["local"] == {"2": 1.863, "4": 1.961}
     assert found["passed"]["local: model of 2"]
     assert found["passed"]["local: model of 4"]
     assert not found["passed"]["local: at most 1 ms per log"]
     slow = turn | {"local": rates | {"4": 14.0}}
-    assert not speedup.judged([slow], ("local",))["passed"]["local: model of 4"]
-
-
-def test_scale_plan(root: Path) -> None:
-    """The cost of a stage becomes that of an archive, which more workers shorten."""
-    answer = json.loads(run_study(root, "scale", "plan"))
-    assert all(answer["passed"].values())
-    hours = [plan["hours"] for plan in answer["plans"]]
-    assert hours == sorted(hours, reverse=True)
-
-
-def test_install(root: Path) -> None:
-    """Import and help take less than what any such program imports, all names more."""
-    answer = json.loads(run_study(root, "install"))
-    assert all(answer["passed"].values())
-    assert answer["start"]["times_bare"]["all names"] > 1
-
-
-def test_mutants(root: Path) -> None:
-    """A small change of a module is tried, which passes as it is and fails where it must."""
-    answer = json.loads(run_study(root, "mutants"))
-    assert answer["mutants"]["n"] == 1
-    assert answer["controls"] == {"as it is": {"survived": 1}, "planted": {"killed": 1}}
-    assert answer["that no test runs"] == 0
-
-
-def test_compat(root: Path) -> None:
-    """A few tests pass with another kernel, and fail where transforms are 1 % too large."""
-    answer = json.loads(run_study(root, "compat"))
-    assert all(answer["passed"].values())
-    (case,) = answer["cases"]
-    assert case["kernel"] == "Haswell" and case["passed"] > 0
+    assert not judged([slow], ("local",))["passed"]["local: model of 4"]

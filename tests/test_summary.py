@@ -1,4 +1,4 @@
-"""The page of claims is what the records say, and has them all."""
+"""The pages of claims are computed from the records, and have all of them."""
 
 from __future__ import annotations
 
@@ -9,87 +9,108 @@ from typing import Any
 import pytest
 
 from studies.harness import summary
-from studies.harness.claims import STEPS, Claim, counted, covered
+from studies.harness.claims import Claim, counted, covered
+from studies.harness.figures import draw, shown
 from studies.harness.study import Study
 
 
 @pytest.fixture
 def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Copy scripts and records to a folder that the page is then of."""
-    for path in summary.HERE.glob("*/*"):
-        if path.suffix in (".py", ".json"):
-            there = tmp_path / path.parent.name / path.name
-            there.parent.mkdir(exist_ok=True)
+    """Copy scripts, records and pages to a folder that the pages are then of."""
+    for path in summary.HERE.rglob("*"):
+        if path.suffix in (".py", ".json", ".md"):
+            there = tmp_path / path.relative_to(summary.HERE)
+            there.parent.mkdir(parents=True, exist_ok=True)
             there.write_bytes(path.read_bytes())
     monkeypatch.setattr(summary, "HERE", tmp_path)
     return tmp_path
 
 
-def test_page_is_up_to_date() -> None:
-    """The page beside the studies is what `python -m studies.harness.summary` writes."""
-    assert summary.PAGE.read_text(encoding="utf-8") == summary.page()
+def test_pages_are_up_to_date() -> None:
+    """The pages of the studies are those that `python -m studies.harness.summary` writes."""
+    assert (summary.HERE / "README.md").read_text(encoding="utf-8") == summary.overview()
+    for group in summary.GROUPS:
+        page = (summary.HERE / group / "README.md").read_text(encoding="utf-8")
+        assert page == summary.group_page(group), group
+
+
+def test_the_first_page_takes_two_screens() -> None:
+    """The page of all studies has at most 90 lines, and the folder eight groups."""
+    assert len(summary.overview().splitlines()) <= 90
+    folders = {path.relative_to(summary.HERE).parts[0] for path in summary.HERE.rglob("*.py")}
+    assert folders - {"harness", "notebooks"} == set(summary.GROUPS)
 
 
 def test_every_record_claims_something() -> None:
-    """Every record of a study is on the page, with a claim of a known step, its date and links."""
-    found = {(record.study, record.name): record for record in summary.records()}
-    recorded = {(path.parent.name, path.stem) for path in summary.HERE.glob("*/*.json")}
-    assert recorded == {key for key, record in found.items() if record.content is not None}
-    text = summary.page()
-    for (study, name), record in found.items():
-        assert record.step in STEPS
-        assert f"({study}/{record.script})" in text
-        if record.content is not None:
-            assert record.claims
-            assert f"({study}/{name}.json)" in text
-            assert record.content["recorded"]["date"] in text
+    """Every record of a study is on the page of its group, with a claim, its date and links."""
+    found = [record for group in summary.GROUPS for record in summary.records(group)]
+    recorded = {p for group in summary.GROUPS for p in (summary.HERE / group).rglob("*.json")}
+    assert recorded == {record.path for record in found if record.content is not None}
+    for group in summary.GROUPS:
+        text, folder = summary.group_page(group), summary.HERE / group
+        for record in summary.records(group):
+            assert f"({record.script.relative_to(folder).as_posix()})" in text
+            if record.content is not None:
+                assert record.claims
+                assert f"({record.path.relative_to(folder).as_posix()})" in text
+                assert record.content["recorded"]["date"] in text
 
 
 def test_every_study_has_claims() -> None:
-    """Every program that can record something has a place on the page."""
-    told = {(record.study, record.script) for record in summary.records()}
+    """Every program that can record something has a place on the page of its group."""
+    stated = {record.script for group in summary.GROUPS for record in summary.records(group)}
     programs = {
-        (path.parent.name, path.name)
-        for path in summary.HERE.glob("*/*.py")
+        path
+        for path in summary.HERE.rglob("*.py")
         if "study.conclude(" in path.read_text(encoding="utf-8")
     }
-    assert programs == told
+    assert programs == stated
+
+
+def test_every_figure_is_of_a_record() -> None:
+    """There is a figure of each record with some shares, and no other."""
+    found = [record for group in summary.GROUPS for record in summary.records(group)]
+    drawn = {p for group in summary.GROUPS for p in (summary.HERE / group).rglob("*.svg")}
+    assert drawn == {record.figure for record in found if shown(record.claims)}
 
 
 def test_figures_follow_the_record(copied: Path) -> None:
-    """Another record gives other figures, ends the note that it is older, and may not be met."""
-    path = copied / "demo_life" / "result.json"
-    before = summary.page()
+    """Another record gives other figures, in the table of claims and in the overview."""
+    path = copied / "life" / "unknown_courses.json"
     record = json.loads(path.read_text())
-    assert record["n_lives"] == record["remaining_km"]["inside_90"] == 10
-    assert "Recorded before laws were weighed" in before.split("### demo_life")[1].split("###")[0]
-    record["remaining_km"]["inside_90"] = 7
+    row = record["courses"]["late"]["all"]["now"]
+    assert row["held"] == 60
+    assert "| 90 % intervals of the remaining life hold: late | 60 of 60 |" in summary.group_page(
+        "life"
+    )
+    row["held"] = 47
     path.write_text(json.dumps(record))
-    part = summary.page().split("### demo_life")[1].split("###")[0]
-    assert "7 of 10" in part
-    assert "7 of 10" not in before.split("### demo_life")[1].split("###")[0]
-    assert "Recorded before" not in part
+    assert "| 90 % intervals of the remaining life hold: late | 47 of 60 |" in summary.group_page(
+        "life"
+    )
+    assert "remaining life hold: late: 47 of 60" in summary.overview()
 
 
-def test_missing_record_is_told(copied: Path) -> None:
-    """What is not recorded is told, and claims nothing."""
-    (copied / "crossings" / "result.json").unlink()
-    text = summary.page()
-    part = text.split("### crossings")[1].split("###")[0]
+def test_a_missing_record_is_reported(copied: Path) -> None:
+    """A study without a record is named as such, and claims nothing."""
+    (copied / "health" / "detectability.json").unlink()
+    part = summary.group_page("health").split("### detectability")[1].split("###")[0]
     assert "**Not recorded**" in part
-    assert "crossings/result" in text.split("Not recorded: ")[1].split("\n")[0]
     assert "|" not in part
+    (line,) = [one for one in summary.overview().splitlines() if "[health/detectability]" in one]
+    assert line.endswith("|  |  |  | no |")
 
 
-def test_what_failed_is_told(copied: Path) -> None:
-    """What a record says not to be so stands on the page, with its reason."""
-    path = copied / "frf_modes" / "result.json"
+def test_what_failed_is_reported(copied: Path) -> None:
+    """A check that a record has as not met stands on the page, with its reason."""
+    path = copied / "modes" / "frf" / "responses.json"
     record: dict[str, Any] = json.loads(path.read_text())
-    assert "Check not met: *coverage*" not in summary.page()
+    assert "Check not met: *coverage*" not in summary.group_page("modes")
     record["passed"]["coverage"] = False
     record["not_met"]["coverage"] = "the noise was another one"
     path.write_text(json.dumps(record))
-    assert "Check not met: *coverage*: the noise was another one." in summary.page()
+    expected = "Check not met: *coverage*: the noise was another one."
+    assert expected in summary.group_page("modes")
 
 
 def test_claims_are_judged() -> None:
@@ -100,7 +121,17 @@ def test_claims_are_judged() -> None:
     assert counted("of", 10, 10) == Claim("of", "10 of 10", "69.2 to 100.0 % (95 %)")
 
 
-def test_interrupted_time_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_shares_are_drawn(tmp_path: Path) -> None:
+    """A figure names every claim of a share; two shares are left to the table."""
+    claims = [counted(f"what is counted {k}", k, 10) for k in range(3)]
+    assert shown([*claims, Claim("a time", "3 s")]) == claims
+    assert shown(claims[:2]) == []
+    draw(claims, tmp_path / "figure.svg")
+    text = (tmp_path / "figure.svg").read_text()
+    assert all(claim.what in text for claim in claims)
+
+
+def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A record has the run time, and that of trials that were done before an interruption."""
     monkeypatch.setattr("sys.argv", ["run.py"])
     study = Study(str(tmp_path / "run.py"), "Is it so?\n\nMore.")
@@ -112,10 +143,10 @@ def test_interrupted_time_is_told(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_quick_form_records_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The quick form keeps and records nothing, and fails where it is not as asked."""
+    """The quick form keeps and records nothing, and fails where a check fails."""
     monkeypatch.setattr("sys.argv", ["run.py", "--quick"])
     study = Study(str(tmp_path / "run.py"), "Is it so?")
-    assert study.kept("anything") is None
+    study.trials.once(abs, -1)
     with pytest.raises(SystemExit, match="it is"):
         study.conclude({"passed": {"it is": False}})
     study.conclude({"passed": {"it is": False}}, not_met=["it is"])

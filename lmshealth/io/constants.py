@@ -77,7 +77,7 @@ FILLED_ERROR = 0.3
 """Largest share of the power spectral density that errors of filled samples may have, at any
 frequency. It is reached at the lowest level between resonances, where least of a mode is seen: with
 8 % of the samples missing in gaps of 12 (share 0.25) damping ratios are 1 to 2 % low, half of their
-standard deviation over 40 s (`studies/outside_faults`)."""
+standard deviation over 40 s (`studies/inputs/outside_faults`)."""
 ORDINARY = 8.0
 """Standard deviations of the prediction error up to which samples beside a filled one are ordinary.
 10⁹ samples of normal noise stay below 6.2; a blow or a step exceeds it, and is not filled in."""

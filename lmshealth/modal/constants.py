@@ -132,7 +132,7 @@ FRF_MOST_DAMPING = 0.2
 # this share: distortion bends whole resonances and looks like further modes.
 DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
 # A fit that misses this share of the response (amplitude, beyond noise) shows no modes, and where
-# this share is noise, it may be why none is found: the real benches of studies/frf_modes, bent by
+# this share is noise, it may be why none is found: the real benches of studies/modes/frf, bent by
 # friction, miss up to 0.12.
 FRF_MISSED = 1 / 3
 # Harmonics below this share of the strongest amplitude of the input have none; an output above the

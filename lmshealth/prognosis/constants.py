@@ -13,17 +13,17 @@ MAX_LOGS = 200
 """Longer histories are condensed: the cost of Σ grows with the third power of the logs. Medians and
 widths of health change by less than a quarter of a 90 % interval when 240 logs become 40 (test)."""
 
-# Priors of nuisance parameters; studies/sbc_life has the ranks of the truth under them.
+# Priors of nuisance parameters; studies/life/calibration has the ranks of the truth under them.
 INTERCEPT_STD = 0.1
 """Standard deviation of ln f of a mode at the baseline: so wide that only the data decide."""
 STEP_PRIOR = Normal(0.0, 0.3)
 """Ln factor on a health parameter at a step: one standard deviation is a loss of a quarter."""
 WALK_STDS = (1e-5, 5e-4, 1.5e-3, 5e-3, 1.5e-2)
 """Standard deviations over the history of the random walk of ln f, equally probable: from none to
-several times the 0.4 % that frequencies of a real building move by (studies/modes_real)."""
+several times the 0.4 % that frequencies of a real building move by (studies/modes/real)."""
 NOISE_SCALES = (1.0, 1.5, 2.25)
 """Factors on the reported standard deviations of ln f; 1 is probable, as 95 % intervals of the
-identification cover 95 % (studies/identification)."""
+identification cover 95 % (studies/modes/identification)."""
 NOISE_SCALE_PRIOR = (0.9, 0.07, 0.03)
 DEVIATION_STDS = (0.0, 0.0125, 0.05)
 """Standard deviations over the history of ln health about its law: exact laws, and deviations that

@@ -9,7 +9,7 @@ import numpy as np
 # --- Alarms and change detection ----------------------------------------------------------------
 # Probability that a machine without damage ever raises an alarm, however many logs are judged. A
 # log Bayes factor of ln(routes / probability) is required (Ville's inequality [Ville1939]). It is
-# no setting: the rates of alarms and detections in studies/tracking_lives hold for this value only.
+# no setting: the rates of alarms and detections in studies/robustness hold for this value only.
 FALSE_ALARM_PROBABILITY = 0.01
 # An alarm has three routes: drift since the baseline, drift that begins later, and a step.
 ALARM_ROUTES = 3

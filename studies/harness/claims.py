@@ -1,38 +1,17 @@
 """Claims of a study: a figure, its interval, and its comparison in the same run.
 
-A script that writes a record names the step of the method that it examines in ``STEP``. Its
-function ``claims`` computes the claims from the record alone; if it writes further records,
-``claims_NAME`` does so for ``NAME.json``.
+The function ``claims`` of a script computes the claims from its record alone.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
-from studies.common.metrics import clopper_pearson
+from studies.harness.metrics import clopper_pearson
 
 Row = Mapping[str, Any]
-STEPS = (
-    "read",
-    "spectra, following error, accelerations",
-    "lines",
-    "identify",
-    "identify, after stops",
-    "identify FRF logs",
-    "track",
-    "infer",
-    "prognose",
-    "prognose, young machines",
-    "prognose, compared with others",
-    "health, on machines outside the model",
-    "plan",
-    "batch",
-    "all of it, from raw logs to the report",
-    "simulated plants",
-    "the tests themselves",
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,14 +23,8 @@ class Claim:
     interval: str = ""  # uncertainty: an interval or a Monte-Carlo error
     beside: str = ""  # peer, bound, requirement or control in the same run
     met: bool = True  # the requirement
-
-
-@dataclass(frozen=True, slots=True)
-class Older:
-    """A record that is older than a correction of the code that it measures."""
-
-    digest: str  # first digits of the SHA-256 of the record: a new record ends the note
-    why: str  # correction since then
+    # Shares with the ends of their intervals, which the figure of the record shows.
+    shares: tuple[tuple[float, float, float], ...] = field(default=(), compare=False)
 
 
 def number(value: float) -> str:
@@ -77,8 +50,9 @@ def percents(shares: Iterable[float]) -> str:
 
 def counted(what: str, hits: int, n: int, beside: str = "", *, met: bool = True) -> Claim:
     """Claim a count, with the 95 % Clopper-Pearson interval of the share."""
-    interval = f"{percents(clopper_pearson(hits, n))} (95 %)"
-    return Claim(what, f"{hits:,} of {n:,}", interval, beside, met)
+    ends = clopper_pearson(hits, n)
+    figure, interval = f"{hits:,} of {n:,}", f"{percents(ends)} (95 %)"
+    return Claim(what, figure, interval, beside, met, ((hits / n, *ends),))
 
 
 def share(what: str, row: Row, beside: str = "", *, met: bool = True) -> Claim:
@@ -102,6 +76,7 @@ def covered(what: str, rows: Iterable[Row], beside: str = "", *, met: bool | Non
         f"± {100 * margin:.1f} % at most (99.9 %)",
         beside,
         all(row["holds"] for row in found) if met is None else met,
+        tuple((row["share"], row["low"], row["high"]) for row in found),
     )
 
 

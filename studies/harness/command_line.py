@@ -8,7 +8,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from importlib import import_module
 from math import inf
-from pathlib import Path
 from unittest.mock import patch
 
 from click.testing import CliRunner
@@ -17,8 +16,8 @@ from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling
 from lmshealth.prognosis import constants as prognosis_constants
 from lmshealth.report import figures as plots
+from studies.harness.checkout import ROOT
 
-ROOT = Path(__file__).parents[2]
 _SOME_REFUSED = 3
 # Where the commands of a program are.
 _GROUPS = {"lmshealth": ("lmshealth.cli.main", "main"), "models": ("models.__main__", "cli")}

@@ -7,7 +7,6 @@ kernel signals it (`setpriv --pdeathsig`). All listen on this machine alone.
 from __future__ import annotations
 
 import os
-import random
 import secrets
 import shutil
 import signal
@@ -230,12 +229,6 @@ class Cluster:
                   "--memory-limit", "0", "--death-timeout", str(WAIT_S),
                   "--local-directory", self.folder)
         )  # fmt: skip
-
-    def replace_worker(self, rng: random.Random) -> None:
-        """Kill one of the living workers, and start another."""
-        living = [worker for worker in self.workers if worker.poll() is None]
-        rng.choice(living).kill()
-        self.add_worker()
 
     def await_workers(self, n: int) -> None:
         """Wait until so many workers have registered."""

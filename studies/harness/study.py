@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from studies.common.metrics import clopper_pearson
+from studies.harness.metrics import clopper_pearson
 from studies.harness.provenance import code_of, name_of
 
 Row = dict[str, Any]
@@ -58,13 +58,10 @@ class Study:
             parser.add_argument(f"--{name}", default=default, **kind)
         self.options = parser.parse_args()
         self.quick: bool = self.options.quick
-        self._folder, self._stem = Path(script).parent, Path(script).stem
+        self._script = Path(script)
         self._question = str(doc).split("\n", 1)[0]
-        self.trials = Trials(self.kept(self._folder.name))
-
-    def kept(self, name: str) -> Path | None:
-        """Return the file in which trials are kept; None for the quick form."""
-        return None if self.quick else KEPT / f"{name}.jsonl"
+        name = "-".join(self._script.resolve().with_suffix("").parts[-3:])
+        self.trials = Trials(None if self.quick else KEPT / f"{name}.jsonl")
 
     def pool(self, n: int = 2) -> AbstractContextManager[Executor | None]:
         """Return a pool of ``n`` processes; the quick form stays in this process."""
@@ -75,7 +72,6 @@ class Study:
         answer: Mapping[str, Any],
         *,
         details: Mapping[str, Any] | None = None,
-        name: str = "",
         not_met: Iterable[str] = (),
         quick_may_fail: bool = False,
     ) -> None:
@@ -83,8 +79,8 @@ class Study:
 
         ``passed`` of the answer has a bool for each check; those in ``not_met`` are documented as
         not passed: of a mapping, the reasons of those that are not are added to the answer.
-        ``details`` are recorded and not printed, in a record of another ``name`` than the script's
-        if it is given. A quick form that is too small to be judged may fail.
+        ``details`` are recorded and not printed. A quick form that is too small to be judged may
+        fail.
         """
         failed = [check for check, fine in answer.get("passed", {}).items() if not fine]
         if isinstance(not_met, Mapping):
@@ -92,8 +88,7 @@ class Study:
             answer = {**answer, "not_met": reasons}
         print(json.dumps(answer, indent=1))
         if not self.quick:
-            name = name or {"run": "result"}.get(self._stem, self._stem)
-            self._write(self._folder / f"{name}.json", {**answer, **(details or {})})
+            self._write(record_of(self._script), {**answer, **(details or {})})
         if not set(failed) <= set(not_met) and not (self.quick and quick_may_fail):
             raise SystemExit(f"not as asked: {failed}")
 
@@ -231,7 +226,13 @@ def real_data() -> Path:
     return Path(os.environ["LMSHEALTH_DATA"])
 
 
-def read_record(script: str, name: str = "result") -> Row:
-    """Read a record from the folder of a script."""
-    found: Row = json.loads((Path(script).parent / f"{name}.json").read_text(encoding="utf-8"))
+def record_of(script: str | Path) -> Path:
+    """Return the file of a script's record: ``result.json`` of ``run.py``, else of its own name."""
+    path = Path(script)
+    return path.with_name("result.json" if path.stem == "run" else f"{path.stem}.json")
+
+
+def read_record(script: str) -> Row:
+    """Read the record of a script."""
+    found: Row = json.loads(record_of(script).read_text(encoding="utf-8"))
     return found

@@ -1,121 +1,155 @@
-"""Write `README.md` of the studies: all claims, as they were recorded.
+"""Write the pages of the studies: all claims, as they were recorded, and their figures.
 
-``python -m studies.harness.summary`` writes the part of that page between its two `MARKS`.
+``python -m studies.harness.summary`` writes what stands between `MARKS` in ``studies/README.md``,
+one line a record, and in the page of each group, all claims of its records, and the figure of each
+record with enough shares.
 """
 
 from __future__ import annotations
 
 import ast
-import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from studies.harness.claims import STEPS, Claim, Older
-from studies.harness.study import STUDIES
+from studies.harness.claims import Claim
+from studies.harness.figures import draw, shown
+from studies.harness.study import STUDIES, record_of
 
 HERE = STUDIES
-PAGE = HERE / "README.md"
+GROUPS = ("inputs", "modes", "track", "health", "life", "robustness", "paper", "cost")
 MARKS = "<!-- claims -->\n", "<!-- end of claims -->\n"
-_DIGITS = 12  # of the digest of a record that is older than a correction
 
 
 @dataclass(frozen=True, slots=True)
 class Record:
     """A record of a study, or the place of a record that does not exist yet."""
 
-    study: str  # folder
-    script: str
-    name: str  # of the record, without suffix
-    step: str  # of the method that it examines
-    older: Older | None  # correction since it was recorded
+    script: Path
+    question: str
     content: dict[str, Any] | None
     claims: tuple[Claim, ...]  # computed from the content
 
+    @property
+    def path(self) -> Path:
+        """Return the file of the record."""
+        return record_of(self.script)
 
-def records() -> Iterator[Record]:
-    """Find the records of all scripts that define claims, whether they exist or not."""
-    for path in sorted(HERE.glob("*/*.py")):
-        if "\nSTEP = " not in path.read_text(encoding="utf-8"):
+    @property
+    def figure(self) -> Path:
+        """Return the file of the figure."""
+        return self.path.with_suffix(".svg")
+
+    @property
+    def title(self) -> str:
+        """Return the name of the study, and of its part where it has several scripts."""
+        _, *names = self.script.relative_to(HERE).with_suffix("").parts
+        return ", ".join(name.replace("_", " ") for name in names if name != "run")
+
+    @property
+    def command(self) -> str:
+        """Return the command that records."""
+        parts = self.script.relative_to(HERE).with_suffix("").parts
+        return f"python -m {'.'.join(('studies', *parts))}"
+
+
+def records(group: str) -> list[Record]:
+    """Find the records of all scripts of a group that have claims, whether they exist or not."""
+    found = []
+    for script in sorted((HERE / group).rglob("*.py")):
+        text = script.read_text(encoding="utf-8")
+        if "\ndef claims(" not in text:
             continue
-        module = import_module(f"studies.{path.parent.name}.{path.stem}")
-        own = "result" if path.stem == "run" else path.stem
-        for function in (name for name in vars(module) if name.split("_")[0] == "claims"):
-            yield _record(
-                module, path, function, function.removeprefix("claims").lstrip("_") or own
-            )
+        question = (ast.get_docstring(ast.parse(text)) or "").split("\n")[0]
+        if record_of(script).exists():
+            content = json.loads(record_of(script).read_text(encoding="utf-8"))
+            parts = script.relative_to(HERE).with_suffix("").parts
+            module = import_module(".".join(("studies", *parts)))
+            found.append(Record(script, question, content, tuple(module.claims(content))))
+        else:
+            found.append(Record(script, question, None, ()))
+    return found
 
 
-def _record(module: Any, script: Path, function: str, name: str) -> Record:
-    path, study = script.with_name(f"{name}.json"), script.parent.name
-    if not path.exists():
-        return Record(study, script.name, name, module.STEP, None, None, ())
-    text = path.read_bytes()
-    older = getattr(module, "OLDER", {}).get(name)
-    # A new record ends the note.
-    if older and hashlib.sha256(text).hexdigest()[:_DIGITS] != older.digest:
-        older = None
-    content = json.loads(text)
-    claims = tuple(getattr(module, function)(content))
-    return Record(study, script.name, name, module.STEP, older, content, claims)
+def between_marks(page: Path, lines: Sequence[str]) -> str:
+    """Return a page with other lines between its marks."""
+    head, rest = page.read_text(encoding="utf-8").split(MARKS[0])
+    return "\n".join([head + MARKS[0], *lines, "", MARKS[1]]) + rest.split(MARKS[1])[1]
 
 
-def page() -> str:
-    """Return the page: all claims, and the text around them as it is."""
-    head, rest = PAGE.read_text(encoding="utf-8").split(MARKS[0])
-    found = list(records())
-    there = [record for record in found if record.content is not None]
+def overview() -> str:
+    """Return the page of all studies: one line a record."""
+    found = [(group, record) for group in GROUPS for record in records(group)]
+    there = [record for _, record in found if record.content is not None]
     claims = [claim for record in there for claim in record.claims]
-    short = sum(not claim.met for claim in claims)
     lines = [
-        head + MARKS[0],
-        f"{len(claims)} claims of {len(there)} records; **{short} are not met**.",
+        f"{len(claims)} claims of {len(there)} records; "
+        f"**{sum(not claim.met for claim in claims)} are not met**. Not recorded are "
+        f"{len(found) - len(there)} studies, which are new or whose code was corrected since.",
+        "",
+        "| study | question | answer: the first claim | claims | not met | recorded |",
+        "| --- | --- | --- | ---: | ---: | --- |",
     ]
-    if missing := [f"{r.study}/{r.name}" for r in found if r.content is None]:
-        lines.append(f"Not recorded: {', '.join(missing)}.")
-    for step in STEPS:
-        lines += ["", f"## {step[0].upper()}{step[1:]}"]
-        for record in found:
-            if record.step == step:
-                lines += ["", *section(record)]
-    return "\n".join(lines) + "\n\n" + MARKS[1] + rest.split(MARKS[1])[1]
+    for group, record in found:
+        link = f"[{group}/{record.title}]({group}/README.md#{anchor(record)})"
+        if record.content is None:
+            lines.append(row([link, record.question, "", "", "", "no"]))
+            continue
+        first, n = record.claims[0], len(record.claims)
+        interval = f"; {first.interval}" if first.interval else ""
+        short = sum(not claim.met for claim in record.claims)
+        made = record.content["recorded"]["date"]
+        answer = f"{first.what}: {first.figure}{interval}"
+        lines.append(row([link, record.question, answer, str(n), str(short), made]))
+    return between_marks(HERE / "README.md", lines)
 
 
-def section(record: Record) -> Iterator[str]:
-    """Return the lines of one record."""
-    title = record.study if record.name == "result" else f"{record.study}, {record.name}"
-    script = f"[{record.script}]({record.study}/{record.script})"
-    yield f"### {title}"
+def group_page(group: str) -> str:
+    """Return the page of a group: all claims of its records."""
+    lines: list[str] = []
+    for record in records(group):
+        lines += ["", *section(record, HERE / group)]
+    return between_marks(HERE / group / "README.md", lines[1:])
+
+
+def anchor(record: Record) -> str:
+    """Return the name of a record's heading in addresses."""
+    return record.title.replace(",", "").replace(" ", "-")
+
+
+def row(cells: Sequence[str]) -> str:
+    """Return a row of a table."""
+    return "| " + " | ".join(cell.replace("|", "&#124;") for cell in cells) + " |"
+
+
+def section(record: Record, folder: Path) -> Iterator[str]:
+    """Return the lines of one record on the page in a folder."""
+    yield f"### {record.title}"
     yield ""
+    script = f"[`{record.command}`]({record.script.relative_to(folder).as_posix()})"
     if record.content is None:
-        yield f"{question(record)} **Not recorded**: {script} has not been run in full."
+        yield f"{record.question} **Not recorded**: {script} has not been run in full."
         return
     made = record.content["recorded"]
-    link = f"[{record.name}.json]({record.study}/{record.name}.json)"
-    yield f"{question(record)} Recorded {made['date']} in {_duration(made)} by {script}: {link}."
-    if record.older:
-        yield f"**Recorded before {record.older.why}.**"
+    link = f"[record]({record.path.relative_to(folder).as_posix()})"
+    yield f"{record.question} {script}, recorded {made['date']} in {_duration(made)}: {link}."
     yield ""
     yield "| claim | figure | uncertainty | comparison | |"
     yield "| --- | --- | --- | --- | --- |"
     for claim in record.claims:
-        cells = (claim.what, claim.figure, claim.interval, claim.beside)
         met = "" if claim.met else "**not met**"
-        yield f"| {' | '.join(cell.replace('|', '&#124;') for cell in cells)} | {met} |"
+        yield row([claim.what, claim.figure, claim.interval, claim.beside, met])
+    if shown(record.claims):
+        yield ""
+        yield f"![shares and intervals]({record.figure.relative_to(folder).as_posix()})"
     reasons = record.content.get("not_met", {})
     for name, fine in record.content.get("passed", {}).items():
         if not fine:
             why = f": {reasons[name]}" if isinstance(reasons, dict) and name in reasons else ""
             yield from ("", f"Check not met: *{name}*{why}.")
-
-
-def question(record: Record) -> str:
-    """Return the question of a script."""
-    tree = ast.parse((HERE / record.study / record.script).read_text(encoding="utf-8"))
-    return (ast.get_docstring(tree) or "").split("\n")[0]
 
 
 def _duration(made: dict[str, Any]) -> str:
@@ -130,8 +164,15 @@ def _time(seconds: float) -> str:
 
 
 def main() -> None:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8")
+    """Write the pages and the figures."""
+    for group in GROUPS:
+        for record in records(group):
+            if claims := shown(record.claims):
+                draw(claims, record.figure)
+            else:
+                record.figure.unlink(missing_ok=True)
+        (HERE / group / "README.md").write_text(group_page(group), encoding="utf-8")
+    (HERE / "README.md").write_text(overview(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -89,5 +89,5 @@ assert verdicts["verdict"].to_dict() == {
 # The same as pages is in `result/index.html`, with a page for each machine.
 #
 # **What this does not show.** Three machines are too few for a fleet prior, with which young
-# machines use the lives of their elders: see the study `fleet_prior`. All three share one
+# machines use the lives of their elders: see the study `life/fleet`. All three share one
 # description; with several, give them all to `run`.

@@ -110,4 +110,4 @@ assert after < before - 0.04
 # this fault and wear are the same. Only another measurement tells them apart.
 #
 # **What this does not show.** How often warnings come where they must and where they must not: the
-# studies `off_model` and `lifetimes_raw` count that over many machines.
+# studies `off_model` and `drawn_machines` count that over many machines.

@@ -8,7 +8,7 @@
 # multisine for 20 s ([FdiTools](https://github.com/WataruOhnishi/FdiTools), W. Ohnishi, MIT
 # licence). The parameter of health is the stiffness of the coupling. The recording (2.5 MB) is
 # downloaded once and compared with its SHA-256. Run time: a minute on one processor.
-# [studies/new_machine](../new_machine) does the same at the command line, with more
+# [new_machine](new_machine/README.md) does the same at the command line, with more
 # explanations.
 
 # %%
@@ -24,7 +24,7 @@ import pooch
 import lmshealth as lh
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.manifest import read_manifest
-from studies.new_machine import cut, map
+from studies.notebooks.new_machine import cut, map
 
 COMMIT = "760b945947491d93917557a145e8637fa209c7d8"
 SHA256 = "a15dadc2e756ceddd927935f9c4c547cdcaef95c8611fc39087c848b3a8acb26"
@@ -34,7 +34,7 @@ PRIVATE = "Examples/private/MultisineTypeA.mat"
 kept = Path(os.environ.get("LMSHEALTH_DATA", "")) / cut.RECORDING
 recording = kept if kept.is_file() else Path(pooch.retrieve(f"{RAW}/{PRIVATE}", SHA256))
 assert pooch.file_hash(recording) == SHA256
-here = Path(lh.__file__).parents[1] / "studies" / "new_machine"
+here = Path(lh.__file__).parents[1] / "studies" / "notebooks" / "new_machine"
 folder = Path(tempfile.mkdtemp())
 
 # %% [markdown]

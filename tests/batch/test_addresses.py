@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from lmshealth.batch.addresses import shown_address, without_secrets
-from studies.bad_inputs.injection import ADDRESSES
+from tests.security.guards import ADDRESSES
 
 SECRET = "s3cr3t"
 

@@ -51,7 +51,7 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.track import accepted_estimates, track
-from studies.cost_of_a_log.life import apart
+from studies.cost.new_log.life import apart
 from studies.harness import servers
 from tests.assessments import Maker, make
 from tests.signals import sine, write_archive, write_archive_stage, write_log

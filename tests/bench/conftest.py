@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from studies.bench.ratios import Figure, table
+from studies.cost.ratios.ratios import Figure, table
 
 _FIGURES = pytest.StashKey[dict[str, dict[str, Any]]]()
 

@@ -29,9 +29,9 @@ from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
-from studies.frf_modes.records import BAND, MODES, RATE, Machine, periodic
-from studies.impact_tests.hammer import RATE as HAMMER_RATE
-from studies.impact_tests.hammer import Hammer, strike
+from studies.modes.frf.hammer import RATE as HAMMER_RATE
+from studies.modes.frf.hammer import Hammer, strike
+from studies.modes.frf.records import BAND, MODES, RATE, Machine, periodic
 from tests.assessments import nothing, worn
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 

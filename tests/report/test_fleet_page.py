@@ -17,8 +17,8 @@ from lmshealth._serialize import pack, unpack
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.text import GAP
-from studies.scale.rows import TODAY, make_refused, make_rows
 from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
+from tests.report.fleet_rows import TODAY, make_refused, make_rows
 
 __all__ = ["make"]
 N = 60

@@ -24,7 +24,7 @@ from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.strokes import record_strokes
 from models.recordings.velocities import Experiment, drive_velocities
-from studies.paper_tables.tables import PRINTED, acceleration_reading
+from studies.paper.tables.tables import PRINTED, acceleration_reading
 from tests.signals import Mode, acceleration_log, make_log, make_stage, sine, white
 
 RATE = 8000.0

@@ -14,8 +14,8 @@ from lmshealth.signal.following_error import loop_error, read_error
 from models.dynamics.stages import STAGES
 from models.recordings.strokes import record_strokes
 from models.recordings.velocities import Experiment, drive_velocities
-from studies.common.harmonics import rebuild
-from studies.paper_tables.tables import error_reading
+from studies.paper.tables.tables import error_reading
+from tests.harmonics import rebuild
 from tests.signals import make_log, sine
 
 RATE = 2000.0

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lmshealth.signal.harmonics import Harmonics, decompose
-from studies.common.harmonics import rebuild
+from tests.harmonics import rebuild
 
 RATE = 2000.0
 SINES = ((3, 2.5e-6, 0.4), (117, 4e-8, -2.9), (250, 1e-6, 1.5))

@@ -7,7 +7,7 @@ import pytest
 from scipy import optimize
 
 from lmshealth.stage.cramer_rao import ambient_bound
-from studies.common.cramer_rao import (
+from studies.harness.data.cramer_rao import (
     Recording,
     Vibration,
     band_factors,

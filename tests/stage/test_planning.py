@@ -16,7 +16,7 @@ from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.planning import Plan, plan
-from studies.common.cramer_rao import long_record_law
+from studies.harness.data.cramer_rao import long_record_law
 from tests.lives import DAMPING, FOOT, FREQUENCY, PRELOAD, SENSITIVITY, make_stage
 from tests.oracles import planned_std
 from tests.signals import write_archive_stage

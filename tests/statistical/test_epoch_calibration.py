@@ -17,12 +17,12 @@ from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage
-from studies.common.histories import map_std
-from studies.common.metrics import place
-from studies.one_guide.run import SHARED, drifts_of
-from studies.sbc_epoch.lives import believing
-from studies.sbc_epoch.lives import draw as draw_track
-from studies.sbc_epoch.run import ranks_of
+from studies.harness.data.histories import map_std
+from studies.harness.metrics import place
+from studies.health.calibration.lives import believing
+from studies.health.calibration.lives import draw as draw_track
+from studies.health.calibration.run import ranks_of
+from studies.health.one_guide import SHARED, drifts_of
 from tests.claims import Claims
 from tests.lives import AXES, MODES, make_stage, true_drift
 from tests.oracles import cdf_at

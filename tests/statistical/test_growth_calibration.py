@@ -8,10 +8,38 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from lmshealth.signal.acceleration_levels import choose_bands
-from studies.readings.growth import COVERAGE, GRID, SIGNIFICANCE, fit, quantile
+from lmshealth.signal.acceleration_levels import (
+    FrequencyBand,
+    Growth,
+    choose_bands,
+    find_growth,
+    read_magnitudes,
+)
+from models.recordings.strokes import VELOCITIES
+from studies.harness.data.logs import make_log
 from tests.claims import Claims
 from tests.statistical.evidence import as_often
+
+RATE, N = 6400.0, 25_600
+# Rows of a grid that no band of the description touches: they are independent of each other.
+GRID = (410.0, 600.0)
+SIGNIFICANCE, COVERAGE = 0.05, 0.95
+
+
+def fit(
+    rng: np.random.Generator, exponent: float, bands: tuple[FrequencyBand, ...]
+) -> tuple[Growth, ...]:
+    """Read the growth of one series of logs at the paper's velocities."""
+    readings = []
+    for velocity in VELOCITIES:
+        values = rng.standard_normal(N) * (0.1 * velocity**exponent)
+        readings += read_magnitudes(make_log({"acc_feed": values}, RATE, velocity=velocity), bands)
+    return find_growth(readings)
+
+
+def quantile(growth: Growth) -> float:
+    """Return Student's quantile of the two-sided interval of a slope."""
+    return float(stats.t.ppf((1 + COVERAGE) / 2, growth.n_logs - 2))
 
 
 def test_slopes_over_velocity_cover(rng: np.random.Generator, claims: Claims) -> None:

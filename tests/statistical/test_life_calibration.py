@@ -20,12 +20,14 @@ from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
 from lmshealth.prognosis.remaining_life import _usage, passages
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
-from studies.common.histories import map_std
-from studies.common.metrics import place
-from studies.common.ranks import N_DRAWS
-from studies.fleet_prior.lives import YOUNG, draw_fleet
-from studies.fleet_prior.lives import draw as draw_machine
-from studies.fleet_prior.run import (
+from studies.harness.data.histories import map_std
+from studies.harness.metrics import place
+from studies.harness.ranks import N_DRAWS
+from studies.life.calibration.lives import draw
+from studies.life.calibration.run import N_POSTERIOR, machine, quantities, true_quantities
+from studies.life.fleet.lives import YOUNG, draw_fleet
+from studies.life.fleet.lives import draw as draw_machine
+from studies.life.fleet.run import (
     MOST_DRAWN,
     SMALL,
     described,
@@ -34,8 +36,6 @@ from studies.fleet_prior.run import (
     learned_prior,
     posterior,
 )
-from studies.sbc_life.lives import draw
-from studies.sbc_life.run import N_POSTERIOR, machine, quantities, true_quantities
 from tests.claims import Claims
 from tests.lives import (
     AXES,

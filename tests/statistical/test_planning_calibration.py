@@ -15,7 +15,7 @@ from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.stage.planning import plan
-from studies.detectability.run import FALSE_ALARM, POWER, called, stage_with
+from studies.health.detectability import FALSE_ALARM, POWER, called, stage_with
 from tests.claims import Claims
 from tests.lives import DAMPING, FREQUENCY, MOUNT, PRELOAD, SENSITIVITY, make_stage
 from tests.oracles import planned_std

@@ -21,7 +21,7 @@ from lmshealth.tracking.change_detection import loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Event, Track, consistency, track
-from studies.off_model.run import of_world
+from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
     FREQUENCY,

@@ -12,7 +12,7 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.reading import read_log
-from studies.read_throughput.samples import MAPS
+from studies.harness.data.samples import MAPS
 
 # What each sample is without a map: channels, samples, Hz and channels that are used in part, or
 # reason and a word of the detail.

@@ -13,7 +13,7 @@ def test_readers_are_as_fast_as_their_libraries(root):
 
     Nor does one hold four minutes of a longer log, which its library does.
     """
-    command = [sys.executable, "-W", "error", "-m", "studies.read_throughput.run", "--quick"]
+    command = [sys.executable, "-W", "error", "-m", "studies.cost.reading.run", "--quick"]
     done = subprocess.run(command, capture_output=True, text=True, check=False, cwd=root)
     assert done.returncode == 0, done.stdout + done.stderr
     answer = json.loads(done.stdout)

@@ -10,7 +10,7 @@ from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import find_harmonic
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.signal.spectra import CrossSpectrum
-from studies.blind_modes.worlds import FAMILIES, World, log_of
+from studies.modes.without_description.worlds import FAMILIES, World, log_of
 
 RATE, SECONDS = 128.0, 300.0
 FREQUENCY = np.arange(1, 12_000) / SECONDS

@@ -16,8 +16,8 @@ from lmshealth.modal.free_decay.identification import identify_decays
 from lmshealth.modal.modes import Modes
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Stage
-from studies.decays.beam import judge_beam, one_beam
-from studies.decays.cases import one_machine
+from studies.modes.decays.beam import judge_beam, one_beam
+from studies.modes.decays.cases import one_machine
 from tests.signals import deviations, make_log, make_stage, sine
 from tests.stops import Ring, ring, stop, stop_log, whole
 

@@ -8,8 +8,8 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.modal.frf.blows import find_hits
 from lmshealth.modal.frf.identification import FrfReading, read_frf
-from studies.common.logs import make_log
-from studies.impact_tests.hammer import RATE, Hammer, strike
+from studies.harness.data.logs import make_log
+from studies.modes.frf.hammer import RATE, Hammer, strike
 
 MODES = ((62.0, 0.015, 1.0), (130.0, 0.01, -0.6))
 BAND = (30.0, 200.0)

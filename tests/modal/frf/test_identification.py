@@ -22,7 +22,7 @@ from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
 from models.recordings.sweep import Sweep, record_sweep, without_loop
-from studies.frf_modes.records import (
+from studies.modes.frf.records import (
     BAND,
     BENCH,
     GUIDE,
@@ -34,7 +34,7 @@ from studies.frf_modes.records import (
     multisine,
     periodic,
 )
-from studies.frf_modes.run import scatter_over_periods
+from studies.modes.frf.responses import scatter_over_periods
 from tests.signals import make_log
 
 SIZE = 1600

@@ -15,7 +15,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import load_columns
 from lmshealth.modal.frf.identification import read_measured
 from lmshealth.modal.frf.measured import read_responses
-from studies.frf_modes.records import Machine
+from studies.modes.frf.records import Machine
 
 F = np.arange(0.0, 200.0, 0.5)
 MACHINE = Machine(modes=((62.0, 0.015, 1.0), (130.0, 0.02, -0.6)))

@@ -31,7 +31,7 @@ L, K_F, K_P, K_I, K_V, R = 1.24e-3, 12.9, 25.0, 21000.0, 15.0, 6.4
 MASS = {6: 23.5, 7: 25.0}
 SCALE = {6: 21.02, 7: 18.0}
 NAMES = sorted(STAGES)
-TABLE_3 = "studies/paper_tables/printed/table3.csv"
+TABLE_3 = "studies/paper/tables/printed/table3.csv"
 S = 2j * np.pi * np.geomspace(0.01, 2000.0, 200)
 
 

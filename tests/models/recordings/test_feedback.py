@@ -1,4 +1,4 @@
-"""Tests of the forces that depend on the motion, inside the loop; energy: studies/friction."""
+"""Tests of the forces that depend on the motion, inside the loop."""
 
 from dataclasses import replace
 

@@ -1,0 +1,123 @@
+"""Run a machine after one new log, and from nothing, in a process of its own.
+
+The argument is a file with its estimates: what draws them does not count.
+"""
+
+from __future__ import annotations
+
+import json
+import pickle
+import sys
+import tempfile
+from collections.abc import Sequence
+from contextlib import closing
+from pathlib import Path
+
+import numpy as np
+
+from lmshealth._serialize import fingerprint
+from lmshealth.batch import run as running
+from lmshealth.batch.alerts import Alerts
+from lmshealth.batch.assess import Machine, assess, assess_all
+from lmshealth.batch.ingest import Progress, Resources
+from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
+from lmshealth.batch.workers import processes
+from lmshealth.prognosis.results import Prognosis
+from lmshealth.report.assessment import Assessment
+from lmshealth.stage.description import Stage, load_stage
+from lmshealth.tracking.history import LogEstimates
+from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from studies.harness.cost import cpu_s, memory_bytes
+from studies.harness.study import Row
+
+NAME, EPOCHS, SEED = "AX-1", 40, 0
+
+
+def machine_of(
+    name: str,
+    logs: Sequence[LogEstimates],
+    stored: int,
+    stage: Stage,
+    store: Store,
+    epochs: int = EPOCHS,
+) -> Machine:
+    """Return a machine with these logs, of which so many are in the store already; add the rest."""
+    keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
+    store.put_identified(
+        OutcomeRow.of(key, log.digest, Identified(log, stage.digest, name))
+        for (_, key), log in zip(keys[stored:], logs[stored:], strict=True)
+    )
+    return Machine(name, tuple(keys), stage, NO_MAINTENANCE, epochs, SEED)
+
+
+def assess_and_report(
+    machines: Sequence[Machine],
+    store: Store,
+    out: Path,
+    workers: int = 1,
+    progress: Progress = lambda step, done, total: None,
+) -> None:
+    """Assess machines and write their pages, as a run does; all must succeed."""
+    with processes(workers) as pool:
+        resources = Resources(store, pool, progress)
+        assert not assess_all(machines, resources)
+        result, *_ = running._report(machines, (), resources, out, Alerts())
+    assert not result.failed
+
+
+def run_with(
+    logs: list[LogEstimates], stored: int, stage: Stage, store: Store, out: Path
+) -> Assessment:
+    """Assess the machine with some of its logs, and write its page."""
+    machine = machine_of(NAME, logs, stored, stage, store)
+    assess_and_report([machine], store, out)
+    found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
+    assert found is not None and found.prognosis is not None
+    return found
+
+
+def main() -> None:
+    """Print costs, and what differs from a run from nothing, as JSON."""
+    logs, stage = pickle.loads(Path(sys.argv[1]).read_bytes()), load_stage("lms-y")
+    n = len(logs)
+    kept: list[Assessment] = []
+    with tempfile.TemporaryDirectory() as folder:
+        out = Path(folder)
+        with closing(Store(f"sqlite:///{out / 'store.sqlite'}")) as store:
+            parts = {"first": (logs[:-1], 0), "new": (logs, n - 1), "unchanged": (logs, n)}
+            cost = {
+                name: cpu_s(lambda part=part: kept.append(run_with(*part, stage, store, out)))
+                for name, part in parts.items()
+            }
+    peak = memory_bytes() / 2**20
+    fresh = assess(logs, stage, epochs=EPOCHS, seed=SEED)
+    short = assess(logs[: 2 * n // 3], stage, epochs=EPOCHS, seed=SEED)
+    print(json.dumps({"cpu_s": cost, "peak_mb": peak, **compared(kept[1], fresh, short)}))
+
+
+def compared(updated: Assessment, fresh: Assessment, short: Assessment) -> Row:
+    """Compare the answers after a new log with those from nothing, and with another life's."""
+    own, other = updated.health, fresh.health
+    assert own is not None and other is not None
+    return {
+        "epochs_equal": bool(np.array_equal(own.samples, other.samples)),
+        "apart": apart(updated.prognosis, fresh.prognosis),
+        "control_apart": apart(updated.prognosis, short.prognosis),
+    }
+
+
+def apart(one: Prognosis | None, other: Prognosis | None) -> float:
+    """Return how far means of the remaining travel, up to the horizon, are apart in std errors."""
+    assert one is not None and other is not None
+    means, errors = [], []
+    for found in (one, other):
+        travel = np.minimum(found.remaining[:, -1], found.horizon)
+        means.append(travel.mean())
+        n = min(found.ess, travel.size)  # without wear the size of the sample has no bound
+        # What no draw shows may have a probability of one effective draw.
+        errors.append(max(travel.std() / np.sqrt(n), found.horizon / n))
+    return float(abs(means[0] - means[1]) / np.hypot(*errors))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,71 @@
+"""Is every figure of speed still met, relative to a peer or a lower bound in the same turn?
+
+Method
+    ``tests/bench`` with pytest-benchmark: identification, sampling, lives, tracking, batches. Peer
+    and program take turns in one process; the figure is the median ratio of their processor times
+    (wall times for workers). It is missed if more turns exceed the bound than chance allows at 1 %
+    for a median on the bound. A requirement in seconds is expressed in times of the peer.
+Run time
+    Ten minutes.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from studies.harness.checkout import ROOT
+from studies.harness.claims import Claim, number
+from studies.harness.study import Row, Study
+
+QUICK = "walker"
+# Recorded before reading and simulation were left out: `read_throughput` counts the processor time
+# of the process that reads for ours, and a simulation is no part of the method.
+LEFT_OUT = ("reading a minute", "a second of a simulated log")
+
+
+def main() -> None:
+    """Run the study; ``--quick`` times one figure and records nothing."""
+    study = Study(__file__, __doc__)
+    with tempfile.TemporaryDirectory() as name:
+        figures = Path(name) / "figures.json"
+        command = [
+            *(sys.executable, "-m", "pytest", "tests/bench", "-o", "python_files=bench_*.py"),
+            *("-p", "no:xdist", "--benchmark-timer=time.process_time"),
+            *("--benchmark-columns=median", "--figures", str(figures)),
+            *(("-k", QUICK) if study.quick else ()),
+        ]
+        done = subprocess.run(command, cwd=ROOT, stdout=sys.stderr, check=False)
+        found: Row = json.loads(figures.read_text(encoding="utf-8"))
+    answer: Row = {
+        "figures": found,
+        # Whether the machine had other work.
+        "processors": os.cpu_count(),
+        "load": [round(load, 1) for load in os.getloadavg()],
+        "passed": {name: not row["missed"] for name, row in found.items()},
+    }
+    answer["passed"]["no bench failed"] = done.returncode == 0
+    study.conclude(answer)
+
+
+def claims(answer: Row) -> Iterator[Claim]:
+    """Claim the cost of every step in times of a peer."""
+    for name, row in answer["figures"].items():
+        if name.startswith(LEFT_OUT):
+            continue
+        yield Claim(
+            name,
+            f"{number(row['ratio'])} times",
+            f"{number(row['least'])} to {number(row['largest'])} in {row['turns']} turns",
+            f"{row['peer']}; at most {number(row['at_most'])}",
+            not row["missed"],
+        )
+
+
+if __name__ == "__main__":
+    main()

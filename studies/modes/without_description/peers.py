@@ -1,0 +1,155 @@
+"""How other programs search a band, with settings that a user can choose without the truth.
+
+The record is decimated to the lowest rate above 2.5 times the top of the band, displacements are
+differentiated twice and channels scaled to unit variance. Models reach order 40 (60 of pyOMA2 above
+four channels), with as many block rows as lags of a third of a second hold, 20 to 40 of them.
+Everything else is the default of the program. Poles outside the band are discarded.
+"""
+
+from __future__ import annotations
+
+import io
+import logging
+import time
+import warnings
+from collections.abc import Callable
+from contextlib import redirect_stdout
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.signal import decimate, find_peaks, welch
+
+from studies.modes.without_description.worlds import World
+
+Array = NDArray[np.float64]
+# Frequencies in Hz and processor time in s, by the name of the program.
+Found = dict[str, tuple[Array, float]]
+
+PRESETS = ("Magalhaes", "Reynders", "Neu", "Kvaale", "Dederichs", "hdbscan", "hier_avg")
+_LAG = 1 / 3  # s
+_LARGEST_DAMPING = 0.1
+
+
+def _prepare(world: World) -> tuple[Array, float]:
+    """Return samples, ``(n_samples, n_channels)``, and their rate in Hz."""
+    factor = max(1, int(world.sample_rate / (2.5 * world.band[1])))
+    rate, n = world.sample_rate / factor, world.n_displacements
+    samples = decimate(world.samples, factor, axis=0) if factor > 1 else world.samples
+    if n:
+        second = np.diff(samples[:, :n], 2, axis=0)
+        samples = np.concatenate([second, samples[1:-1, n:]], axis=1)
+    return (samples - samples.mean(axis=0)) / samples.std(axis=0), rate
+
+
+def pyoma2(world: World) -> Found:
+    """Search with covariance-driven SSI of pyOMA2, clustered by each of its presets."""
+    from pyoma2.algorithms import SSI
+    from pyoma2.algorithms.data.run_params import Clustering
+    from pyoma2.setup import SingleSetup
+
+    start = time.process_time()
+    samples, rate = _prepare(world)
+    algorithm = SSI(name="ssi", br=_rows(rate), ordmax=40 if samples.shape[1] <= 4 else 60)
+    setup = SingleSetup(samples, fs=rate)
+    setup.add_algorithms(algorithm)
+
+    def poles() -> Array:
+        setup.run_by_name("ssi")
+        return np.empty(0)
+
+    def clustered(name: str) -> Array:
+        algorithm.add_clustering(Clustering(name=name, quick=name, freqlim=world.band))
+        algorithm.run_clustering(name=name)
+        return np.asarray(algorithm.result.clustering_results[name].Fn)
+
+    _found(poles, world.band)
+    alone = time.process_time() - start
+    found: Found = {}
+    for name in PRESETS:
+        start = time.process_time()
+        f = _found(lambda name=name: clustered(name), world.band)
+        found[f"pyOMA2 SSI, {name}"] = f, alone + time.process_time() - start
+    return found
+
+
+def toolbox(world: World, *, method: str) -> Found:
+    """Search with a method of pyoma-toolbox, and its automatic clearing and selection."""
+    from pyOMA.core.PreProcessingTools import PreProcessSignals
+    from pyOMA.core.SSICovRef import BRSSICovRef
+    from pyOMA.core.StabilDiagram import StabilCluster
+    from pyOMA.core.VarPLSCF import VarPLSCF
+
+    start = time.process_time()
+    samples, rate = _prepare(world)
+    signals = PreProcessSignals(samples, rate)
+
+    def search() -> Array:
+        if method == "SSI":
+            rows = _rows(rate)
+            signals.correlation(2 * rows + 2)
+            model = BRSSICovRef(signals)
+            model.build_toeplitz_cov(rows)
+            model.compute_modal_params(40, modal_contrib=False)
+        else:
+            model = VarPLSCF(signals)
+            lines = min(401, len(samples) // 30 - 1)
+            model.build_half_spectra(lines, 0.0, rate / 2, window_decay=0.01, num_blocks=30)
+            model.compute_modal_params(20, modal_contrib=False)
+        cluster = StabilCluster(model)
+        cluster.calculate_soft_critera_matrices()
+        cluster.calculate_stabilization_masks(d_range=(0, 100 * _LARGEST_DAMPING))
+        cluster.automatic_clearing()
+        cluster.automatic_classification()
+        cluster.automatic_selection()
+        return np.array(cluster.get_selected_modal_values()[0], dtype=float)
+
+    f = _found(search, world.band)
+    return {f"pyoma-toolbox {method}": (f, time.process_time() - start)}
+
+
+def peaks(world: World) -> Array:
+    """Pick the peaks of the spectrum of each channel (control).
+
+    A peak exceeds its surroundings by six standard deviations of a mean of ordinates; peaks of
+    several channels within 1 % are one.
+    """
+    seconds = len(world.samples) / world.sample_rate
+    low, high = world.band
+    segment = min(seconds / 8, 200 / low)  # resolves half a percent of the bottom of the band
+    n = round(segment * world.sample_rate)
+    f, density = welch(world.samples, world.sample_rate, "hann", n, axis=0)
+    within = (f >= low) & (f <= high)
+    prominence = 6 / np.sqrt(1.5 * seconds / segment)
+    every = [
+        (f[within][k], height)
+        for column in np.log(density[within]).T
+        for k, height in zip(*_peaks(column, prominence), strict=True)
+    ]
+    chosen: list[float] = []
+    for place, _ in sorted(every, key=lambda one: -one[1]):
+        if all(abs(place / other - 1) > 0.01 for other in chosen):
+            chosen.append(float(place))
+    return np.sort(chosen)
+
+
+def _peaks(level: Array, prominence: float) -> tuple[Array, Array]:
+    place, properties = find_peaks(level, prominence=prominence)
+    return place, properties["prominences"]
+
+
+def _rows(rate: float) -> int:
+    return int(np.clip(_LAG * rate, 20, 40))
+
+
+def _found(search: Callable[[], Array], band: tuple[float, float]) -> Array:
+    """Call a program without its messages; nothing found where it raises."""
+    with warnings.catch_warnings(), redirect_stdout(io.StringIO()), np.errstate(all="ignore"):
+        warnings.simplefilter("ignore")
+        logging.disable(logging.CRITICAL)
+        try:
+            f = search()
+        except Exception:  # of any kind: these are programs of others
+            return np.empty(0)
+        finally:
+            logging.disable(logging.NOTSET)
+    return np.sort(f[(f >= band[0]) & (f <= band[1])])
