@@ -8,10 +8,10 @@ from importlib import import_module
 from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
-from lmshealth._result import Result as _Result
+from lmshealth._private.result import Result as _Result
 
 if TYPE_CHECKING:
-    from lmshealth.analysis import analyse as analyse
+    from lmshealth.batch.analysis import analyse as analyse
     from lmshealth.batch.assess import assess as assess
     from lmshealth.batch.run import Settings as Settings
     from lmshealth.batch.run import run as run
@@ -40,7 +40,7 @@ _HOMES = {
     "LmshealthError": "errors",
     "LogEstimates": "tracking.history",
     "Settings": "batch.run",
-    "analyse": "analysis",
+    "analyse": "batch.analysis",
     "assess": "batch.assess",
     "build_history": "tracking.history",
     "decide": "prognosis.maintenance_decision",

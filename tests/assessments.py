@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from msgspec.structs import asdict
 
-from lmshealth._arrays import FloatArray
-from lmshealth._files import write_text
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.files import write_text
 from lmshealth.batch.status import coming_states, make_status
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import Verdict

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.health.results import Health
 from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes

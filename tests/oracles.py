@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking.history import History, Series
 
 # The model of a mode: prior standard deviations, and the walk of ln damping in a life.

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from lmshealth._files import read_table
+from lmshealth._private.files import read_table
 from lmshealth.cli.main import main
 from lmshealth.errors import BadStage, BadTable
 from lmshealth.io.column_map import load_columns

@@ -18,7 +18,7 @@ from typing import IO, Any, NamedTuple
 
 import msgspec
 
-from lmshealth._files import read_table, write_bytes
+from lmshealth._private.files import read_table, write_bytes
 from lmshealth.batch import constants
 from lmshealth.batch.status import Change, Fleet, Status, compare
 from lmshealth.batch.store import Announced, Store, Unsent

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, TypeVar
 
 from numpy.linalg import LinAlgError
 
-from lmshealth._serialize import VERSION, fingerprint, pack
+from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.errors import LmshealthError

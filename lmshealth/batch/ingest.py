@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Generic, NamedTuple, Self, TypeVar
 
-from lmshealth._serialize import VERSION, fingerprint
+from lmshealth._private.serialize import VERSION, fingerprint
 from lmshealth.batch import constants
 from lmshealth.batch.store import Identified, OutcomeRow, Store
 from lmshealth.batch.workers import Pool

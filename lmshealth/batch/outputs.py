@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lmshealth._files import replacing, write_text
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.files import replacing, write_text
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.batch.assess import LogRows, reason_if_failed
 from lmshealth.batch.status import Status, coming_states, make_status, points
 from lmshealth.batch.store import unpack_or_none

@@ -11,8 +11,8 @@ from tempfile import TemporaryFile
 
 import msgspec
 
-from lmshealth._files import remove_abandoned, write_text
-from lmshealth._serialize import VERSION, fingerprint, pack
+from lmshealth._private.files import remove_abandoned, write_text
+from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import (
     Alerts,

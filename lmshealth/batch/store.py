@@ -29,7 +29,7 @@ from sqlalchemy.engine import URL, Connection, Engine, make_url
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 from sqlalchemy.schema import CreateTable
 
-from lmshealth._serialize import VERSION, fingerprint, pack, unpack
+from lmshealth._private.serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.batch.status import Change, Status

@@ -25,8 +25,8 @@ from urllib.parse import urlsplit
 from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
-from lmshealth._interrupts import INTERRUPTS, ignore_interrupts
-from lmshealth._serialize import VERSION
+from lmshealth._private.interrupts import INTERRUPTS, ignore_interrupts
+from lmshealth._private.serialize import VERSION
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError

@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 import click
 import pandas as pd
 
-from lmshealth._files import write_text
-from lmshealth._toml import decode
+from lmshealth._private.files import write_text
+from lmshealth._private.toml import decode
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.column_map import ColumnMap

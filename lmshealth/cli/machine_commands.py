@@ -11,7 +11,7 @@ import click
 from msgspec.structs import replace
 from numpy.linalg import LinAlgError
 
-from lmshealth._files import write_draws, write_text
+from lmshealth._private.files import write_draws, write_text
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData

@@ -15,7 +15,7 @@ from typing import Any, NoReturn
 
 import click
 
-from lmshealth._interrupts import INTERRUPTS
+from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli.streams import standard_streams
 from lmshealth.cli.terminal import print_errors
 from lmshealth.errors import LmshealthError

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.random import MT19937, RandomState
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health.importance_sampling import importance_sample, tempered

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from scipy.special import chdtrc
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.health import constants
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import JointPrior

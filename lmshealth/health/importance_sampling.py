@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 from scipy.special import gammaln, logsumexp
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health.laplace import LogProbability

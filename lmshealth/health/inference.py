@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import constants
 from lmshealth.health.ensemble_sampling import (

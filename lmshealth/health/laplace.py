@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.optimize import Bounds, minimize
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 
 LogProbability = Callable[[FloatArray], FloatArray]
 """Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.result import Result
 from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 

@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from scipy.special import expit, logit
 
-from lmshealth._arrays import BoolArray
+from lmshealth._private.arrays import BoolArray
 from lmshealth.health import constants
 from lmshealth.health.results import Health
 from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY

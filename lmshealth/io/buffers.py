@@ -7,7 +7,7 @@ from typing import IO, ClassVar, cast
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io.refusal import Unusable
 
 # A minute at 20 kHz: longer columns stay on disk.

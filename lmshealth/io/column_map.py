@@ -12,8 +12,8 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
 
-from lmshealth._files import read_table
-from lmshealth._toml import decode, within
+from lmshealth._private.files import read_table
+from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
 from lmshealth.io.metadata import KEYS, as_text

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, Samples, blocks
 from lmshealth.io.refusal import Unusable

@@ -6,8 +6,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from lmshealth._arrays import freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import freeze
+from lmshealth._private.result import Result
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
 

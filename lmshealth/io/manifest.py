@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from lmshealth._files import escapes
+from lmshealth._private.files import escapes
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log

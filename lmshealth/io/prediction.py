@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks
 from lmshealth.io.time_axis import IntArray

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
-from lmshealth._files import read_table
+from lmshealth._private.files import read_table
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
 from lmshealth.io.log import low_high, possible

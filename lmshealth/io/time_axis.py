@@ -10,7 +10,7 @@ from typing import NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
 from lmshealth.io.log import expect_possible

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from lmshealth._arrays import ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.modes import Modes

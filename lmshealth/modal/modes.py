@@ -11,8 +11,8 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from lmshealth._arrays import FloatArray, freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.result import Result
 from lmshealth.io.log import WARNINGS, Refusal
 from lmshealth.signal.spectral_lines import Line
 

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.special import softmax
 from scipy.stats import norm
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection, merge

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import uniform_filter1d
 
-from lmshealth._arrays import ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.modes import Modes
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray
+from lmshealth._private.arrays import ComplexArray
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.channel_checks import independent
 from lmshealth.io.log import Channel, Log, Refusal

@@ -12,8 +12,8 @@ import numpy as np
 from scipy.special import betainc, logsumexp, softmax
 from scipy.stats import binom
 
-from lmshealth._arrays import FloatArray
-from lmshealth._serialize import fingerprint
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import LmshealthError
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import scatter_prior

@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotEnoughData
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.scenarios import Scenario, list_scenarios

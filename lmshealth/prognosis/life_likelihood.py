@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, Rows
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_data import LifeData

@@ -10,7 +10,7 @@ import numpy as np
 from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import FloatArray, ReadOnly, freeze
+from lmshealth._private.arrays import FloatArray, ReadOnly, freeze
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.health.constants import MAX_PARETO_K, MIN_ESS
 from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.stage.constants import MAX_RISK

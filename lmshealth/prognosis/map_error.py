@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 from scipy.special import softmax
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.importance_sampling import importance_sample
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import drifts, ln_health

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.prognosis import constants

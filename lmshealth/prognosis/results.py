@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.result import Result
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,7 +10,7 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.constants import STEP_PROBABILITY
 from lmshealth.prognosis import constants
 from lmshealth.stage.degradation_laws import Law

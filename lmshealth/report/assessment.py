@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.health.verdict import (
     NO_HEALTH,

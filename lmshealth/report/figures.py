@@ -17,8 +17,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy.special import gammaincinv
 
-from lmshealth._arrays import FloatArray
-from lmshealth._result import Result
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.result import Result
 from lmshealth.errors import BadQuestion
 from lmshealth.health.results import Health
 from lmshealth.io.log import SI_UNITS, Log

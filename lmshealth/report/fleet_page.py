@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._files import write_text
+from lmshealth._private.files import write_text
 from lmshealth.io.log import Refusal
 from lmshealth.report import constants
 from lmshealth.report.assessment import Summary

@@ -14,8 +14,8 @@ from scipy.optimize import isotonic_regression
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.stats import gamma
 
-from lmshealth._arrays import FloatArray
-from lmshealth._files import write_bytes, write_text
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.files import write_bytes, write_text
 from lmshealth.errors import BadLog
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum

@@ -15,7 +15,7 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
-from lmshealth._files import write_bytes
+from lmshealth._private.files import write_bytes
 from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
 

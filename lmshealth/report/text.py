@@ -5,7 +5,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.report import constants
 
 _KM = 1000.0

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants

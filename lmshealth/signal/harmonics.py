@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import fft
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._private.arrays import FloatArray, freeze
 
 Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
 

@@ -12,7 +12,7 @@ from scipy.linalg import toeplitz
 from scipy.stats import f as fisher
 from scipy.stats import gamma
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.signal import constants
 
 # Sine tapers: the test uses half as many ordinates to either side.

@@ -7,7 +7,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import MINUTE, blocks
 from lmshealth.io.log import Channel, Log

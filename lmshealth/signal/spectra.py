@@ -9,7 +9,7 @@ import numpy as np
 from scipy import fft
 from scipy.stats import gamma
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.io.buffers import MINUTE
 from lmshealth.io.log import Channel
 from lmshealth.signal import constants

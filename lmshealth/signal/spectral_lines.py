@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
 from lmshealth.signal.multitaper_test import detect_sinusoids

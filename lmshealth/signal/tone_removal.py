@@ -6,7 +6,7 @@ import numpy as np
 from scipy.ndimage import minimum_filter1d
 from scipy.special import spherical_jn
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.signal import constants
 
 # Distances in ordinates of the surroundings whose median a peak is compared with.

@@ -10,7 +10,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.stage import constants
 from lmshealth.stage.description import ModeSpec, ParameterSpec, Stage
 from lmshealth.stage.identifiability import Identifiability, identifiability_of

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 
 # Prior standard deviation of the logarithm of the noise level. Without it an ever smaller noise
 # would still cost what an unknown part of its spectrum does.

@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 from scipy.special import expit, log_expit
 
-from lmshealth._arrays import FloatArray
-from lmshealth._toml import within
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.toml import within
 from lmshealth.stage import constants
 from lmshealth.stage.priors import Lognormal, Prior, Uniform
 

@@ -14,9 +14,9 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta, Struct
 
-from lmshealth._arrays import FloatArray
-from lmshealth._files import escapes, read_table
-from lmshealth._toml import decode, within
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.files import escapes, read_table
+from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadStage
 from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, LONGEST_NAME
 from lmshealth.io.log import MOMENTS, Metadata

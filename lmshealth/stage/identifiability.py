@@ -7,7 +7,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadStage
 from lmshealth.stage import constants
 from lmshealth.stage.cramer_rao import ambient_bound

@@ -10,8 +10,8 @@ import numpy as np
 import pandas as pd
 from numpy.polynomial.chebyshev import chebder, chebvander
 
-from lmshealth._arrays import BoolArray, FloatArray
-from lmshealth._files import read_table
+from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.files import read_table
 from lmshealth.errors import BadStage, OutsideMap
 from lmshealth.stage import constants
 

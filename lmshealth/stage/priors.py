@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from scipy.special import ndtr, ndtri
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
-from lmshealth._toml import within
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.toml import within
 from lmshealth.errors import BadStage
 from lmshealth.stage import constants
 

@@ -16,8 +16,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._files import write_text
-from lmshealth._toml import quoted
+from lmshealth._private.files import write_text
+from lmshealth._private.toml import quoted
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks, in_unit

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import FilterBank, FilterModel, advance, restart
 from lmshealth.tracking.history import Step, StepKind

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray, freeze
+from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import Regressor, regressors

@@ -15,7 +15,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, Rows
+from lmshealth._private.arrays import BoolArray, FloatArray, Rows
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import Step
 from lmshealth.tracking.state_space import StateSpace

@@ -9,8 +9,8 @@ from typing import Any, Literal, Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray, ReadOnly, freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
+from lmshealth._private.result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.constants import AGREEMENT
 from lmshealth.io.log import Metadata, Notice, Refusal

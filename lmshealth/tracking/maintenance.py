@@ -6,7 +6,7 @@ from datetime import datetime
 from pathlib import Path
 from typing import Self
 
-from lmshealth._arrays import freeze
+from lmshealth._private.arrays import freeze
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal, expect_moment
 from lmshealth.io.manifest import find_sheets, name_of

@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.metadata import COVARIATES

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.filter_bank import (
     FilterBank,

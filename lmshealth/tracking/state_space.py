@@ -9,7 +9,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import regressors

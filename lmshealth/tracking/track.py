@@ -13,8 +13,8 @@ import numpy as np
 from scipy import stats
 from scipy.special import expit, logit
 
-from lmshealth._arrays import BoolArray, FloatArray, freeze
-from lmshealth._result import Result
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.stats import beta as beta_distribution
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 
 
 def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) -> FloatArray:

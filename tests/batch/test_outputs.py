@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from lmshealth._serialize import pack
+from lmshealth._private.serialize import pack
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.outputs import MachineRecord, machine_output, write_tables
 from lmshealth.io.log import Refusal

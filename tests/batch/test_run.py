@@ -27,7 +27,7 @@ from click.testing import CliRunner
 from sqlalchemy import text
 
 from lmshealth import examples
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.status import (
     Status,

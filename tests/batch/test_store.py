@@ -21,7 +21,7 @@ import pytest
 from sqlalchemy import Engine, create_engine, event, text
 from sqlalchemy.exc import OperationalError
 
-from lmshealth._serialize import pack
+from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch import store as store_module
 from lmshealth.batch.assess import pack_assessment

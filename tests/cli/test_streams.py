@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._interrupts import INTERRUPTS
+from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli import main as command_line
 from lmshealth.cli import streams, terminal
 from tests.signals import write_archive_stage, write_log

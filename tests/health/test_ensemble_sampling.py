@@ -8,7 +8,7 @@ from emcee import autocorr
 from emcee.autocorr import integrated_time
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage

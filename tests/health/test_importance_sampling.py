@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health.importance_sampling import (

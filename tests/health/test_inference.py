@@ -14,7 +14,7 @@ from arviz_stats.base.array import array_stats
 from scipy import stats
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import inference
 from lmshealth.health.ensemble_sampling import Sample

@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lmshealth._serialize import fingerprint
+from lmshealth._private.serialize import fingerprint
 from lmshealth.io import constants, metadata
 from lmshealth.io.log import Metadata
 from lmshealth.io.metadata import moment_after, parse_metadata

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.prognosis.remaining_life import first_passage
 from lmshealth.prognosis.scenarios import DegradationPath
 from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.prognosis import constants
 from lmshealth.prognosis import fleet_prior as fleet
 from lmshealth.prognosis.fleet_prior import (

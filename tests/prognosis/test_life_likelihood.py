@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_likelihood import LifeLikelihood, scatter_prior

@@ -11,7 +11,7 @@ import pytest
 import xarray
 from threadpoolctl import threadpool_limits
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.health.ensemble_sampling import Sample
 from lmshealth.health.importance_sampling import importance_sample_to_ess

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 from scipy.optimize import brentq
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.constants import STEP_PROBABILITY
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.scenarios import DegradationPath, Scenario, list_scenarios

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.prognosis.maintenance_decision import Service
 from lmshealth.report.assessment import (
     Life,

@@ -15,7 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.results import Health
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.maintenance_decision import decide

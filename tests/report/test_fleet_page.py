@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lmshealth._serialize import pack, unpack
+from lmshealth._private.serialize import pack, unpack
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.text import GAP

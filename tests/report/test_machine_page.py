@@ -14,7 +14,7 @@ import pytest
 from msgspec import structs
 
 from lmshealth import examples
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.batch.assess import assess
 from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal

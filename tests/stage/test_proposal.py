@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from lmshealth._toml import decode
+from lmshealth._private.toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.reading import read_log

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw, infer_together

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.prognosis.life_likelihood import LifeLikelihood

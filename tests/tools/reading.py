@@ -17,7 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from lmshealth._serialize import unpack
+from lmshealth._private.serialize import unpack
 from lmshealth.batch.store import Store, default_url
 from lmshealth.report import figures, log_figures
 from lmshealth.report.assessment import Assessment, limit_of

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking import filter_bank as bank

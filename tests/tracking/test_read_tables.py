@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from lmshealth._serialize import fingerprint
+from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import BadTable
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows

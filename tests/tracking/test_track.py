@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage, Usage
 from lmshealth.tracking import constants

@@ -28,7 +28,7 @@ from typing import IO, Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from lmshealth._interrupts import ignore_interrupts
+from lmshealth._private.interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
 from lmshealth.io.buffers import Spool

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks
 from lmshealth.io.column_map import ColumnMap, role_of

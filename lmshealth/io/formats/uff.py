@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric

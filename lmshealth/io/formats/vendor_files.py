@@ -13,7 +13,7 @@ from xml.etree.ElementTree import Element, ParseError, iterparse, parse
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, check_size

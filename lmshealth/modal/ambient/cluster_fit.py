@@ -14,7 +14,7 @@ import numpy as np
 from scipy.ndimage import binary_dilation, find_objects, label, median_filter, uniform_filter1d
 from scipy.stats import gamma
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection

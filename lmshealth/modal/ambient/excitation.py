@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import softmax
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.whittle import Likelihood, Marginal, marginalise, response
 from lmshealth.signal.spectra import CrossSpectrum

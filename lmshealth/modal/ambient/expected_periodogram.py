@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.signal.spectra import CrossSpectrum
 
 # Half-power bandwidths times duration below which the expected periodogram replaces the density,

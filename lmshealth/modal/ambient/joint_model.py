@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from scipy.linalg import block_diag
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal.ambient.whittle import receptance, response
 
 # Gain in log likelihood below which a mode is left as it is, and most shorter steps.

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import comb
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import (
     LEAST_FLOOR,

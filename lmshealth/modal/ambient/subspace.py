@@ -11,7 +11,7 @@ from scipy.signal import czt
 from scipy.signal.windows import tukey
 from scipy.spatial.distance import squareform
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import eigh
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.joint_model import JointModel
 from lmshealth.signal.constants import LINE_WIDTH

@@ -29,7 +29,7 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.optimize import brentq
 from scipy.special import logsumexp, softmax
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 

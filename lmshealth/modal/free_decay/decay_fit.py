@@ -11,7 +11,7 @@ import numpy as np
 from scipy import linalg, stats
 from scipy.special import softmax
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, stack
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, stack
 from lmshealth.modal import constants
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from scipy import ndimage, stats
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import fft, linalg
 
-from lmshealth._arrays import ComplexArray, FloatArray, stack
+from lmshealth._private.arrays import ComplexArray, FloatArray, stack
 
 # Degree of the polynomial over the band that represents leakage from outside.
 _DEGREE = 2

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray, ReadOnly
+from lmshealth._private.arrays import ComplexArray, FloatArray, ReadOnly
 from lmshealth.errors import BadLog
 from lmshealth.io import constants as limits
 from lmshealth.io.column_map import RESPONSE_COLUMN, ColumnMap, parse_column, role_of

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import fft
 
-from lmshealth._arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 
 # Correlation of a signal with itself at a period and its multiples: half of it is no noise.
 _REPEATS = 0.5

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from scipy.optimize import least_squares
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, stack
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, stack
 from lmshealth.modal import constants
 
 # A transient is smooth over a band: powers of s.

@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
 from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import (
     ModelOrder,

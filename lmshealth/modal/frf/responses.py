@@ -12,7 +12,7 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.stats import f as fisher
 
-from lmshealth._arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal import constants

@@ -13,7 +13,7 @@ from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses

@@ -15,7 +15,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.special import hyp1f1, ndtr
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.mode_filters import IntArray, Measurements, ModeFilters, update
 

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth._arrays import BoolArray, FloatArray, Rows
+from lmshealth._private.arrays import BoolArray, FloatArray, Rows
 from lmshealth.tracking import constants
 
 IntArray = NDArray[np.intp]

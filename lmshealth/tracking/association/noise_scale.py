@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from lmshealth._arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.mode_filters import IntArray, Measurements
 

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import Scan, clutter_gains
 from lmshealth.tracking.association.mode_filters import IntArray, ModeFilters, update

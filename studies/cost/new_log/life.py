@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._serialize import fingerprint
+from lmshealth._private.serialize import fingerprint
 from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.assess import Machine, assess, assess_all

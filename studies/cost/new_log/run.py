@@ -27,7 +27,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._serialize import fingerprint
+from lmshealth._private.serialize import fingerprint
 from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.tracking.history import LogEstimates

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from lmshealth._arrays import ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     TransientLikelihood,

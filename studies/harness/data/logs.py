@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata
 
 _KINDS: dict[str, ChannelKind] = {

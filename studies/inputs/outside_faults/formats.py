@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from studies.inputs.outside_faults.case import Case, Program, Seen, last_line
 
 RATE, SECONDS_OF_LOG = 2000.0, 6.0

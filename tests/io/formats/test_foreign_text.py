@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._toml import decode
+from lmshealth._private.toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Log

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from lmshealth._toml import decode
+from lmshealth._private.toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.moments import SinceFirst

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._arrays import FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking.association.mode_filters import Measurements, ModeFilters, predict, update
 
 HERE = (np.zeros(2, dtype=int), np.arange(2))

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from lmshealth._files import remove_abandoned, write_bytes, write_text
+from lmshealth._private.files import remove_abandoned, write_bytes, write_text
 from lmshealth.errors import BadTable
 
 
@@ -78,7 +78,7 @@ def test_a_failure_to_write_is_an_error(tmp_path: Path) -> None:
 HOLD = """
 import sys, time
 from pathlib import Path
-from lmshealth._files import replacing
+from lmshealth._private.files import replacing
 with replacing(Path(sys.argv[1])) as stream:
     print("writing", flush=True)
     time.sleep(60)

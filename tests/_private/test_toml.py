@@ -8,7 +8,7 @@ from typing import Annotated
 import pytest
 from msgspec import Meta, Struct
 
-from lmshealth._toml import decode
+from lmshealth._private.toml import decode
 from lmshealth.stage.description import Description
 
 

@@ -12,9 +12,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from lmshealth import _serialize as packing
-from lmshealth._arrays import BoolArray, FloatArray
-from lmshealth._serialize import fingerprint, pack, unpack
+from lmshealth._private import serialize as packing
+from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.serialize import fingerprint, pack, unpack
 
 
 class Law(msgspec.Struct, frozen=True, tag="law", tag_field="kind"):

@@ -1,0 +1,1 @@
+"""Helpers of all folders: arrays, results, files, serialisation, TOML."""
