@@ -16,7 +16,7 @@ from scipy.signal import lfilter
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import MINUTE, Stored
 from lmshealth.io.column_map import load_columns
-from lmshealth.io.log import Channel, Log
+from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.io.reading import read_log
 from lmshealth.modal import identification as modal
 from lmshealth.modal.ambient import cluster_fit
@@ -836,3 +836,46 @@ def test_a_wide_band_is_searched_in_parts() -> None:
         signal += moved / moved.std()
     modes = identify(make_log({"acc_0": signal}, rate))
     assert modes.frequency == pytest.approx([f for f, _ in truth], rel=0.01)
+
+
+@pytest.mark.parametrize(
+    ("reason", "channel", "flagged"),
+    [
+        ("levels", "acc_a", True),
+        ("rate", "time_s", True),
+        ("levels", "acc_other", False),
+        ("spikes", "acc_a", False),
+        ("rate", "", False),
+    ],
+)
+def test_warnings_flag_the_modes_that_they_concern(
+    reason: str, channel: str, flagged: bool
+) -> None:
+    """A warning flags modes of its channel, and of all where it is about time, unless repaired."""
+    log = one_mode_log(20.0)
+    name = log.channels[0].name
+    channel = name if channel == "acc_a" else channel
+    log = replace(log, refused=(Refusal(log.name, reason, "as it is", channel=channel),))
+    modes = identify(log, band=(90.0, 160.0))
+    assert len(modes.names) == 1
+    assert (reason in modes.flags[0].split()) == flagged
+
+
+@pytest.mark.slow
+def test_modes_outside_the_band_need_no_data(needs: Callable[[str], None]) -> None:
+    """A mode of the search that left the spectra is not fitted: this band ended in a traceback."""
+    needs("data")
+    path = Path(os.environ["LMSHEALTH_DATA"]) / "outside_faults/crash_zero_weights.csv"
+    modes = identify(read_log(path), band=(22.0, 45.0))
+    assert all(22.0 <= f <= 45.0 for f in modes.frequency)
+
+
+@pytest.mark.slow
+def test_many_short_pieces_keep_the_damping(needs: Callable[[str], None]) -> None:
+    """A log that lost samples 511 times shows the damping of the whole one."""
+    needs("data")
+    path = Path(os.environ["LMSHEALTH_DATA"]) / "outside_faults/klipper_lost_random.csv"
+    modes = identify(read_log(path))
+    upper = int(np.abs(modes.frequency - 78).argmin())
+    error = modes.damping_ratio[upper] - 0.0238
+    assert abs(error) < 3 * modes.damping_ratio_std[upper] and modes.snr.max() < 1e5

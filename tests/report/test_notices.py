@@ -9,6 +9,7 @@ import pytest
 from msgspec import structs
 
 from lmshealth.health.verdict import judge
+from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import COLUMNS, machine_tables
@@ -132,3 +133,18 @@ def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) ->
     found, expected = (summarise(one, one.service()).health[0] for one in (own, good))
     for name in ("low", "median", "high", "limit", "below_limit"):
         assert getattr(found, name) == pytest.approx(getattr(expected, name))
+
+
+@pytest.mark.parametrize(
+    ("reason", "channel", "severity"),
+    [("levels", "acc_x", "caution"), ("spikes", "acc_x", "note"), ("flat", "acc_x", None)],
+)
+def test_warnings_about_channels_are_noticed(
+    make: Maker, reason: str, channel: str, severity: str | None
+) -> None:
+    """What is repaired is a note, what is not a caution; refused channels are in refused.csv."""
+    good = make()
+    row = Refusal(good.history.logs[-1], reason, "as it is", channel=channel)
+    found = {one.code: one for one in notices(replace(good, refused=(row, *good.refused)))}
+    assert (found[reason].severity if reason in found else None) == severity
+    assert reason not in found or found[reason].where == channel
