@@ -130,6 +130,8 @@ def test_a_run_ends_by_a_signal_in_one_line(
     with subprocess.Popen(
         [*archive, "--workers", str(workers)], stderr=subprocess.PIPE, text=True,
         stdout=subprocess.DEVNULL, start_new_session=True,
+        # What `nohup` starts ignores SIGHUP.
+        preexec_fn=lambda: signal.signal(getattr(signal, name), signal.SIG_DFL),
     ) as process:  # fmt: skip
         rng = np.random.default_rng(workers)
         while not (tmp_path / "out" / "lmshealth.sqlite").exists() and process.poll() is None:

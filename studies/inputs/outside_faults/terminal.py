@@ -18,7 +18,6 @@ from studies.inputs.outside_faults.case import Case, Program, Seen, is_traceback
 
 KIND = "terminal"
 RATE = 1000.0  # of the logs, Hz
-CLOSE = {"stdout": ">&-", "stderr": "2>&-", "full disk": ">/dev/full", "pipe": "| head -1"}
 BEGUN_S, ENDED_S = 60.0, 30.0  # longest waits for the first results of a run, and for its end
 WORK = 60  # logs of a run that is ended by a signal: more than it finishes before
 
@@ -61,17 +60,27 @@ def encoded(program: Program, folder: Path, *, encoding: str) -> Seen:
 
 
 def redirected(program: Program, folder: Path, *, to: str) -> Seen:
-    """Analyse a folder of one log, and print to where nobody can read."""
+    """Analyse a folder of one log without a stream."""
     (folder / "logs").mkdir()
     write_log(folder / "logs" / "a.csv", (126.0,), 1)
     words = ("run", folder / "logs", "--stage", "lms-y", "--out", folder / "out", "--workers", "1")
-    done = shell(program, CLOSE.get(to, ""), *words)
-    written = (folder / "out" / "status.json").exists()
-    status = int((re.findall(r"status (\d+)", done.stderr) or [done.returncode])[0])
-    right = written and not is_traceback(done) and status == (to in ("full disk", "pipe"))
-    # `head` may have read all before it ends.
-    right |= written and to == "pipe" and status == 0
-    return Seen(right, f"{status}, {'written' if written else 'nothing written'}")
+    done = shell(program, to, *words)
+    return _judged(done, folder / "out" / "status.json", 0)
+
+
+def full(program: Program, folder: Path, *, to: str) -> Seen:
+    """Save the modes of a log, and print them to where nothing can be written."""
+    write_log(folder / "a.csv", (126.0,), 1)
+    saved = folder / "stage.toml"
+    done = shell(program, to, "modes", folder / "a.csv", "--band", "90", "300", "--save", saved)
+    return _judged(done, saved, 1 if to else 0)
+
+
+def _judged(done: subprocess.CompletedProcess[str], file: Path, status: int) -> Seen:
+    """Judge a call by its status and by a file that it writes."""
+    found = int((re.findall(r"status (\d+)", done.stderr) or [done.returncode])[0])
+    right = file.exists() and found == status and not is_traceback(done)
+    return Seen(right, f"{found}, {file.name} is {'' if file.exists() else 'not '}written")
 
 
 def ended(program: Program, folder: Path, *, name: str) -> Seen:
@@ -83,6 +92,8 @@ def ended(program: Program, folder: Path, *, name: str) -> Seen:
     with subprocess.Popen(
         program.command(*words), stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True,
         env=program.environment(), start_new_session=True,
+        # What `nohup` starts ignores SIGHUP.
+        preexec_fn=lambda: signal.signal(getattr(signal, name or "SIGTERM"), signal.SIG_DFL),
     ) as process:  # fmt: skip
         end = time.monotonic() + BEGUN_S
         while name and not _identified(folder / "out") and time.monotonic() < end:
@@ -176,11 +187,10 @@ _NARROW = [
 CASES: tuple[Case, ...] = (
     _case("standard output in latin-1", "readable", encoded, "encoding", "latin-1", "utf-8"),
     _case("standard output in ASCII", "readable", encoded, "encoding", "ascii", "utf-8"),
-    _case("closed standard output", "status 0, all files", redirected, "to", "stdout", ""),
-    _case("closed standard error", "status 0, all files", redirected, "to", "stderr", ""),
-    _case("full disk behind standard output", "status 1, all files", redirected, "to",
-          "full disk", ""),
-    _case("pipe that is closed early", "all files, no message", redirected, "to", "pipe", ""),
+    _case("closed standard output", "status 0, all files", redirected, "to", ">&-", ""),
+    _case("closed standard error", "status 0, all files", redirected, "to", "2>&-", ""),
+    _case("full disk behind standard output", "status 1, files", full, "to", ">/dev/full", ""),
+    _case("pipe that is closed early", "status 1, files", full, "to", "| true", ""),
     _case("SIGTERM to all processes", "status 143, one line", ended, "name", "SIGTERM", ""),
     _case("SIGHUP to all processes", "status 129, one line", ended, "name", "SIGHUP", ""),
     *_NARROW,
