@@ -36,7 +36,7 @@ class Program:
 
     def command(self, *arguments: str | Path) -> list[str]:
         """Return the command line of a call."""
-        return [sys.executable, "-P", "-m", "lmshealth", *map(str, arguments)]  # not of the folder
+        return [sys.executable, "-m", "lmshealth", *map(str, arguments)]
 
     def __call__(self, *arguments: str | Path, **options: Any) -> subprocess.CompletedProcess[str]:
         """Call the command line of the program and wait for its end.
