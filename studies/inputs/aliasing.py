@@ -96,7 +96,7 @@ def claims(record: Row) -> list[Claim]:
             "aliased records and filtered ones that the best threshold misjudges",
             f"{record['least_error']:.0%}",
             f"energy at half of the rate of aliased records {span((least, most))} times the floor, "
-            f"of filtered ones {span((record['ratios']['filtered'][k] for k in (0, 2)))} times",
+            f"of filtered ones {span(record['ratios']['filtered'][k] for k in (0, 2))} times",
             "no threshold is of use, and nothing is flagged",
         )
     ]
