@@ -341,7 +341,7 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
         if at < end:
             continue
         start, stop = _extent(measured, at, lag)
-        if stop - start >= constants.SHORTEST_REPEAT and not _by_chance(measured, start, stop):
+        if stop - start >= constants.SHORTEST_REPEAT and not _by_chance(measured, start, stop, lag):
             found.append((max(start, end), stop))
             end = stop
             periodic += stop - start if stop - start >= 3 * lag else 0
@@ -403,8 +403,15 @@ def _equal(measured: Sequence[Samples], start: int, stop: int, lag: int) -> np.n
     return same
 
 
-def _by_chance(measured: Sequence[Samples], start: int, stop: int) -> bool:
-    """Return whether so few levels occur in a range that it may repeat another one by chance."""
-    n = stop - start
-    share = max(_equal(measured, start + k, stop, k).mean() for k in _LAGS if k < n)
+def _by_chance(measured: Sequence[Samples], start: int, stop: int, lag: int) -> bool:
+    """Return whether a range may repeat another one, a lag before it, by chance.
+
+    It may where few levels occur in it, or, as in a tone of few digits, where samples beside it
+    equal those a lag before, too.
+    """
+    n, size = stop - start, measured[0].size
+    shares = [_equal(measured, start + k, stop, k).mean() for k in _LAGS if k < n]
+    beside = (max(lag, start - n), start), (stop, min(size, stop + n))
+    shares += [_equal(measured, low, high, lag).mean() for low, high in beside if low < high]
+    share = max(shares)
     return bool(share > 0 and n * -np.log(share) < constants.CHANCE)

@@ -163,7 +163,7 @@ def test_a_spectrum_without_names(tmp_path: Path) -> None:
 )
 def test_a_log_is_no_other_file(tmp_path: Path, text: str) -> None:
     """Texts that begin like other files are read."""
-    rows = "".join(f"{a:.4f},{b:.4f}\n" for a, b in zip(X, X[::-1] ** 2, strict=True))
+    rows = "".join(f"{a:.4f},{b:.4f}\n" for a, b in zip(X, X[::-1], strict=True))
     (tmp_path / "a.csv").write_text(text + rows)
     assert read_log(tmp_path / "a.csv").sample_rate == 2000.0
 

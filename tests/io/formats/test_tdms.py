@@ -337,7 +337,7 @@ def test_channels_that_start_later_are_aligned(tmp_path, start, offset):
 @pytest.mark.parametrize("late", [0.00525, 0.7])
 def test_channels_that_cannot_be_aligned(tmp_path, late):
     """A fraction of a sample, or half of the record: the minority is refused with both starts."""
-    channels = [(name, NOISE**k, clock()) for k, name in ((1, "a"), (2, "b"))]
+    channels = [("a", NOISE, clock()), ("b", NOISE[::-1], clock())]
     path = write(tmp_path / "a.tdms", *channels, ("c", NOISE**3, clock(late)))
     log = read_log(path)
     assert [c.name for c in log.channels] == ["acc_a", "acc_b"]
@@ -350,7 +350,7 @@ def test_starts_that_are_equal_or_absent(tmp_path):
     without = {"unit_string": "g", "wf_increment": 5e-4}
     path = write(
         tmp_path / "a.tdms",
-        *(("a", NOISE, clock()), ("b", NOISE**2, clock(1e-5)), ("c", NOISE**3, without)),
+        *(("a", NOISE, clock()), ("b", NOISE[::-1], clock(1e-5)), ("c", NOISE**3, without)),
         n_segments=3,
     )
     log = read_log(path)
