@@ -91,14 +91,17 @@ def refused(make: Callable[[Path], Path], words: tuple[str, ...], program: Progr
 
 def proposed(make: Callable[[Path], Path], words: tuple[str, ...], program: Program,
              folder: Path, options: tuple[str, ...] = (), mode: float = 0.0) -> Seen:  # fmt: skip
-    """Propose a map, which has words in it, and read the log by it."""
+    """Propose a map, which has words in it; for a mode, read the log by it.
+
+    `init` writes only a map by which it has read the log.
+    """
     path = make(folder)
     done = program("init", path, "--out", folder / "out", *options)
     where = folder / "out" / "map.toml"
     if not where.exists():
         return Seen(False, last_line(done.stderr))
     text = where.read_text("utf-8")
-    modes, why = found_modes(program, path, "--columns", where)
+    modes, why = found_modes(program, path, "--columns", where) if mode else ([], "")
     lines = [line for line in text.splitlines() if " = " in line and "assumed: set" not in line]
     right = all(word in text for word in words) and not why and (not mode or near(modes, mode, ANY))
     return Seen(right, f"{'; '.join(modes)} {why} {' | '.join(lines)}".strip()[:200])
