@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
     from lmshealth.modal.frf.identification import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
+    from lmshealth.modal.log_estimates import LogEstimates as LogEstimates
     from lmshealth.prognosis.life_posterior import fit_life as fit_life
     from lmshealth.prognosis.maintenance_decision import decide as decide
     from lmshealth.prognosis.remaining_life import prognose as prognose
     from lmshealth.stage.description import load_stage as load_stage
     from lmshealth.stage.planning import plan as plan
-    from lmshealth.tracking.history import LogEstimates as LogEstimates
     from lmshealth.tracking.history import build_history as build_history
     from lmshealth.tracking.track import track as track
 
@@ -38,7 +38,7 @@ __version__ = version("lmshealth")
 # command line sets the number of threads before numpy is imported.
 _HOMES = {
     "LmshealthError": "errors",
-    "LogEstimates": "tracking.history",
+    "LogEstimates": "modal.log_estimates",
     "Settings": "batch.run",
     "analyse": "batch.analysis",
     "assess": "batch.assess",

@@ -7,8 +7,9 @@ preload is left and 87 % of the mount stiffness; the preload reaches its limit o
 from importlib import resources
 from pathlib import Path
 
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import load_stage
-from lmshealth.tracking.history import History, LogEstimates, build_history
+from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.read_tables import read_estimates
 
 TABLE = Path(str(resources.files("lmshealth") / "stage" / "descriptions" / "example-y.csv"))

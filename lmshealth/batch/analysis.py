@@ -12,10 +12,10 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import find_logs, read_manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
 from lmshealth.modal.identification import identify
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
 
 

@@ -19,6 +19,7 @@ from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import Epoch, epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.io.log import Notice
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import (
     EndedLife,
@@ -36,14 +37,8 @@ from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import (
-    History,
-    LogEstimates,
-    build_history,
-    missing_mode_notices,
-    rate_notices,
-    sort_by_time,
-)
+from lmshealth.tracking.contradictions import sort_by_time
+from lmshealth.tracking.history import History, build_history, missing_mode_notices, rate_notices
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
 

@@ -24,11 +24,11 @@ from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates
 
 Progress = Callable[[str, int, int], None]
 """Callback: name of the step, how many items are done, how many there are."""

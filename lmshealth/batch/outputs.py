@@ -19,7 +19,7 @@ from lmshealth.batch.workers import Pool
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import COLUMNS, Row, csv_text, join_csv, machine_tables
-from lmshealth.tracking.history import LEFT_OUT
+from lmshealth.tracking.contradictions import LEFT_OUT
 
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()

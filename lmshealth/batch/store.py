@@ -35,8 +35,8 @@ from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.batch.status import Change, Status
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Summary
-from lmshealth.tracking.history import LogEstimates
 
 Outcome = LogEstimates | tuple[Refusal, ...]
 """Result of a log: its modal estimates, or why it was refused."""

@@ -27,6 +27,7 @@ from lmshealth.modal.free_decay.identification import identify_decays
 from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
 from lmshealth.modal.frf.measured import MeasuredResponse, read_responses
 from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
 from lmshealth.report import log_figures, tables
@@ -35,7 +36,6 @@ from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
-from lmshealth.tracking.history import LogEstimates
 
 Result = TypeVar("Result")
 

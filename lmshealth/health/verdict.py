@@ -14,9 +14,10 @@ from lmshealth._private.arrays import BoolArray
 from lmshealth.health import constants
 from lmshealth.health.results import Health
 from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.naming import off_description
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.history import History, LogEstimates
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Event, Track
 
 # Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.

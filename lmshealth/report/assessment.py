@@ -17,6 +17,7 @@ from lmshealth.health.verdict import (
     undeclared_events,
 )
 from lmshealth.io.log import Notice, Refusal
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
 from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
@@ -36,7 +37,7 @@ from lmshealth.report.text import (
     travel_left,
 )
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.history import History, LogEstimates
+from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
 
 State = Literal["good", "bad", "open"]

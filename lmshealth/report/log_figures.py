@@ -23,6 +23,7 @@ from lmshealth.modal.ambient.search import Found
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.frf.measured import MeasuredResponse
 from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
@@ -34,7 +35,6 @@ from lmshealth.signal.segments import select_segments
 from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
-from lmshealth.tracking.history import LogEstimates
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

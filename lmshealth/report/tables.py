@@ -15,6 +15,7 @@ from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
@@ -26,7 +27,6 @@ from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.check import Diagnostic, StageCheck
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.planning import Plan
-from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Track, mode_columns
 

@@ -19,10 +19,11 @@ from lmshealth.errors import BadTable
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.io.tables import lines, name_machine, read_rows, to_moments, to_numbers
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.history import History, LogEstimates, build_history
+from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.maintenance import read_actions
 
 _KM, _MILLI, _MICRO = 1000.0, 1e-3, 1e-6

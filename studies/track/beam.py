@@ -28,9 +28,10 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth.io.log import Metadata
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Covariate, Description, Stage
-from lmshealth.tracking.history import History, LogEstimates, build_history
+from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted, span
 from studies.harness.study import Row, Study, real_data

@@ -40,6 +40,7 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
 from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.prognosis import life_posterior
 from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import scatter_prior
@@ -49,7 +50,6 @@ from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.tables import COLUMNS, machine_tables
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal
-from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
 from studies.harness import servers

@@ -38,12 +38,12 @@ from lmshealth.batch.store import (
     unpack_or_none,
 )
 from lmshealth.io.log import Metadata, Refusal
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
-from lmshealth.tracking.history import LogEstimates
 from studies.harness.servers import Postgres, wait_until
 from tests.assessments import leaves, worn
 

@@ -19,6 +19,7 @@ from lmshealth.batch.assess import assess
 from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
@@ -33,7 +34,7 @@ from lmshealth.report.text import GAP, plain
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.covariate_effects import find_covariate_effects
-from lmshealth.tracking.history import LogEstimates, Series
+from lmshealth.tracking.history import Series
 from tests.assessments import (
     Maker,
     Page,

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.stage.description import load_stage
-from lmshealth.tracking.history import LogEstimates
 from tests.assessments import Maker, blind, chromium, make, nothing, watch, write_report
 from tests.signals import Mode, accelerations, make_log
 

@@ -13,6 +13,7 @@ import pytest
 
 from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Metadata, Refusal
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import Prognosis
@@ -31,7 +32,7 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.history import History, LogEstimates, Series
+from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Effect, Event, Track
 from tests.lives import health_of

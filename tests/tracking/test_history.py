@@ -12,15 +12,15 @@ import pytest
 
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import WARNINGS, Refusal
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
+from lmshealth.tracking.contradictions import sort_by_time
 from lmshealth.tracking.history import (
     History,
-    LogEstimates,
     Series,
     build_history,
     missing_mode_notices,
     rate_notices,
-    sort_by_time,
 )
 from lmshealth.tracking.maintenance import Action
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track

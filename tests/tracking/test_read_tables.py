@@ -13,9 +13,10 @@ import pytest
 from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import BadTable
 from lmshealth.io.constants import LAST_MOMENT
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates, build_history
+from lmshealth.tracking.history import build_history
 from lmshealth.tracking.read_tables import read_drifts, read_estimates, read_machines
 from tests.lives import FADING, make_stage, make_track
 

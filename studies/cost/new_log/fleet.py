@@ -33,10 +33,10 @@ from lmshealth import load_stage
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
 from lmshealth.health.ensemble_sampling import seed_of
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.track import accepted_estimates
 from studies.cost.archive import Steps
 from studies.cost.new_log.life import EPOCHS, apart, assess_and_report, machine_of

@@ -22,10 +22,10 @@ from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.history import LogEstimates
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from studies.harness.cost import cpu_s, memory_bytes
 from studies.harness.study import Row

@@ -29,8 +29,8 @@ import numpy as np
 
 from lmshealth._private.serialize import fingerprint
 from lmshealth.io.log import Metadata
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
-from lmshealth.tracking.history import LogEstimates
 from studies.cost.new_log.life import NAME, SEED
 from studies.harness.claims import Claim, number
 from studies.harness.cost import in_own_process

@@ -31,11 +31,12 @@ from unittest.mock import patch
 import numpy as np
 
 from lmshealth.io.log import Metadata
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Covariate, Description, ModeSpec, Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association import associate
-from lmshealth.tracking.history import History, LogEstimates, build_history
+from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted
 from studies.harness.data.histories import START
