@@ -108,9 +108,11 @@ def _modes(tables: dict[str, list[Row]]) -> list[str]:
     if len(set(keys)) != len(keys):
         found.append("a mode stands twice in modes.csv")
     known = {(row["log"], row["source"], row["mode"]) for row in tables["modes"]}
-    for row in tables["modes_cov"]:
-        if (row["log"], row["source_a"], row["mode_a"]) not in known:
-            found.append(f"modes_cov.csv names {row['mode_a']}, which modes.csv does not have")
+    found += [
+        f"modes_cov.csv names {row['mode_a']}, which modes.csv does not have"
+        for row in tables["modes_cov"]
+        if (row["log"], row["source_a"], row["mode_a"]) not in known
+    ]
     return found
 
 
@@ -155,9 +157,8 @@ def _prognosis(tables: dict[str, list[Row]]) -> list[str]:
             told = float(row["censored_from"] or "nan")
             if not (math.isnan(level) and math.isnan(told)) and not math.isclose(level, told):
                 found.append(f"censored_from of {name} is {told}, quantiles end at {level}")
-    for stage in {row["stage"] for row in tables["prognosis"]}:
-        if "any" not in [r["parameter"] for r in tables["prognosis"] if r["stage"] == stage]:
-            found.append(f"prognosis of {stage} lacks any")
+    rows = {(row["stage"], row["parameter"]) for row in tables["prognosis"]}
+    found += [f"prognosis of {stage} lacks any" for stage, _ in rows if (stage, "any") not in rows]
     return found
 
 

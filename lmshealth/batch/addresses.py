@@ -65,7 +65,8 @@ def notify() -> None:
 
     changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
     messenger, addresses = apprise.Apprise(), os.environ.get(constants.NOTIFY, "").split()
-    if not all([messenger.add(address) for address in addresses]):
+    # All are tried, so that each is named.
+    if not all([messenger.add(address) for address in addresses]):  # noqa: C419
         sys.exit(f"apprise does not know an address in {constants.NOTIFY}")
     body = "\n".join(change["text"] for change in changes)
     if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):

@@ -51,7 +51,7 @@ def test_scenarios_have_all_the_probability(steps: tuple[float, ...], n: int) ->
     assert sum(scenario.weight for scenario in scenarios) == pytest.approx(1, abs=1e-14)
     keys = {tuple((b.law.kind, b.begin, b.steps) for b in one.paths) for one in scenarios}
     assert len(keys) == n
-    weight = {taken: 0.0 for taken in (steps, ())}
+    weight = dict.fromkeys((steps, ()), 0.0)
     for scenario in scenarios:
         (taken,) = {path.steps for path in scenario.paths}
         weight[taken] += scenario.weight

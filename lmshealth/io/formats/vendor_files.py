@@ -74,7 +74,7 @@ def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 def _records(path: Path, names: list[str]) -> Iterator[list[float]]:
     """Yield time and values of each record; the signals, which come before, add their names."""
     try:
-        for _, element in iterparse(path):
+        for _, element in iterparse(path):  # noqa: S314 (expat bounds entities)
             if element.tag == "dataSignal":
                 names.append(_name(element))
             if element.tag == "rec":
@@ -97,7 +97,7 @@ def response_functions(path: Path) -> list[Function]:
     A trace has none. `Unusable` (``corrupt``) for numbers that are cut off or do not fit together.
     """
     try:
-        root = parse(path).getroot()
+        root = parse(path).getroot()  # noqa: S314
         named = {what: [e for e in root.iter("FrequencyResponseFunction") if e.get("name") == what]
                  for what in ("m_pPlant", "m_pMeasCoherence")}  # fmt: skip
         plants, coherences = named.values()
