@@ -93,7 +93,7 @@ _ASSESSED = _table("assessed", "machine key", "content evidence summary")
 # Parts of the last assessment of each machine, by the fingerprint of what they depend on.
 _PARTS = _table("parts", "machine key", "content")
 # Which assessment of each machine was published last, and the key of its list of refused logs.
-_PRESENT = _table("present", "machine", "content")
+_PRESENT = _table("present", "machine", "name content")
 # Summaries of all published assessments, numbered in the order of publication.
 _SUMMARIES = _table("summaries", "machine key", "content")
 # Lists of logs that belong to no machine, by the fingerprint of the list.
@@ -473,7 +473,9 @@ class Store:
         number = 1 + max((one.number for _, one in self._summarised(machine)), default=0)
         others = sql.delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
         with self._begin() as connection:
-            self._put_rows(connection, _PRESENT, [{"machine": own, "content": present}])
+            self._put_rows(
+                connection, _PRESENT, [{"machine": own, "name": machine} | {"content": present}]
+            )
             if summary is not None:
                 content = pack(_Summarised(number, summary))
                 row = {"machine": own, "key": key, "content": content}
@@ -583,7 +585,7 @@ class Store:
     def _remove_damaged(self, table: sql.Table, keys: tuple[Any, ...]) -> None:
         name = table.name.rpartition("_")[0]
         self.damaged[name] += 1
-        _logger.warning("damaged row of %s in the store %s", name, self._shown)
+        _logger.info("damaged row of %s in the store %s", name, self._shown)
         if self._writes:
             columns = zip(table.primary_key.columns, keys, strict=True)
             with self._begin() as connection:

@@ -72,9 +72,12 @@ def analyse(
 # Alerts: a machine whose last log is old is silent
 
 
-def alerts(folder: Path, *, fails: bool = False, days: float = 1.0) -> tuple[str, ...]:
+def alerts(
+    folder: Path, *, fails: bool = False, days: float = 1.0, takes: float = 0.0
+) -> tuple[str, ...]:
     """Return options of a run that delivers silences: each call of the command is a line."""
-    command = shlex.join([sys.executable, "-c", KEEP, str(folder / "sent")])
+    program = f"import time; time.sleep({takes}); {KEEP}"
+    command = shlex.join([sys.executable, "-c", program, str(folder / "sent")])
     return ("--silent-days", str(days), "--alert-command", "false" if fails else command)
 
 
@@ -127,7 +130,7 @@ def cut_status(program: Program, folder: Path) -> Seen:
 def at_once(program: Program, folder: Path) -> Seen:
     """Run twice at the same time."""
     write_log(folder / "logs" / "0.csv", 0)
-    out = ("--out", str(folder / "out"), "--workers", "1", *alerts(folder))
+    out = ("--out", str(folder / "out"), "--workers", "1", *alerts(folder, takes=5.0))
     command = program.command("run", folder / "logs", "--stage", "lms-y", *out)
     quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
     both = [subprocess.Popen(command, env=program.environment(), **quiet) for _ in range(2)]  # type: ignore[call-overload]
