@@ -17,19 +17,26 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
+from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from importlib import import_module
 from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
 from studies.harness.checkout import ROOT, checkout
 from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
-from studies.inputs.outside_faults.case import Case, Program, Seen
+from studies.inputs.outside_faults.case import Case, Program
 
 SCRIPTS = ("run", "case", "figure")
 
 EACH = 6  # of the cases of the quick form
+SIDES = ("fault", "control")
+Answer = Sequence[Any]  # whether it is right, and its text
+# By revision; the present program has no name.
+PROGRAMS = {"": Program(ROOT)}
 # Modules beside this one, each with its CASES.
 KINDS = tuple(
     path.stem for path in sorted(Path(__file__).parent.glob("*.py")) if path.stem not in SCRIPTS
@@ -37,18 +44,23 @@ KINDS = tuple(
 
 
 def main() -> None:
-    """Run all cases with both revisions."""
+    """Give all cases to both revisions."""
     study = Study(__file__, __doc__, before="e0d0b2d", only="")
-    chosen = [one for one in cases() if study.options.only in f"{one.kind}: {one.name}"]
-    with tempfile.TemporaryDirectory() as temporary:
-        folder = Path(temporary)
-        chosen = chosen[::EACH] if study.quick else chosen
-        now = all_answers(chosen, Program(ROOT), folder / "now")
-        before: dict[str, tuple[Seen, Seen]] = {}
+    chosen = [one.name for one in cases() if study.options.only in f"{one.kind}: {one.name}"]
+    chosen = chosen[::EACH] if study.quick else chosen
+    # Each call is a process of its own, so that threads do.
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        ask = partial(study.trials.collect, answer, pool=pool)
+        present = ask([(name, side, "") for name in chosen for side in SIDES], also=["lmshealth"])
+        now = dict(zip(chosen, zip(present[::2], present[1::2], strict=True), strict=True))
+        before: dict[str, Answer] = dict.fromkeys(chosen, (False, ""))
         if not study.quick:
-            with checkout(study.options.before, folder / "code") as code:
-                before = all_answers(chosen, Program(code), folder / "before")
-    rows = [_row(one, now[one.name], before.get(one.name)) for one in chosen]
+            revision = study.options.before
+            with TemporaryDirectory() as folder, checkout(revision, Path(folder) / "code") as code:
+                PROGRAMS[revision] = Program(code)
+                found = ask([(name, "fault", revision) for name in chosen])
+                before = dict(zip(chosen, found, strict=True))
+    rows = [_row(one, *now[one.name], before[one.name]) for one in cases() if one.name in now]
     study.conclude(
         {
             "cases": len(rows),
@@ -67,48 +79,30 @@ def cases() -> list[Case]:
     return [case for module in modules for case in module.CASES]
 
 
-def all_answers(chosen: list[Case], program: Program, folder: Path) -> dict[str, tuple[Seen, Seen]]:
-    """Give all cases to a program, as many at a time as there are processors."""
-
-    def ask(case: Case) -> tuple[Seen, Seen]:
-        found = answers(case, program, folder)
-        print(
-            *(f"{one.right!s:5} {one.answer}" for one in found),
-            case.name,
-            sep=" | ",
-            file=sys.stderr,
-        )
-        return found
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # each call is a process
-        return dict(zip((one.name for one in chosen), pool.map(ask, chosen), strict=True))
-
-
-def answers(case: Case, program: Program, folder: Path) -> tuple[Seen, Seen]:
-    """Give a case and its control to a program, each in a new folder; never raises."""
-    found = []
-    for name, ask in (("fault", case.fault), ("control", case.control)):
-        own = folder / case.kind / case.name.replace("/", " ") / name
-        own.mkdir(parents=True)
+def answer(name: str, side: str, revision: str) -> tuple[bool, str]:
+    """Give one side of a case to a program in a new folder; never raises."""
+    case = next(one for one in cases() if one.name == name)
+    with TemporaryDirectory() as folder:
         try:
-            found.append(ask(program, own))
+            right, text = getattr(case, side)(PROGRAMS[revision], Path(folder))
         except Exception as error:  # an older program may answer in a way that a case cannot read
-            found.append(Seen(False, f"{type(error).__name__}: {error}"[:160]))
-    return found[0], found[1]
+            right, text = False, f"{type(error).__name__}: {error}"
+    print(name, side, revision, bool(right), text, sep=" | ", file=sys.stderr)
+    return bool(right), text[:200]
 
 
-def _row(case: Case, now: tuple[Seen, Seen], before: tuple[Seen, Seen] | None) -> Row:
+def _row(case: Case, fault: Answer, control: Answer, before: Answer) -> Row:
     """Return the row of the table of one case."""
     return {
         "kind": case.kind,
         "case": case.name,
         "right": case.right,
-        "before": before[0].answer if before else "",
-        "right_before": bool(before and before[0].right),
-        "now": now[0].answer,
-        "right_now": bool(now[0].right),
-        "control": now[1].answer,
-        "control_right": bool(now[1].right),
+        "before": before[1],
+        "right_before": before[0],
+        "now": fault[1],
+        "right_now": fault[0],
+        "control": control[1],
+        "control_right": control[0],
     }
 
 
