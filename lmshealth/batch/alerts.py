@@ -73,7 +73,7 @@ def announce(
     `Store.alone`; return statuses, changes, and notes of damage.
     """
     unsent, everything = store.unsent(), store.announced()
-    folder, notes = shown(scope.logs.absolute()), list[str]()
+    folder, notes = shown(os.path.abspath(scope.logs)), list[str]()
     own = {
         stage: one
         for stage, one in everything.items()

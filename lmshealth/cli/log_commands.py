@@ -85,7 +85,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     there = [str(path) for path in files if path.exists()]
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
-    text, guesses = propose(logs[0], rate=given["rate"], max_memory=given["max_memory"])
+    how = {name: given[name] for name in ("rate", "max_memory", "latest")}
+    text, guesses = propose(logs[0], **how)
     rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
     terminal.print_table(f"Columns of {logs[0]}", rows, 3)
     ctx.params |= {"logs": logs, "columns": decode(text.encode(), ColumnMap)}

@@ -14,9 +14,10 @@ from lmshealth.io.time_axis import IntArray, too_many
 # Standard deviation of normal noise over the median of its magnitude, and samples of a block from
 # which the usual second difference is taken.
 _NORMAL, _SAMPLE = 1.4826, 1 << 12
+_NONE: IntArray = np.empty((0, 2), dtype=np.int64)
 
 
-def missing_ranges(values: Samples) -> tuple[IntArray, str]:
+def missing_ranges(values: Samples, added: IntArray = _NONE) -> tuple[IntArray, str]:
     """Find the missing samples (NaN, infinite or absurd) of a channel, ``(n_samples,)`` in SI.
 
     Return half-open ranges in which every sample is missing, ascending, ``(n_ranges, 2)``, and
@@ -38,7 +39,10 @@ def missing_ranges(values: Samples) -> tuple[IntArray, str]:
         return ranges, ""
     n_missing, n_ranges = int(np.sum(ranges[:, 1] - ranges[:, 0])), len(ranges)
     note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_ranges} ranges"
-    if n_missing > constants.LARGEST_MISSING * values.size or too_many(n_ranges, values.size):
+    # Gaps of the time are common to all channels, and were counted there.
+    own = n_missing - int(np.sum(added[:, 1] - added[:, 0]))
+    many = too_many(n_ranges - len(added), values.size)
+    if own > constants.LARGEST_MISSING * values.size or many:
         raise Unusable("missing-samples", note)
     return ranges, note
 

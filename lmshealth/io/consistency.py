@@ -162,8 +162,12 @@ def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
     middle = max(start, (start + stop - _STRETCH) // 2)
     stretch = position[middle : min(stop, middle + _STRETCH) + 1]
     apart = np.abs(np.diff(stretch))
-    usual = float(np.median(apart))
-    steps = [resolution(stretch), float(np.quantile(np.abs(apart - usual), 0.9))]
+    stretch, apart = stretch[np.isfinite(stretch)], apart[np.isfinite(apart)]
+    if not apart.size:
+        return 0.0, 0.0
+    # Second differences are those of rounding, also where the motion accelerates.
+    uneven = float(np.quantile(np.abs(np.diff(apart)), 0.9)) if apart.size > 1 else 0.0
+    steps = [resolution(stretch, np.finfo(np.float32).eps), uneven]
     # A position that is held, or coarser than its increment, has steps of its own.
     held = apart[apart > 0]
     if held.size < 0.9 * apart.size:
@@ -228,7 +232,7 @@ def _without_beat(own: _Blocks, dropped: IntArray) -> tuple[IntArray, tuple[floa
     steps slightly below its increment: with the jumps it moves by the velocity, without them not.
     """
     way = own.way.copy()
-    way[dropped // _LENGTH] = np.nan
+    way[np.minimum((dropped - 1) // _LENGTH, way.size - 1)] = np.nan
     fit = _slope(own._replace(way=way))
     if dropped.size and fit is not None and (whole := _slope(own)) is not None:
         off = abs(fit[0] - 1)
@@ -311,8 +315,8 @@ def _fit(way: FloatArray, expected: FloatArray, step: float) -> tuple[float, flo
         slope = inverse @ (x[keep].T @ y[keep])
         error = y - x @ slope
     n = int(keep.sum())
-    if np.mean(np.abs(error)) > 0.5 * np.mean(y):
-        return None  # the one does not follow the other
+    if np.mean(np.abs(error)) > constants.UNLIKE * np.mean(y) + step:
+        return None  # the one does not follow the other, as a path velocity
     variance = max(float(np.sum(error[keep] ** 2)) / max(n - 2, 1), step**2 / 6 / n)
     return float(slope[0]), float(np.sqrt(variance * inverse[0, 0]))
 
@@ -323,7 +327,8 @@ def _rounding(velocity: Samples, expected: FloatArray) -> float:
     if ramps.size < _FEWEST:
         return 0.0
     levels = np.abs(np.concatenate([velocity[k : k + 2 * _LENGTH] for k in ramps]))
-    return float(resolution(levels) / 2 / np.quantile(levels, 0.9))
+    levels = levels[np.isfinite(levels)]
+    return float(resolution(levels) / 2 / np.quantile(levels, 0.9)) if levels.any() else 0.0
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:

@@ -123,9 +123,13 @@ MAGNITUDE = 1e-3
 """Share of the variance of its square that a magnitude of other channels has beyond theirs:
 rounding to a thirtieth of its standard deviation leaves 10⁻⁴. Also below a tenth of what a linear
 combination leaves of it."""
-WIDE_GAP, GAP_EXPECTED = 0.5, 60
-"""Gap between levels in standard deviations from which levels are missing (an error of g²/12, 2 %
-of the variance), if so many samples were expected in it."""
+WIDE_GAP, STUCK_BAND = 0.5, 0.3
+"""Gaps between levels in standard deviations from which levels are missing (an error of g²/12, 2 %
+of the variance), and the largest relative difference of the bands between them from a gap: those
+of a stuck bit are equal; clusters of a tone and parts of a drift are not."""
+MOST_TURNS = 16
+"""Turns of a counter from one sample to the next that are undone; more are no counter's, but those
+of a prediction that follows its own corrections."""
 
 # Time
 
@@ -179,6 +183,9 @@ RATE_FLAGGED, RATE_REFUSED = 5e-4, 5e-3
 """Relative differences between the sample rate and that by set position and set velocity, beyond
 five standard errors: a frequency has the first as its standard deviation in a record of 60 s
 (README.md, "Time"); the second is the rounding of a velocity to three digits."""
+UNLIKE = 0.1
+"""Mean error of the displacements by the set position, as a share of them, from which they do not
+follow the set velocity: that of another axis or of a path. A wrong rate has none."""
 MOVING = 0.2
 """Share of the usual speed from which a block of samples is in motion."""
 FINE_STEPS = 4.0

@@ -311,7 +311,7 @@ def _measured(
     """
     values, notes = item.values, dict[str, str]()
     try:
-        gone, notes["gaps"] = missing_ranges(values)
+        gone, notes["gaps"] = missing_ranges(values, added)
         rough = check_signal(values)
         values, notes["unwrapped"] = unwrapped(values, gone, rough)
         if item.signal.role in _DYNAMIC:
@@ -329,10 +329,10 @@ def _measured(
         return None
     values, left = filled(values, gone, axis.breaks)
     open_ones = f"{len(left)} of {len(gone)} ranges are not filled" if left.size else ""
-    if np.array_equal(gone, added):  # time_s has a note of these
-        notes["gaps"] = open_ones
-    elif notes["gaps"]:
+    if notes["gaps"] and not np.array_equal(gone, added):  # time_s has a note of those
         notes["gaps"] += f"; {open_ones or 'they are filled by linear prediction'}"
+    else:
+        notes["gaps"] = open_ones
     refused += [
         Refusal(name, reason, detail, channel=item.signal.name)
         for reason, detail in notes.items()

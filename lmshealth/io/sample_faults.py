@@ -115,18 +115,24 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
         errors = model.errors(x)
         i = 0
         while True:
-            off = np.abs(errors[i : i + _STRIDE]) > whole / 2
+            lacks = gone[i + _ORDER : i + _ORDER + _STRIDE]
+            off = (np.abs(errors[i : i + _STRIDE]) > whole / 2) | lacks
             if not off.any():
                 i += _STRIDE
                 if i >= errors.size:
                     break
                 continue
             i += int(off.argmax())
-            turn = whole * round(float(errors[i]) / whole)
+            lacking = bool(gone[i + _ORDER])
+            if not abs(errors[i]) < constants.MOST_TURNS * whole:
+                return values, 0  # the model follows its own corrections
+            turn = float(errors[i]) if lacking else whole * round(float(errors[i]) / whole)
             reached = errors[i : i + _ORDER + 1]
             reached -= turn * a[: reached.size]
             x[i + _ORDER] -= turn
-            squares, n, i = squares + float(errors[i]) ** 2, n + 1, i + 1
+            if not lacking:
+                squares, n = squares + float(errors[i]) ** 2, n + 1
+            i += 1
         before = x[-_ORDER:].copy()
         x[gone] = np.nan
         spool.append(x[_ORDER:])
@@ -271,16 +277,26 @@ def check_sign(values: Samples, rough: Roughness) -> None:
         scale = float(own.std())
         skew = float(np.mean((own - own.mean()) ** 3)) / scale**3
         from_zero = 0 <= low < constants.NEAR_ZERO * q[3] and skew > constants.MAGNITUDE_SKEW
-        if edge or from_zero:
+        if (edge or from_zero) and _reaches(values, own is x, low, float(q[3])):
             end = f"below {rough.low:.4g}" if own is x else f"above {rough.high:.4g}"
             detail = f"no sample is {end} (SI), as of a magnitude, which shows modes at sums and "
             raise Unusable("rectified", f"{detail}doubles of their frequencies; record its sign")
 
 
+def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:
+    """Return whether a channel comes near its edge throughout; a drift is there for a while."""
+    n = max(constants.LEVEL_SAMPLES // 8, 1)
+    for at in np.linspace(0, max(0, values.size - n), 8).astype(int).tolist():
+        x = values[at : at + n] if is_lower else -values[at : at + n]
+        if np.isfinite(x).any() and np.nanmin(x) - low > (middle - low) / 2:
+            return False
+    return True
+
+
 def coarse_levels(values: Samples) -> str:
     """Return what is wrong with the levels of a channel; empty if nothing."""
     x = _sample(values, constants.LEVEL_SAMPLES)
-    levels, count = np.unique(x, return_counts=True)
+    levels = np.unique(x)
     if levels.size < 3:
         return ""
     gaps, std = np.diff(levels), float(x.std())
@@ -288,20 +304,14 @@ def coarse_levels(values: Samples) -> str:
     if std < constants.LEAST_STEPS * step and levels.size < constants.FEWEST_LEVELS:
         found = f"its standard deviation is {std / step:.2f} steps of {step:.3g} (SI)"
         return f"{found}: levels and standard deviations of its modes may be wrong; widen its gain"
-    upto = np.cumsum(count) / x.size
-    inner = (upto[:-1] > 0.1) & (upto[:-1] < 0.9)
-    least = max(constants.WIDE_GAP * std, 3 * step)
-    wide = inner & (gaps > least) & (gaps < 2 * constants.WIDE_GAP * std)
-    for k in np.flatnonzero(wide).tolist():
-        # Between two humps of the distribution there are few samples beside the gap.
-        below, above = levels[k : k + 2].tolist()
-        reach = (above - below) / 4
-        n_below = int(np.count_nonzero((x > below - reach) & (x <= below)))
-        n_above = int(np.count_nonzero((x >= above) & (x < above + reach)))
-        n = min(n_below, n_above)
-        if n > 0.25 * max(n_below, n_above) and 4 * n > constants.GAP_EXPECTED:
-            found = f"no sample lies between {below:.6g} and {above:.6g} (SI)"
-            return f"{found}, {(above - below) / std:.2f} standard deviations; check the converter"
+    # A bit that is stuck leaves bands of levels apart that are as wide as the bands.
+    wide = np.flatnonzero((gaps > max(constants.WIDE_GAP * std, 3 * step)) & (gaps < std))
+    bands = levels[wide[1:]] - levels[wide[:-1] + 1]
+    stuck = np.abs(bands / gaps[wide[:-1]] - 1) < constants.STUCK_BAND
+    if stuck.sum() > 0.5 * bands.size:
+        below, above = levels[wide[0] : wide[0] + 2].tolist()
+        found = f"no sample lies between {below:.6g} and {above:.6g} (SI), nor in gaps like it"
+        return f"{found}: a bit of the converter is stuck; check it"
     return ""
 
 

@@ -63,9 +63,7 @@ class TimeAxis(NamedTuple):
         before = np.searchsorted(self.breaks, self.lost - [0, 1], side="right")
         lost = self.lost + shift[before]
         breaks = (self.breaks + shift[1:])[~known]
-        note = (
-            f"{self.note}; short ones are filled by linear prediction" if added.size else self.note
-        )
+        note = f"{self.note}; short ones are inserted, and filled where the channel allows it"
         return self._replace(breaks=breaks, lost=lost, note=note, dropped=breaks * 0), added
 
 
@@ -146,7 +144,9 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
         raise Unusable("time", f"time_s: {error}") from error
     if not varies:
         # Coarse stamps do not count the samples of a gap.
-        lacking = np.where(step > constants.JITTER * interval, 0.0, lengths / interval - 1)
+        is_whole = abs(interval / step - round(interval / step)) < constants.AGREEMENT
+        is_coarse = slack > 0 or (step > constants.JITTER * interval and not is_whole)
+        lacking = np.where(is_coarse, 0.0, lengths / interval - 1)
         dropped = np.rint(lacking).astype(np.int64)
         certain = np.abs(lacking - dropped) < constants.JITTER
         few = (dropped > 0) & (dropped <= constants.LONGEST_FILLED)
@@ -352,12 +352,16 @@ def _check_order(time: Samples) -> int:
     return repeated
 
 
-def resolution(time: Samples) -> float:
-    """Return the step in s to which time stamps are rounded, of decimals or of floats."""
+def resolution(time: Samples, relative: float = 0.0) -> float:
+    """Return the step to which values, such as time stamps in s, are rounded: decimals or floats.
+
+    ``relative`` is their least relative step, such as that of float32 in another unit.
+    """
     stamps = time[:BLOCK]
     largest = float(np.abs(stamps).max())
     float32 = np.array_equal(stamps.astype(np.float32), stamps)
     floating = float(np.spacing(np.float32(largest) if float32 else largest))
+    floating = max(floating, relative * largest)
     for digits in range(_MOST_DIGITS):
         scaled = stamps * 10.0**digits
         if (np.abs(scaled - np.rint(scaled)) < max(1e-6, 4 * floating * 10.0**digits)).all():

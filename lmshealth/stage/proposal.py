@@ -136,7 +136,11 @@ class _Column:
 
 
 def propose(
-    path: Path, *, rate: float | None = None, max_memory: float = constants.MAX_MEMORY
+    path: Path,
+    *,
+    rate: float | None = None,
+    max_memory: float = constants.MAX_MEMORY,
+    latest: datetime | None = None,
 ) -> tuple[str, list[Guess]]:
     """Propose the column map of a file, as TOML with comments; return all guesses too.
 
@@ -151,7 +155,7 @@ def propose(
         axis = frequency_column(content.present)
         if axis and all(one.is_even for one in columns[:1]):
             raise over_frequency(axis)
-        stated = parse_metadata(content.metadata)[1]
+        stated = parse_metadata(content.metadata, latest)[1]
         if rate and stated and abs(rate / stated - 1) > constants.AGREEMENT:
             detail = f"the file states {stated:.8g} Hz, --sample-rate is {rate:.8g} Hz"
             raise Unusable("time", f"{detail}; leave the option out, or correct the file")

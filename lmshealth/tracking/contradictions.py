@@ -133,11 +133,15 @@ def _without_odd_rates(
         own, ratio = ordered[k].modes, float(np.log(rates[k] / right))
         share = _share(own, [ordered[i].modes for i in near], ticks[near] - ticks[k], ratio)
         rest = f"the sample rate is {rates[k]:.8g} Hz, that of {usual.sum()} logs {right:.8g} Hz"
-        if share is not None and share > 2 / 3:
+        if share is not None and 2 / 3 < share < 4 / 3:
             rest += ", and the frequencies are off by this ratio: one of the two rates is wrong"
             rest += "; correct sample_rate_hz in manifest.csv"
             found.append(Refusal(ordered[k].log, "odd-rate", rest))
-        elif (share is None or share > 1 / 3) and abs(ratio) < constants.RATE_NEAR and is_usual:
+        elif (
+            (share is None or 1 / 3 < share <= 2 / 3)
+            and abs(ratio) < constants.RATE_NEAR
+            and is_usual
+        ):
             rest += ", too little for the frequencies to decide which is right; check both"
             found.append(Refusal(ordered[k].log, "rate", rest, channel="sample_rate_hz"))
     left_out = {one.log for one in found if one.reason in LEFT_OUT}

@@ -318,3 +318,40 @@ def test_a_log_is_cut_at_dropped_and_repeated_samples(make):
 def test_limits_are_in_order():
     """What is flagged is more than what two clocks may differ by, and less than what is refused."""
     assert constants.AGREEMENT < constants.RATE_FLAGGED < constants.RATE_REFUSED
+
+
+def test_samples_dropped_at_the_end_of_a_block_are_found():
+    """The increment over them belongs to the block that ends there, also to the last one."""
+    n, last = 32 * 400 + 5, 32 * 400
+    k = np.concatenate([np.arange(last), np.arange(last + 1, n + 1)])[:n]
+    phase = 2 * np.pi * 0.01 / RATE
+    position = 0.3 * np.sin(phase * k + 0.2)
+    velocity = 0.3 * phase * RATE * np.cos(phase * k + 0.2)
+    assert last in found(position, velocity).dropped
+
+
+def test_a_missing_velocity_leaves_the_comparison():
+    """One sample without a set velocity does not end the comparison of a rate that is off."""
+    position, velocity = strokes()
+    velocity[1000] = np.nan
+    with pytest.raises(Unusable, match="sample rate is"):
+        found(position, velocity, rate=1.02 * RATE)
+
+
+@pytest.mark.parametrize("speed", [0.02, 0.05, 0.1])
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_float32_positions_in_micrometres_are_not_cut(speed, kind):
+    """Positions in mm of 1 um, stored as float32, have ramps of whole steps."""
+    rate, size = 10_000, 100_000
+    t = np.arange(size) / rate
+    part, period = t % 1.2, 2.4
+    velocity = np.clip(np.minimum(part, 1.1 - part), 0, speed) * np.where(t % period < 1.2, 1, -1)
+    position = np.round(1e3 * np.cumsum(velocity) / rate, 3).astype(kind).astype(float) * 1e-3
+    assert found(position, rate=rate).dropped.size == 0
+    assert found(position, velocity, rate=rate).notes == ()
+
+
+def test_a_path_velocity_is_no_wrong_rate():
+    """The speed along a circle is not that of one axis."""
+    t = np.arange(40_000) / RATE
+    assert found(0.05 * np.sin(np.pi * t), np.full(t.size, 0.05 * np.pi)).notes == ()

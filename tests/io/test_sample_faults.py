@@ -151,8 +151,51 @@ def test_levels():
         assert coarse_levels(np.asarray(good, dtype=float)) == ""
 
 
+@pytest.mark.parametrize("seconds", [0.2, 0.4, 1.0])
+def test_drifts_and_tones_are_no_faults(seconds):
+    """A slow decay has no edge and no missing levels, nor has a tone of whole periods."""
+    t = np.arange(N) / N
+    for part in (0.001, 0.03):
+        x = np.exp(-t / seconds) + part * vibration()
+        check_sign(x, roughness(x))
+        assert coarse_levels(x) == ""
+    for period in (5, 6, 8):
+        tone = np.sin(2 * np.pi * np.arange(N) / period + 0.3) + 1e-3 * vibration()
+        check_sign(tone, roughness(tone))
+        assert coarse_levels(tone) == ""
+
+
+@pytest.mark.parametrize("bits", [16, 24])
+def test_overflows_of_blows_end_with_an_answer(bits):
+    """Jumps of blows in a counter that overflows are undone or refused."""
+    t = np.arange(25000) % 5000 / 5000
+    wave = np.exp(-0.02 * 2 * np.pi * 90 * t) * np.cos(2 * np.pi * 90 * t)
+    noise = 3 * np.random.default_rng(1).standard_normal(t.size)
+    values = overflow(np.round(1.2 * 2 ** (bits - 1) * wave + noise), bits)
+    try:
+        read, _ = unwrapped(values, np.empty((0, 2), dtype=np.int64), roughness(values))
+    except Unusable as error:
+        assert error.reason == "wrapped"
+    else:
+        assert np.isfinite(read).all()
+
+
 def test_the_step_of_levels():
     """The step is found from rounded values, and there is none without levels."""
     counts = np.round(60 * vibration())
     assert level_step(np.round(0.0981 * counts, 5)) == pytest.approx(0.0981, rel=1e-5)
     assert level_step(vibration()) is None
+
+
+@pytest.mark.parametrize("n_missing", [1, 5, 10])
+@pytest.mark.parametrize("seed", range(3))
+def test_overflows_beside_missing_samples_are_undone(n_missing, seed):
+    """A gap near the largest sample neither hides a turn nor makes one."""
+    counts = np.rint(160 * vibration(seed, noise=0.01) / np.abs(vibration(seed, noise=0.01)).max())
+    at = int(np.abs(counts).argmax()) + 1
+    values = overflow(counts, 8)
+    values[at : at + n_missing] = np.nan
+    gone = np.array([[at, at + n_missing]])
+    read, note = unwrapped(values, gone, roughness(values))
+    assert "overflow" in note
+    np.testing.assert_array_equal(np.diff(np.delete(read - counts, slice(at, at + n_missing))), 0)

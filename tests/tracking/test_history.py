@@ -458,6 +458,13 @@ def test_a_log_whose_frequencies_follow_another_rate_is_left_out(stage, at, odd)
     assert (notice.code, notice.severity, notice.where) == ("odd-rate", "caution", str(at))
 
 
+def test_damage_beside_another_rate_is_kept(stage):
+    """Modes that move ten times as far as the rate explains do not follow it."""
+    rates = [20e3] * 9 + [20.2e3] * 3
+    history, refused = build_history(rated(rates, follow=-10.0), stage)
+    assert len(history.logs) == 12 and refused == []
+
+
 def test_headers_that_alternate_keep_the_first_rate(stage):
     """Where both rates are as frequent, the logs that differ from the first are left out."""
     history, refused = build_history(rated([20e3, 19.6e3] * 6), stage)
