@@ -167,7 +167,7 @@ def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
         return 0.0, 0.0
     # Second differences are those of rounding, also where the motion accelerates.
     uneven = float(np.quantile(np.abs(np.diff(apart)), 0.9)) if apart.size > 1 else 0.0
-    steps = [resolution(stretch, np.finfo(np.float32).eps), uneven]
+    steps = [resolution(stretch, float(np.finfo(np.float32).eps)), uneven]
     # A position that is held, or coarser than its increment, has steps of its own.
     held = apart[apart > 0]
     if held.size < 0.9 * apart.size:
