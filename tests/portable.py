@@ -36,14 +36,15 @@ def _without(module: ModuleType, names: Iterable[str]) -> ModuleType:
 
 def hide(root: Path, hidden: set[str]) -> None:
     """Hide modules, and names of ``os`` and ``signal``, from modules below a folder only."""
-    folder = f"{root.resolve()}{os.sep}"
+    folder, venv = (f"{one.resolve()}{os.sep}" for one in (root, root / ".venv"))
     reduced = {"os": _without(os, SYSTEM), "signal": _without(signal, SIGNALS)}
     original = builtins.__import__
 
     def imported(
         name: str, space: Mapping[str, Any] | None = None, *rest: Any, **named: Any
     ) -> ModuleType:
-        if str((space or {}).get("__file__", "")).startswith(folder):
+        file = str((space or {}).get("__file__", ""))
+        if file.startswith(folder) and not file.startswith(venv):
             if name.partition(".")[0] in hidden:
                 raise ModuleNotFoundError(f"No module named {name!r}", name=name)
             if name in reduced:

@@ -93,7 +93,7 @@ def find_logs(
     detail = "holds samples, and its suffix is not read; rename it to .csv, or move it out"
     refused = [Refusal(name_of(path, root), "skipped", detail) for path in skipped]
     detail = "manifest.csv lists it, and a hidden file or a table is no log; rename it"
-    others = (_name_in(path, root) for path in sorted(listed) if path.is_file())
+    others = (_name_in(path, root) for path in sorted(listed) if os.path.isfile(path))
     refused += [Refusal(name, "bad-row", detail) for name in others if name not in named]
     return FileList(found.logs, (*found.refused, *refused))
 
