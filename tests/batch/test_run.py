@@ -105,7 +105,7 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
     (logs / "later").mkdir()
     shutil.copy(logs / "log-00.h5", logs / "later" / "copy.h5")
     (logs / "broken.h5").write_bytes(b"no signal at all" * 100)
-    write_log(logs / "foreign.h5", 1.0, 99, stage="other-Z")
+    write_log(logs / "foreign.h5", 1.0, 40, stage="other-Z")
     out = folder / "out"
     result = run(logs, [stage], out, Settings(epochs=2))
     return Done(logs, out, stage, result, tables(out), pages(out))

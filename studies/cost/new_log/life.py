@@ -17,7 +17,6 @@ import numpy as np
 
 from lmshealth._private.serialize import fingerprint
 from lmshealth.batch import run as running
-from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
@@ -61,7 +60,7 @@ def assess_and_report(
     with processes(workers) as pool:
         resources = Resources(store, pool, progress)
         assert not assess_all(machines, resources)
-        result, *_ = running._report(machines, (), resources, out, Alerts())
+        result, *_ = running._report(machines, (), resources, out)
     assert not result.failed
 
 
