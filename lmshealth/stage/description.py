@@ -177,7 +177,7 @@ class Covariate(_Part, frozen=True):
 class Baseline(_Part, frozen=True):
     """Least number of logs since the baseline for a verdict, and its size in `stage` and `plan`."""
 
-    logs: Annotated[int, within(1, constants.MOST_LOGS)] = 5
+    logs: Annotated[int, within(1, 100 * constants.MOST_LOGS)] = 5
 
 
 class Decision(_Part, frozen=True):
