@@ -347,7 +347,8 @@ def _accept(
     found = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
     snr = np.array([one.snr for one in found])
     best = [channels[c].name for c in snr.argmax(axis=1)]
-    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), source, best)
+    own = result.mean, result.cov, snr.max(axis=1)
+    modes = estimates_only(*own, source, best, result.credibility)
     credible = [k for k, one in enumerate(found) if one.rejection is None]
     return _BandModes(source, (*poles, *found), modes.select(credible))
 
