@@ -4,14 +4,14 @@ A likelihood states the covariance of ``[ln f, ln ζ]`` under assumptions. Where
 does not hold, a method replaces the covariance, and records here by how much that has multiplied
 the standard deviation of ln f (`widened`), and for which cause:
 
-=================  ===============================================================================
-``unsteady``       ambient: the intensity of the excitation varies over the record
-``coloured``       ambient: average over spectra of the excitation that are not flat
-``cluster``        ambient: one mode represents two that the data do not separate
-``noise-estimate`` frf: the variance of the noise is estimated from few values
-``dependent-lines`` frf: errors of neighbouring lines are correlated, or distortion has few lines
-``ambient-level``  free decays: average over the level of the ambient response
-=================  ===============================================================================
+===================  =============================================================================
+``unsteady``         ambient: the intensity of the excitation varies over the record
+``coloured``         ambient: average over spectra of the excitation that are not flat
+``cluster``          ambient: one mode represents two that the data do not separate
+``noise-estimate``   frf: the variance of the noise is estimated from few values
+``dependent-lines``  frf: errors of neighbouring lines are correlated, distortion bends a whole peak
+``ambient-level``    free decays: average over the level of the ambient response
+===================  =============================================================================
 
 Factors of ln ζ are similar, not equal: averages change both by what each of them is uncertain.
 """
@@ -96,9 +96,9 @@ def inverse_bias(freedom: float) -> float:
 
 
 def small_sample(freedom: float, *, unbiased: bool = False) -> float:
-    """Return the variance of an error over a variance estimated from few values (Student's t).
+    """Return the variance of an estimate over the one stated by weights from few values.
 
-    ``freedom`` is the number of complex degrees of freedom of the estimate; an ``unbiased`` one has
-    been multiplied by `inverse_bias`, which is part of the factor.
+    Weights are inverse variances of ``freedom`` complex degrees of freedom each; where they are
+    ``unbiased`` these variances have been multiplied by `inverse_bias`, a part of the factor.
     """
     return (freedom - unbiased) / (freedom - 2)
