@@ -1,19 +1,10 @@
 """Factors on the standard deviations of modes, by cause.
 
-A likelihood states the covariance of ``[ln f, ln ζ]`` under assumptions. Where data show that one
-does not hold, a method replaces the covariance, and records here by how much that has multiplied
-the standard deviation of ln f (`widened`), and for which cause:
-
-===================  =============================================================================
-``unsteady``         ambient: the intensity of the excitation varies over the record
-``coloured``         ambient: average over spectra of the excitation that are not flat
-``cluster``          ambient: one mode represents two that the data do not separate
-``noise-estimate``   frf: the variance of the noise is estimated from few values
-``dependent-lines``  frf: errors of neighbouring lines are correlated, distortion bends a whole peak
-``ambient-level``    free decays: average over the level of the ambient response
-===================  =============================================================================
-
-Factors of ln ζ are similar, not equal: averages change both by what each of them is uncertain.
+A likelihood states the covariance of ``[ln f, ln ζ]`` under assumptions. Where the data of the log
+show that one does not hold, a method replaces the covariance, and records by how much that has
+multiplied the standard deviation of ln f (`widened`), and for which cause. README.md lists the
+causes: ``unsteady``, ``coloured`` and ``cluster`` of ambient vibration, ``noise-estimate`` and
+``dependent-lines`` of frequency responses, ``ambient-level`` of free decays.
 """
 
 from __future__ import annotations

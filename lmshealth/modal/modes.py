@@ -62,14 +62,13 @@ class Modes(Result):
     # Root mean square acceleration of the mode in m/s², over time, as a norm over the channels;
     # NaN (the default) where it was not measured.
     excitation: FloatArray = None  # type: ignore[assignment]
-    # Factors that ``cov`` has, per mode; by default unknown.
-    credibility: tuple[Credibility, ...] = None  # type: ignore[assignment]
+    credibility: tuple[Credibility, ...] = ()  # factors of ``cov`` per mode, by default unknown
 
     def __post_init__(self) -> None:
         n = len(self.names)
         if self.excitation is None:
             object.__setattr__(self, "excitation", np.full(n, np.nan))
-        if self.credibility is None:
+        if not self.credibility:
             object.__setattr__(self, "credibility", (Credibility(),) * n)
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
@@ -166,7 +165,7 @@ def estimates_only(
     snr: FloatArray,
     source: str,
     channels: Sequence[str],
-    credibility: tuple[Credibility, ...] | None = None,
+    credibility: tuple[Credibility, ...] = (),
 ) -> Modes:
     """Return unnamed modes of one source without shapes, dispersion, lines or refusals.
 
@@ -188,7 +187,7 @@ def estimates_only(
         shapes=np.empty((n, 0)),
         lines=(),
         refused=(),
-        credibility=credibility or (Credibility(),) * n,
+        credibility=credibility,
     )
 
 

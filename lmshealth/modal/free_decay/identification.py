@@ -28,7 +28,6 @@ from lmshealth.modal.naming import assign, is_near
 from lmshealth.modal.targets import (
     Target,
     check_band,
-    choose_channels,
     choose_targets,
     limit_channels,
 )
@@ -112,7 +111,7 @@ def identify_decays(
     """
     check_band(log, band)
     log = limit_channels(log, channels)
-    used = choose_channels(log)
+    used = log.channels
     segments = select_segments(log, "settling") if segments is None else segments
     longest = max((s.stop - s.start for s in segments), default=0)
     if longest < 8:
