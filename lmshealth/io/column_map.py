@@ -1,6 +1,7 @@
-"""Column names, their units, and column maps that translate the names of an export.
+"""What is stated about exports: column names and units, column maps, and layouts of text.
 
 A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
+A column map translates the names of one export, a layout states how a program writes its text.
 """
 
 import re
@@ -170,8 +171,127 @@ class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
     variable: str | None = None
 
 
+# A text that is taken as it is, or a regular expression, of which the last group is the value.
+Pattern = Annotated[str, Meta(min_length=1, max_length=500)]
+# The first of several that is found counts.
+Choice = Pattern | Annotated[list[Pattern], Meta(min_length=1)]
+# Beginnings of tables that belong to no vendor: no layout may recognise them.
+_PLAIN_TABLES = (
+    "",
+    "0,1\n0.001,2.5\n0.002,-1\n",
+    "time;a;b\n0,1;2\n0,2;3\n",
+    "Time\tPosition\ns\tmm\n0.001\t0.1\n",
+    "# stage: A-1\ntime_s,delta_e_um,acc_x_g\n0.001,0.1,0.2\n",
+)
+
+
+class TimeColumns(Struct, frozen=True, forbid_unknown_fields=True):
+    """Columns of times in a layout; of several each belongs to the columns up to the next."""
+
+    name: Annotated[str, Meta(examples=["Time"])]  # of the column
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+    absent: Pattern | None = None  # found in a header whose column of times is empty
+
+
+class StartMoment(Struct, frozen=True, forbid_unknown_fields=True):
+    """Moment of the first sample in a layout.
+
+    What the patterns find is joined by blanks and read by ``format``: ``filetime`` (ticks of 100 ns
+    since 1601), ``unix`` (s since 1970), directives of `strptime`, or ISO 8601.
+    """
+
+    find: Annotated[list[Pattern], Meta(min_length=1)]
+    format: str = "iso"
+
+
+class Segments(Struct, frozen=True, forbid_unknown_fields=True):
+    """Further headers between the rows of a layout, which are left out.
+
+    Their lines that begin with a key of ``same`` must be those of the first header. Without one
+    column of times, which places the rows, there may be no more of them than the largest number in
+    the line that begins with the key ``rows``; ``needed`` names the setting of the program that
+    writes one.
+    """
+
+    same: Annotated[list[str], Meta(min_length=1, examples=[["Channels"]])]
+    rows: Annotated[str, Meta(min_length=1, examples=["Samples"])]
+    needed: Annotated[str, Meta(min_length=1, examples=["X values"])]
+
+
+class Layout(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a program writes its text: a header of its own, and rows.
+
+    Every pattern of ``recognise`` is found in the first lines of such a file, and not all in
+    others. The rows begin behind the line in which the first match of ``rows_after`` ends; the
+    lines before them are the header, in which the last match of each pattern counts. ``names``,
+    ``units``, ``interval`` (between samples) and ``offset`` (in s, of the first sample) find a row
+    with a field for each column, or one field for all; with a group ``column``, all matches count,
+    each for the column of that number. The README of this folder has an example.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=60, examples=["ACME recorder"])]
+    recognise: Annotated[list[Pattern], Meta(min_length=1, examples=[["\\AACME recorder"]])]
+    rows_after: Annotated[Pattern, Meta(examples=["^Data:"])]
+    delimiter: Annotated[Choice, Meta(examples=[","])]  # a number is that of its character
+    decimal: Choice | None = None  # by default found in the first rows
+    names: Pattern | None = None  # by default columns are called "0", "1", ...
+    units: Pattern | None = None  # by default in brackets behind the names
+    interval: Pattern | None = None
+    interval_unit: Literal["s", "ms", "us", "ns"] = "s"
+    offset: Pattern | None = None
+    time: TimeColumns | None = None
+    start: StartMoment | None = None
+    metadata: dict[str, Pattern] = {}  # keys of the contract
+    segments: Segments | None = None
+
+    def __post_init__(self) -> None:
+        """Check what the types do not state; the error lists every fault."""
+        marks = {"delimiter": self.delimiter, "decimal": self.decimal}
+        given: dict[str, Choice | None] = {"recognise": self.recognise, **marks}
+        given |= {key: getattr(self, key) for key in ("rows_after", "names", "units", "interval")}
+        given |= {"offset": self.offset}
+        given |= {"time.absent": self.time.absent} if self.time else {}
+        given |= {"start.find": self.start.find} if self.start else {}
+        given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
+        faults = [f"{key}: {fault}" for key, choice in given.items()
+                  for pattern in choices(choice) if (fault := _fault(pattern))]  # fmt: skip
+        if not faults:
+            faults = [f"{key}: got {mark!r}, needed one character, or a group () around it"
+                      for key, choice in marks.items() for mark in choices(choice)
+                      if len(mark) > 1 and not re.compile(mark).groups]  # fmt: skip
+            faults += [f"recognise: also fits other tables, such as {plain[:40]!r}; needed lines "
+                       "that only files of this layout have"
+                       for plain in _PLAIN_TABLES if self.recognises(plain)][:1]  # fmt: skip
+        if unknown := sorted(set(self.metadata) - set(KEYS)):
+            faults.append(f"metadata: got {listed(unknown)}; known keys are {listed(KEYS)}")
+        if faults:
+            raise ValueError("; ".join(faults))
+
+    def recognises(self, text: str) -> bool:
+        """Return whether a text begins as files of this layout do."""
+        return all(re.search(pattern, text, re.MULTILINE) for pattern in self.recognise)
+
+
+def choices(given: Choice | None) -> list[str]:
+    """List the patterns of a key, of which the first that is found counts."""
+    return [given] if isinstance(given, str) else given or []
+
+
+def _fault(pattern: str) -> str:
+    """Return what is wrong with a regular expression; empty where nothing is."""
+    try:
+        re.compile(pattern, re.MULTILINE)
+    except re.error as error:
+        return f"{pattern!r} is no regular expression: {error}"
+    return ""
+
+
 class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """Translation of an export into the log contract; by default its columns are the contract's."""
+    """Translation of an export into the log contract; by default its columns are the contract's.
+
+    ``layouts`` are the user's, tried with the shipped ones; one of the same name replaces a shipped
+    one. They travel with the map because a log that is read by another layout is another log.
+    """
 
     columns: dict[str, str] = {}  # contract name to the name in the file
     # Contract name without unit suffix to its unit, or to the SI value of one count.
@@ -180,6 +300,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     sample_rate_hz: Annotated[float, within(*constants.RANGES["sample_rate_hz"])] | None = None
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
+    layouts: list[Layout] = []
 
     @cached_property
     def _targets(self) -> dict[str, str]:
@@ -230,6 +351,25 @@ def load_columns(path: str | Path) -> ColumnMap:
     except Unusable as error:
         raise BadTable(f"column map {path}: {error.detail}") from error
     return columns
+
+
+def load_layouts(folder: str | Path) -> list[Layout]:
+    """Read the layouts of text from a folder: one TOML file each.
+
+    `BadTable` if there is none, one cannot be read or breaks the schema, or two have one name.
+    """
+    layouts: dict[str, Layout] = {}
+    for path in sorted(Path(folder).glob("*.toml")):
+        try:
+            layout = decode(read_table(path), Layout)
+            if layout.name in layouts:
+                raise ValueError(f"name: another file of the folder has {layout.name!r}, too")
+        except (OSError, ValueError) as error:
+            raise BadTable(f"layout {path}: {error}") from error
+        layouts[layout.name] = layout
+    if not layouts:
+        raise BadTable(f"{folder}: holds no layout; needed files *.toml, one for each layout")
+    return list(layouts.values())
 
 
 def _check(columns: ColumnMap) -> None:

@@ -1,20 +1,36 @@
 """Dialect of delimited text: encoding, delimiter, decimal mark, names and units of the columns.
 
-All of it is found from the first lines of the file, unless the column map states it. A layout of a
-vendor (`text_layouts`) states it in a header of its own.
+All of it is found from the first lines of the file, unless the column map states it, or a layout
+(`layouts/*.toml`, and those of the user) recognises a header of a program.
 """
 
 import codecs
 import csv
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache, partial
+from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from lmshealth.io.column_map import ColumnMap, CsvLayout, unit_key
-from lmshealth.io.formats.unit_channels import Described
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io import constants
+from lmshealth.io.column_map import (
+    SI_TIMES,
+    Choice,
+    ColumnMap,
+    CsvLayout,
+    Layout,
+    Segments,
+    StartMoment,
+    choices,
+    load_layouts,
+    unit_key,
+)
+from lmshealth.io.formats.unit_channels import Described, rate_of
+from lmshealth.io.metadata import moment_after
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Delimiters in the order in which equal candidates are preferred; a blank is any run of them.
 _DELIMITERS = ",;\t| :"
@@ -44,6 +60,9 @@ _MICRO = str.maketrans("µμ", "uu")
 _OTHER_UNITS = frozenset(
     "min h V mV Volt Volts N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
 )
+# Key of a moment without a time zone, which is no metadatum of a log.
+LOCAL_TIME = "local_time"
+_FILETIME_EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +80,7 @@ class Dialect:
     metadata: dict[str, str] = field(default_factory=dict)
     guessed: tuple[str, ...] = ()
     has_rows: bool = True
+    segments: Segments | None = None
 
 
 class _Rows(NamedTuple):
@@ -131,6 +151,38 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
     marks, has_rows = (found.delimiter, found.decimal), found.share > 0
     return Dialect(*marks, channels, found.first, metadata, guessed, has_rows)
+
+
+def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
+    """Read the dialect from the header of a text by its layout; None where none recognises it.
+
+    `Unusable`: ``format`` where several recognise it, ``corrupt`` for a header without what its
+    layout needs, ``metadata`` for a moment of another format.
+    """
+    text = "\n".join(line.rstrip("\r\n") for line in lines)
+    layouts = {one.name: one for one in (*_shipped(), *columns.layouts)}
+    fitting = [one for one in layouts.values() if one.recognises(text)]
+    if not fitting:
+        return None
+    layout = fitting[0]
+    if len(fitting) > 1:
+        step = "give recognise of one of them a further line"
+        raise Unusable("format", f"{listed(x.name for x in fitting)} are its layouts; {step}")
+    end = re.search(layout.rows_after, text, re.MULTILINE)
+    if end is None:
+        raise corrupt(f"is a {layout.name} without a line {layout.rows_after!r} before its rows")
+    start = text[: end.end()].removesuffix("\n").count("\n") + 1
+    header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
+    delimiter = _mark(layout.delimiter, header)
+    # The numbers of the first row may be whole.
+    decimal = "," if delimiter != "," and any("," in row for row in rows) else "."
+    decimal = _mark(layout.decimal, header) if layout.decimal else decimal
+    n_fields = len(fields_of((rows or [""])[0], delimiter))
+    channels = _channels(layout, header, delimiter, n_fields, columns)
+    found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}
+    metadata = {key: value.strip() for key, value in found.items() if value.strip()}
+    metadata |= _start(layout.start, header) if layout.start else {}
+    return Dialect(delimiter, decimal, channels, start, metadata, segments=layout.segments)
 
 
 def fields_of(line: str, delimiter: str) -> list[str]:
@@ -313,3 +365,101 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
         (where is None and layout.header is None, _UNNAMED),
     ]
     return tuple(text for differs, text in listed if differs)
+
+
+@cache
+def _shipped() -> tuple[Layout, ...]:
+    return tuple(load_layouts(Path(__file__).parent / "layouts"))
+
+
+def _value(pattern: str | None, header: str) -> str:
+    """Return what the last match of a pattern finds, or a text as it is; empty where nothing."""
+    if pattern is None or not re.compile(pattern).groups:
+        return pattern or ""
+    found = [*re.finditer(pattern, header, re.MULTILINE)][-1:]
+    return "".join(match[match.re.groups] or "" for match in found)
+
+
+def _mark(choice: Choice, header: str) -> str:
+    """Return the first mark that is found; digits are the number of its character."""
+    found = next(filter(None, (_value(one, header) for one in choices(choice))), "")
+    mark = chr(int(found)) if found.isdecimal() else found
+    if len(mark) != 1:
+        raise corrupt(f"its header states the delimiter or decimal mark {mark!r}")
+    return mark
+
+
+def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str]:
+    """Return what a pattern finds for each of ``n`` columns, or in a longer row for each field."""
+    if pattern and "column" in re.compile(pattern).groupindex:
+        found = {int(m["column"]): m[m.re.groups].strip()
+                 for m in re.finditer(pattern, header, re.MULTILINE)}  # fmt: skip
+        first = int(n in found)  # columns are counted from 1 where there is an n-th
+        return [found.get(k + first, "") for k in range(n)]
+    row = [one.strip() for one in fields_of(_value(pattern, header), delimiter)]
+    while row and not row[-1]:
+        row.pop()
+    return row * n if len(row) == 1 < n else [*row, *[""] * (n - len(row))]
+
+
+def _channels(
+    layout: Layout, header: str, delimiter: str, n_fields: int, columns: ColumnMap
+) -> tuple[Described, ...]:
+    """Describe the columns: times, and channels with unit, rate and start."""
+    rows = partial(_cells, header=header, delimiter=delimiter)
+    # A row of names may be longer than the rows; other names are as many as the fields.
+    names = rows(layout.names, n=0) or rows(layout.names, n=n_fields)
+    units, intervals, offsets = (
+        rows(pattern, n=len(names)) for pattern in (layout.units, layout.interval, layout.offset)
+    )
+    time, channels = layout.time, list[Described]()
+    if time and time.absent and re.search(time.absent, header, re.MULTILINE):
+        time = None
+    n_times = names.count(time.name) if time else 0
+    for k in reversed(range(len(names))):
+        if time and names[k] == time.name:
+            # One of several has the rate and the start of the channel behind it.
+            own = channels[-1] if n_times > 1 and channels else Described("", "")
+            channels.append(Described("time", time.unit, own.rate, start=own.start))
+            continue
+        interval = _number(intervals[k])
+        rate = rate_of(interval and interval * SI_TIMES[layout.interval_unit])
+        # One column of times places the samples of all channels.
+        start = 0.0 if n_times == 1 else _number(offsets[k]) or 0.0
+        one = _described(names[k] or str(k), "", columns)
+        if layout.units:  # "[g]", "g (Acceleration)"
+            unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]
+            one = Described(names[k] or str(k), unit.strip())
+        channels.append(replace(one, rate=rate, start=start))
+    return tuple(reversed(channels))
+
+
+def _start(start: StartMoment, header: str) -> dict[str, str]:
+    """Return the moment of the first sample as metadata; local time where there is no time zone."""
+    parts = [_value(pattern, header).strip() for pattern in start.find]
+    text = " ".join(parts)
+    if not all(parts):
+        return {}
+    try:
+        if start.format == "filetime":
+            ticks = int(text) // 10
+            moment = moment_after(_FILETIME_EPOCH, ticks, timedelta(microseconds=1))
+            return {"recorded_at": moment} if ticks else {}
+        if start.format == "unix":
+            return {"recorded_at": moment_after(constants.FIRST_MOMENT, float(text))}
+        if start.format != "iso":
+            found = datetime.strptime(text, start.format)
+        else:
+            found = datetime.fromisoformat(text.replace("/", "-").replace(",", "."))
+    except ValueError as error:
+        step = "correct the format of its layout"
+        raise Unusable("metadata", f"starts at {text!r}, no {start.format}; {step}") from error
+    return {"recorded_at" if found.tzinfo else LOCAL_TIME: found.isoformat()}
+
+
+def _number(text: str) -> float | None:
+    """Read a number with a decimal point or comma; None for any other text."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None
