@@ -9,15 +9,16 @@ from datetime import date, datetime
 from functools import partial, reduce
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import click
 from loky import cpu_count
+from msgspec.structs import replace
 
 from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
-from lmshealth.io.column_map import load_columns
+from lmshealth.io.column_map import ColumnMap, Layout, load_columns, load_layouts
 from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, MAX_MEMORY
 from lmshealth.io.log import MOMENTS
 from lmshealth.signal.segments import PARTS
@@ -137,11 +138,46 @@ out_option = partial(click.option, "--out", required=True, type=OUT)
 store_option = partial(
     click.option, "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL"
 )
+
+
+class LayoutFolder(NamedTuple):
+    """Value of ``--layouts``, empty where it is not set."""
+
+    folder: str = ""
+    layouts: tuple[Layout, ...] = ()
+
+
+def layouts() -> LayoutFolder:
+    """Return the value of ``--layouts``."""
+    found: LayoutFolder = click.get_current_context().meta.get(_LAYOUTS, LayoutFolder())
+    return found
+
+
+def _columns(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
+    """Load a column map, with the layouts of ``--layouts``; None without both."""
+    own = layouts().layouts
+    if path is None and not own:
+        return None
+    columns = ColumnMap() if path is None else load_columns(path)
+    return replace(columns, layouts=(*columns.layouts, *own))
+
+
+def _layouts(ctx: click.Context, option: click.Parameter, folder: Path | None) -> None:
+    """Load layouts before the first log is read."""
+    if folder is not None:
+        ctx.meta[_LAYOUTS] = LayoutFolder(str(folder), load_layouts(folder))
+
+
+_LAYOUTS = f"{__name__}.layouts"
+LAYOUTS = eager_option(
+    "--layouts",
+    type=FOLDER,
+    metavar="FOLDER",
+    callback=_layouts,
+    help="Folder of layouts (*.toml), by which text of further programs is read.",
+)
 _COLUMNS = click.option(
-    "--columns",
-    type=click.Path(),
-    callback=lambda ctx, option, path: path if path is None else load_columns(path),
-    help="Column map of the export.",
+    "--columns", type=click.Path(), callback=_columns, help="Column map of the export."
 )
 MOST_MEMORY = click.option(
     "--max-memory",
@@ -213,8 +249,8 @@ PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stag
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options by which logs are read: --columns, --max-memory (bytes), --allow-future."""
-    return _COLUMNS(MOST_MEMORY(ALLOW_FUTURE(command)))
+    """Add the options by which logs are read: a map, layouts, memory in bytes, later dates."""
+    return _COLUMNS(LAYOUTS(MOST_MEMORY(ALLOW_FUTURE(command))))
 
 
 def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:

@@ -173,7 +173,8 @@ class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
 # A text that is taken as it is, or a regular expression, of which the last group is the value.
 Pattern = Annotated[str, Meta(min_length=1, max_length=500)]
-# The first of several that is found counts.
+# Where it names a row, this is the delimiter. The first of several that is found counts.
+DELIMITER = "{d}"
 Choice = Pattern | Annotated[list[Pattern], Meta(min_length=1)]
 # Beginnings of tables that belong to no vendor: no layout may recognise them.
 _PLAIN_TABLES = (
@@ -300,7 +301,7 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     sample_rate_hz: Annotated[float, within(*constants.RANGES["sample_rate_hz"])] | None = None
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
-    layouts: list[Layout] = []
+    layouts: tuple[Layout, ...] = ()
 
     @cached_property
     def _targets(self) -> dict[str, str]:
@@ -353,7 +354,7 @@ def load_columns(path: str | Path) -> ColumnMap:
     return columns
 
 
-def load_layouts(folder: str | Path) -> list[Layout]:
+def load_layouts(folder: str | Path) -> tuple[Layout, ...]:
     """Read the layouts of text from a folder: one TOML file each.
 
     `BadTable` if there is none, one cannot be read or breaks the schema, or two have one name.
@@ -369,7 +370,7 @@ def load_layouts(folder: str | Path) -> list[Layout]:
         layouts[layout.name] = layout
     if not layouts:
         raise BadTable(f"{folder}: holds no layout; needed files *.toml, one for each layout")
-    return list(layouts.values())
+    return tuple(layouts.values())
 
 
 def _check(columns: ColumnMap) -> None:

@@ -17,6 +17,7 @@ from typing import NamedTuple
 
 from lmshealth.io import constants
 from lmshealth.io.column_map import (
+    DELIMITER,
     SI_TIMES,
     Choice,
     ColumnMap,
@@ -171,7 +172,7 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
     end = re.search(layout.rows_after, text, re.MULTILINE)
     if end is None:
         raise corrupt(f"is a {layout.name} without a line {layout.rows_after!r} before its rows")
-    start = text[: end.end()].removesuffix("\n").count("\n") + 1
+    start = text.count("\n", 0, end.end()) + (not end[0].endswith("\n"))
     header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
     delimiter = _mark(layout.delimiter, header)
     # The numbers of the first row may be whole.
@@ -369,7 +370,7 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
 
 @cache
 def _shipped() -> tuple[Layout, ...]:
-    return tuple(load_layouts(Path(__file__).parent / "layouts"))
+    return load_layouts(Path(__file__).parent / "layouts")
 
 
 def _value(pattern: str | None, header: str) -> str:
@@ -397,21 +398,24 @@ def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str
         first = int(n in found)  # columns are counted from 1 where there is an n-th
         return [found.get(k + first, "") for k in range(n)]
     row = [one.strip() for one in fields_of(_value(pattern, header), delimiter)]
+    if len(row) == 1 < n:
+        return row * n
     while row and not row[-1]:
         row.pop()
-    return row * n if len(row) == 1 < n else [*row, *[""] * (n - len(row))]
+    return [*row, *[""] * (n - len(row))]
 
 
 def _channels(
     layout: Layout, header: str, delimiter: str, n_fields: int, columns: ColumnMap
 ) -> tuple[Described, ...]:
     """Describe the columns: times, and channels with unit, rate and start."""
+    mark = re.escape(delimiter)
+    patterns = layout.names, layout.units, layout.interval, layout.offset
+    named, *others = (pattern and pattern.replace(DELIMITER, mark) for pattern in patterns)
     rows = partial(_cells, header=header, delimiter=delimiter)
     # A row of names may be longer than the rows; other names are as many as the fields.
-    names = rows(layout.names, n=0) or rows(layout.names, n=n_fields)
-    units, intervals, offsets = (
-        rows(pattern, n=len(names)) for pattern in (layout.units, layout.interval, layout.offset)
-    )
+    names = rows(named, n=0) or rows(named, n=n_fields)
+    units, intervals, offsets = (rows(pattern, n=len(names)) for pattern in others)
     time, channels = layout.time, list[Described]()
     if time and time.absent and re.search(time.absent, header, re.MULTILINE):
         time = None

@@ -82,7 +82,7 @@ def read_responses(
                 functions = (load_functions(file, max_memory) if form == UFF.name
                              else response_functions(file))  # fmt: skip
         else:
-            own = _ResponseColumns(columns=given.columns, csv=given.csv)
+            own = _ResponseColumns(columns=given.columns, csv=given.csv, layouts=given.layouts)
             content = load(path, own, max_memory)
             functions, stated = _tabulated(content, own), content.metadata
         metadata, _ = parse_metadata(stated | given.constants() | dict(overrides or {}), latest)
