@@ -22,8 +22,7 @@ from lmshealth.io.channel_checks import (
 )
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.consistency import Findings, Motion, compare
-from lmshealth.io.formats.content import Content
-from lmshealth.io.formats.foreign import frequency_column, over_frequency
+from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata

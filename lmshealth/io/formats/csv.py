@@ -21,18 +21,15 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, Segments, role_of
-from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
+from lmshealth.io.formats.channels import SinceFirst, choose, parse_moments
+from lmshealth.io.formats.content import GZIP, Content, Format, check_size, describe, not_numeric
 from lmshealth.io.formats.dialect import (
     Dialect,
-    encoding_of,
     fields_of,
     find_dialect,
     is_number_or_moment,
     stated_dialect,
 )
-from lmshealth.io.formats.foreign import describe
-from lmshealth.io.formats.moments import SinceFirst, parse_moments
-from lmshealth.io.formats.unit_channels import choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
@@ -52,6 +49,28 @@ _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # Most bytes of text behind the rows: rates, counts and ends that exporters write there.
 _TRAILER = 1 << 12
 _WORD = re.compile(r"[^\W\d_]{3}")
+
+
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
+    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
+    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
+        return marked
+    # Without a mark: Latin letters in two bytes each, of which one is zero.
+    for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
+            return name
+    try:
+        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+        return "utf-8"
+    except UnicodeDecodeError:
+        from charset_normalizer import from_bytes
+
+        found = from_bytes(head).best()
+    # µ, ° and ² are these bytes in the Windows code page of Western Europe.
+    western = found is None or any(mark in head for mark in b"\xb5\xb0\xb2")
+    return "cp1252" if western or found is None else found.encoding
 
 
 class Text:
@@ -174,9 +193,6 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
         encoding = "utf-8"
     text = Text(stream, stored)
     lines = _head(text, encoding)
-    if lines and lines[0].startswith("DIAEXTENDED"):
-        detail = "the header of a DIAdem file, whose numbers are in others"
-        raise Unusable("format", f"{detail}; export the data as TDMS or CSV")
     dialect = stated_dialect(lines, columns) or find_dialect(lines, columns)
     if dialect.segments:
         text = Text(_SegmentStream(stream, dialect, dialect.segments), stored)

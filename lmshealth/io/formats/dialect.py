@@ -4,7 +4,6 @@ All of it is found from the first lines of the file, unless the column map state
 (`layouts/*.toml`, and those of the user) recognises a header of a program.
 """
 
-import codecs
 import csv
 import re
 from collections.abc import Iterator, Sequence
@@ -29,7 +28,7 @@ from lmshealth.io.column_map import (
     load_layouts,
     unit_key,
 )
-from lmshealth.io.formats.unit_channels import Described, rate_of
+from lmshealth.io.formats.channels import Described, rate_of
 from lmshealth.io.metadata import moment_after
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
@@ -94,28 +93,6 @@ class _Rows(NamedTuple):
     n_fields: int
     delimiter: str
     decimal: str
-
-
-def encoding_of(head: bytes) -> str:
-    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
-    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
-    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
-    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
-        return marked
-    # Without a mark: Latin letters in two bytes each, of which one is zero.
-    for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
-            return name
-    try:
-        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
-        return "utf-8"
-    except UnicodeDecodeError:
-        from charset_normalizer import from_bytes
-
-        found = from_bytes(head).best()
-    # µ, ° and ² are these bytes in the Windows code page of Western Europe.
-    western = found is None or any(mark in head for mark in b"\xb5\xb0\xb2")
-    return "cp1252" if western or found is None else found.encoding
 
 
 def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
