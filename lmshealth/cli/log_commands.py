@@ -88,7 +88,7 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
     how = {name: given[name] for name in ("rate", "max_memory", "latest")}
-    layouts = options.layouts().layouts
+    layouts = options.layouts()
     text, guesses = propose(logs[0], **how, layouts=layouts)
     rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
     terminal.print_table(f"Columns of {logs[0]}", rows, 3)
@@ -139,8 +139,8 @@ def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[
     """Name the commands that read a log by its proposed map."""
     by = {one.kind: one.name for one in reversed(log.channels)}
     what = f"{shlex.quote(log.name)} --columns {shlex.quote(str(map_file))}"
-    if folder := options.layouts().folder:
-        what += f" --layouts {shlex.quote(folder)}"
+    if folder := options.layouts_folder():
+        what += f" --layouts {shlex.quote(str(folder))}"
     steps = [f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")]
     if "current" in by:
         output = by.get("acceleration", by.get("displacement"))

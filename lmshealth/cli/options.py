@@ -9,7 +9,7 @@ from datetime import date, datetime
 from functools import partial, reduce
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import click
 from loky import cpu_count
@@ -140,32 +140,25 @@ store_option = partial(
 )
 
 
-class LayoutFolder(NamedTuple):
-    """Value of ``--layouts``, empty where it is not set."""
+def layouts() -> tuple[Layout, ...]:
+    """Load the layouts of ``--layouts``."""
+    folder = layouts_folder()
+    return load_layouts(folder) if folder else ()
 
-    folder: str = ""
-    layouts: tuple[Layout, ...] = ()
 
-
-def layouts() -> LayoutFolder:
-    """Return the value of ``--layouts``."""
-    found: LayoutFolder = click.get_current_context().meta.get(_LAYOUTS, LayoutFolder())
-    return found
+def layouts_folder() -> Path | None:
+    """Return the folder of ``--layouts``."""
+    folder: Path | None = click.get_current_context().meta.get(_LAYOUTS)
+    return folder
 
 
 def _columns(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
     """Load a column map, with the layouts of ``--layouts``; None without both."""
-    own = layouts().layouts
+    own = layouts()
     if path is None and not own:
         return None
     columns = ColumnMap() if path is None else load_columns(path)
     return replace(columns, layouts=(*columns.layouts, *own))
-
-
-def _layouts(ctx: click.Context, option: click.Parameter, folder: Path | None) -> None:
-    """Load layouts before the first log is read."""
-    if folder is not None:
-        ctx.meta[_LAYOUTS] = LayoutFolder(str(folder), load_layouts(folder))
 
 
 _LAYOUTS = f"{__name__}.layouts"
@@ -173,7 +166,7 @@ LAYOUTS = eager_option(
     "--layouts",
     type=FOLDER,
     metavar="FOLDER",
-    callback=_layouts,
+    callback=lambda ctx, option, folder: ctx.meta.update({_LAYOUTS: folder}),
     help="Folder of layouts (*.toml), by which text of further programs is read.",
 )
 _COLUMNS = click.option(

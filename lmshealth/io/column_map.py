@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from lmshealth._private.files import read_table
 from lmshealth._private.toml import decode, within
@@ -173,9 +174,8 @@ class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
 
 # A text that is taken as it is, or a regular expression, of which the last group is the value.
 Pattern = Annotated[str, Meta(min_length=1, max_length=500)]
-# Where it names a row, this is the delimiter. The first of several that is found counts.
+# Where it finds a row, DELIMITER stands for the delimiter.
 DELIMITER = "{d}"
-Choice = Pattern | Annotated[list[Pattern], Meta(min_length=1)]
 # Beginnings of tables that belong to no vendor: no layout may recognise them.
 _PLAIN_TABLES = (
     "",
@@ -233,8 +233,9 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
     name: Annotated[str, Meta(min_length=1, max_length=60, examples=["ACME recorder"])]
     recognise: Annotated[list[Pattern], Meta(min_length=1, examples=[["\\AACME recorder"]])]
     rows_after: Annotated[Pattern, Meta(examples=["^Data:"])]
-    delimiter: Annotated[Choice, Meta(examples=[","])]  # a number is that of its character
-    decimal: Choice | None = None  # by default found in the first rows
+    # The number of its character is also found; blanks where nothing is.
+    delimiter: Annotated[Pattern, Meta(examples=[","])]
+    decimal: Pattern | None = None  # found in the first rows where nothing is
     names: Pattern | None = None  # by default columns are called "0", "1", ...
     units: Pattern | None = None  # by default in brackets behind the names
     interval: Pattern | None = None
@@ -247,22 +248,20 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Check what the types do not state; the error lists every fault."""
-        marks = {"delimiter": self.delimiter, "decimal": self.decimal}
-        given: dict[str, Choice | None] = {"recognise": self.recognise, **marks}
-        given |= {key: getattr(self, key) for key in ("rows_after", "names", "units", "interval")}
-        given |= {"offset": self.offset}
-        given |= {"time.absent": self.time.absent} if self.time else {}
-        given |= {"start.find": self.start.find} if self.start else {}
+        given = asdict(self)
         given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
-        faults = [f"{key}: {fault}" for key, choice in given.items()
-                  for pattern in choices(choice) if (fault := _fault(pattern))]  # fmt: skip
+        given |= {"time": self.time and self.time.absent, "start": self.start and self.start.find}
+        given = {key: [value] if isinstance(value, str) else value for key, value in given.items()}
+        faults = [f"{key}: {fault}" for key, value in given.items() if isinstance(value, list)
+                  for pattern in value if (fault := _fault(pattern)) and key != "name"]  # fmt: skip
         if not faults:
+            marks = {"delimiter": self.delimiter, "decimal": self.decimal or "."}
             faults = [f"{key}: got {mark!r}, needed one character, or a group () around it"
-                      for key, choice in marks.items() for mark in choices(choice)
+                      for key, mark in marks.items()
                       if len(mark) > 1 and not re.compile(mark).groups]  # fmt: skip
-            faults += [f"recognise: also fits other tables, such as {plain[:40]!r}; needed lines "
-                       "that only files of this layout have"
-                       for plain in _PLAIN_TABLES if self.recognises(plain)][:1]  # fmt: skip
+            if plain := [text for text in _PLAIN_TABLES if self.recognises(text)]:
+                needed = "needed lines that only files of this layout have"
+                faults.append(f"recognise: also fits other tables, as {plain[0][:40]!r}; {needed}")
         if unknown := sorted(set(self.metadata) - set(KEYS)):
             faults.append(f"metadata: got {listed(unknown)}; known keys are {listed(KEYS)}")
         if faults:
@@ -271,11 +270,6 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
     def recognises(self, text: str) -> bool:
         """Return whether a text begins as files of this layout do."""
         return all(re.search(pattern, text, re.MULTILINE) for pattern in self.recognise)
-
-
-def choices(given: Choice | None) -> list[str]:
-    """List the patterns of a key, of which the first that is found counts."""
-    return [given] if isinstance(given, str) else given or []
 
 
 def _fault(pattern: str) -> str:

@@ -18,13 +18,11 @@ from lmshealth.io import constants
 from lmshealth.io.column_map import (
     DELIMITER,
     SI_TIMES,
-    Choice,
     ColumnMap,
     CsvLayout,
     Layout,
     Segments,
     StartMoment,
-    choices,
     load_layouts,
     unit_key,
 )
@@ -151,10 +149,13 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
         raise corrupt(f"is a {layout.name} without a line {layout.rows_after!r} before its rows")
     start = text.count("\n", 0, end.end()) + (not end[0].endswith("\n"))
     header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
-    delimiter = _mark(layout.delimiter, header)
+    delimiter = _value(layout.delimiter, header) or " "
+    delimiter = chr(int(delimiter)) if delimiter.isdecimal() else delimiter
     # The numbers of the first row may be whole.
-    decimal = "," if delimiter != "," and any("," in row for row in rows) else "."
-    decimal = _mark(layout.decimal, header) if layout.decimal else decimal
+    has_commas = delimiter != "," and any("," in row for row in rows)
+    decimal = _value(layout.decimal, header) or ("," if has_commas else ".")
+    if len(delimiter) != 1 or decimal not in (".", ","):
+        raise corrupt(f"its header has the delimiter {delimiter!r}, the decimal mark {decimal!r}")
     n_fields = len(fields_of((rows or [""])[0], delimiter))
     channels = _channels(layout, header, delimiter, n_fields, columns)
     found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}
@@ -356,15 +357,6 @@ def _value(pattern: str | None, header: str) -> str:
         return pattern or ""
     found = [*re.finditer(pattern, header, re.MULTILINE)][-1:]
     return "".join(match[match.re.groups] or "" for match in found)
-
-
-def _mark(choice: Choice, header: str) -> str:
-    """Return the first mark that is found; digits are the number of its character."""
-    found = next(filter(None, (_value(one, header) for one in choices(choice))), "")
-    mark = chr(int(found)) if found.isdecimal() else found
-    if len(mark) != 1:
-        raise corrupt(f"its header states the delimiter or decimal mark {mark!r}")
-    return mark
 
 
 def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str]:

@@ -178,7 +178,7 @@ def test_a_folder_has_layouts_of_different_names(folder: Path) -> None:
     ("old", "new", "reason", "needed"),
     [
         ("rows_after = '^", "rows_after = '^Never", "corrupt", "is a ACME recorder without a line"),
-        ('delimiter = ";"', "delimiter = '^Mark: (.)'", "corrupt", "delimiter or decimal mark ''"),
+        ('delimiter = ";"', "delimiter = '^Axis(:..)'", "corrupt", "the delimiter ': a'"),
         ('"%d.%m', '"%d/%m', "metadata", "starts at '05.01.2026 08:15:30', no %d/%m"),
     ],
 )
