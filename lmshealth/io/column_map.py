@@ -281,12 +281,8 @@ def _fault(pattern: str) -> str:
     return ""
 
 
-class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """Translation of an export into the log contract; by default its columns are the contract's.
-
-    ``layouts`` are the user's, tried with the shipped ones; one of the same name replaces a shipped
-    one. They travel with the map because a log that is read by another layout is another log.
-    """
+class _MapFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the file of a column map."""
 
     columns: dict[str, str] = {}  # contract name to the name in the file
     # Contract name without unit suffix to its unit, or to the SI value of one count.
@@ -295,6 +291,15 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     sample_rate_hz: Annotated[float, within(*constants.RANGES["sample_rate_hz"])] | None = None
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
+
+
+class ColumnMap(_MapFile, frozen=True, forbid_unknown_fields=True, dict=True):
+    """Translation of an export into the log contract; by default its columns are the contract's.
+
+    ``layouts`` are the user's; one with the name of a shipped layout replaces it. They travel with
+    the map because a log that is read by another layout is another log.
+    """
+
     layouts: tuple[Layout, ...] = ()
 
     @cached_property
@@ -339,7 +344,7 @@ def load_columns(path: str | Path) -> ColumnMap:
     that are not in the log contract.
     """
     try:
-        columns = decode(read_table(Path(path)), ColumnMap)
+        columns = ColumnMap(**asdict(decode(read_table(Path(path)), _MapFile)))
         _check(columns)
     except (OSError, ValueError) as error:
         raise BadTable(f"column map {path}: {error}") from error
