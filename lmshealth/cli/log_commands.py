@@ -203,7 +203,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     """Identify the modes of single logs: natural frequency and damping ratio.
 
     json also lists complex mode shapes, their phase collinearity (MPC), the modal assurance
-    criterion (MAC) of each pair of modes, and spectral lines.
+    criterion (MAC) of each pair of modes, spectral lines, and the factors that make up std_factor.
     """
     stage, band = given["stage"], given["band"]
     _check_outputs(given)
@@ -225,6 +225,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     rows = [row for one in found for row in tables.modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
+    content["std_factors"] = [row for r in found for row in tables.factor_rows(r.log, r.modes)]
     pairs = [(r.log, one) for r in found if stage for one in compare(r.modes, stage)]
     if off := [{"log": log, **one._asdict()} for log, one in pairs]:
         content["off_description"] = off
@@ -440,6 +441,7 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         "fit": [tables.fit_row(log.name, own) for log, own in found],
         "frf": [row for log, own in found for row in tables.frf_rows(log.name, own)],
         "lines": _line_rows((log.name, own.modes.lines) for log, own in found),
+        "std_factors": [row for e in estimates for row in tables.factor_rows(e.log, e.modes)],
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
     if stage and given["style"] != "json":

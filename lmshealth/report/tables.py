@@ -17,6 +17,7 @@ from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes
+from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
@@ -36,7 +37,8 @@ _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 COLUMNS = {
     "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
     "delta_e_below_40hz_um mode source channel frequency_hz frequency_std_hz damping_ratio "
-    "damping_ratio_std correlation_f_zeta snr dispersion excitation_mm_s2 flags sample_rate_hz",
+    "damping_ratio_std correlation_f_zeta snr dispersion std_factor excitation_mm_s2 flags "
+    "sample_rate_hz",
     "modes_cov": "log source_a mode_a source_b mode_b cov_ln_f",
     "track": "stage recorded_at travel_km mode frequency_hz frequency_std_hz damping_ratio "
     "damping_ratio_std drift drift_std nis nis_dof noise_scale widening",
@@ -80,6 +82,7 @@ LOG_COLUMNS = {
     "growth": "stage channel band n_logs n_velocities slope slope_std p_value grows",
     "lines": "frequency_hz amplitude unit kind channel",
     "mac": "log mode_a mode_b mac",
+    "std_factors": "log mode cause std_factor",
     "stage": "name model_std n_logs seconds_per_log",
     "stage_modes": "mode frequency_hz searched_low_hz searched_high_hz tracked informs map_hz "
     "map_at_limits_hz surrogate_error_ln_f logs_reach_ln_f",
@@ -200,6 +203,12 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
     return rows
+
+
+def factor_rows(log: str, modes: Modes) -> list[Row]:
+    """Return the factors on the standard deviation of each mode, one row per mode and cause."""
+    each = zip(modes.names, modes.credibility, strict=True)
+    return _rows("std_factors", [(log, name, *one) for name, own in each for one in own.factors])
 
 
 def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:
