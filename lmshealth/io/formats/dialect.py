@@ -156,8 +156,8 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
     decimal = _value(layout.decimal, header) or ("," if has_commas else ".")
     if len(delimiter) != 1 or decimal not in (".", ","):
         raise corrupt(f"its header has the delimiter {delimiter!r}, the decimal mark {decimal!r}")
-    n_fields = len(fields_of((rows or [""])[0], delimiter))
-    channels = _channels(layout, header, delimiter, n_fields, columns)
+    row = fields_of(rows[0], delimiter) if rows else []
+    channels = _channels(layout, header, delimiter, row, columns)
     found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}
     metadata = {key: value.strip() for key, value in found.items() if value.strip()}
     metadata |= _start(layout.start, header) if layout.start else {}
@@ -375,30 +375,29 @@ def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str
 
 
 def _channels(
-    layout: Layout, header: str, delimiter: str, n_fields: int, columns: ColumnMap
+    layout: Layout, header: str, delimiter: str, row: Sequence[str], columns: ColumnMap
 ) -> tuple[Described, ...]:
-    """Describe the columns: times, and channels with unit, rate and start."""
+    """Describe the columns of a first row: times, and channels with unit, rate and start."""
     mark = re.escape(delimiter)
     patterns = layout.names, layout.units, layout.interval, layout.offset
     named, *others = (pattern and pattern.replace(DELIMITER, mark) for pattern in patterns)
     rows = partial(_cells, header=header, delimiter=delimiter)
     # A row of names may be longer than the rows; other names are as many as the fields.
-    names = rows(named, n=0) or rows(named, n=n_fields)
+    names = rows(named, n=0) or rows(named, n=len(row))
     units, intervals, offsets = (rows(pattern, n=len(names)) for pattern in others)
     time, channels = layout.time, list[Described]()
-    if time and time.absent and re.search(time.absent, header, re.MULTILINE):
-        time = None
-    n_times = names.count(time.name) if time else 0
+    timed = [k for k, name in enumerate(names)
+             if time and name == time.name and all(row[k : k + 1])]  # fmt: skip
     for k in reversed(range(len(names))):
-        if time and names[k] == time.name:
+        if time and k in timed:
             # One of several has the rate and the start of the channel behind it.
-            own = channels[-1] if n_times > 1 and channels else Described("", "")
+            own = channels[-1] if len(timed) > 1 and channels else Described("", "")
             channels.append(Described("time", time.unit, own.rate, start=own.start))
             continue
         interval = _number(intervals[k])
         rate = rate_of(interval and interval * SI_TIMES[layout.interval_unit])
         # One column of times places the samples of all channels.
-        start = 0.0 if n_times == 1 else _number(offsets[k]) or 0.0
+        start = 0.0 if len(timed) == 1 else _number(offsets[k]) or 0.0
         one = _described(names[k] or str(k), "", columns)
         if layout.units:  # "[g]", "g (Acceleration)"
             unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]
