@@ -150,12 +150,13 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
     start = text.count("\n", 0, end.end()) + (not end[0].endswith("\n"))
     header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
     delimiter = _value(layout.delimiter, header) or " "
-    delimiter = chr(int(delimiter)) if delimiter.isdecimal() else delimiter
+    delimiter = chr(int(delimiter)) if re.fullmatch(r"\d{1,3}", delimiter) else delimiter
     # The numbers of the first row may be whole.
     has_commas = delimiter != "," and any("," in row for row in rows)
     decimal = _value(layout.decimal, header) or ("," if has_commas else ".")
     if len(delimiter) != 1 or decimal not in (".", ","):
-        raise corrupt(f"its header has the delimiter {delimiter!r}, the decimal mark {decimal!r}")
+        marks = f"the delimiter {delimiter[:9]!r}, the decimal mark {decimal[:9]!r}"
+        raise corrupt(f"its header has {marks}")
     row = fields_of(rows[0], delimiter) if rows else []
     channels = _channels(layout, header, delimiter, row, columns)
     found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import pickle
 import re
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +22,7 @@ from lmshealth.io.column_map import ColumnMap, Layout, load_columns, load_layout
 from lmshealth.io.formats import dialect
 from lmshealth.io.formats.dialect import Dialect, stated_dialect
 from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import Unusable
 from lmshealth.stage.proposal import moment_of
 
 SHIPPED = Path(dialect.__file__).parent / "layouts"
@@ -60,6 +63,20 @@ def test_a_sample_is_recognised_by_its_layout_alone(sample: Path) -> None:
     of_one = found.channels[1].rate
     assert of_one == (None if rate is None else pytest.approx(rate))
     assert found.start == start
+
+
+@pytest.mark.parametrize("sample", SAMPLES, ids=lambda path: path.name)
+@pytest.mark.parametrize("filling", [" ", "\t", ",", "a,", "# NAME0 = ", "Start,Increment", "1"])
+def test_a_hostile_header_is_read_in_linear_time(sample: Path, filling: str) -> None:
+    """The patterns of shipped layouts do not go back: long lines of any kind take no minutes."""
+    lines = head_of(sample)[:20]
+    long = filling * (20_000 // len(filling))
+    begin = time.process_time()
+    for k, line in enumerate(lines):
+        for part in (line.strip(), *re.findall(r"^.*?[=,\t]", line)):
+            with suppress(Unusable):
+                stated_dialect([*lines[:k], f"{part}{long}\n", *lines[k + 1 :]], ColumnMap())
+    assert time.process_time() - begin < 2
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +143,7 @@ def test_a_layout_of_the_user_does_not_read_files_of_others(folder: Path) -> Non
 def test_a_file_of_two_layouts_is_refused(folder: Path) -> None:
     """Both are named; one of the same name replaces a shipped one."""
     text = (folder / "layouts" / "acme.toml").read_text(encoding="utf-8")
-    (folder / "layouts" / "other.toml").write_text(text.replace("ACME rec", "The rec", 1))
+    (folder / "layouts" / "other.toml").write_text(text.replace("ACME rec", "The rec", 1), "utf-8")
     layouts = load_layouts(folder / "layouts")
     assert len(layouts) == 2
     with pytest.raises(BadLog, match="ACME recorder, The recorder are its layouts; give recognise"):
