@@ -157,8 +157,7 @@ def _columns(ctx: click.Context, option: click.Parameter, path: str | None) -> C
     own = layouts()
     if path is None and not own:
         return None
-    columns = ColumnMap() if path is None else load_columns(path)
-    return replace(columns, layouts=(*columns.layouts, *own))
+    return replace(ColumnMap() if path is None else load_columns(path), layouts=own)
 
 
 _LAYOUTS = f"{__name__}.layouts"

@@ -62,7 +62,8 @@ def read_log(
     path : str or Path
         The file; its suffix names the format and its content must agree.
     columns : ColumnMap, optional
-        How an export is read; by default the columns are those of the log contract.
+        How an export is read, and layouts of the user; by default the columns are those of the log
+        contract.
     overrides : mapping of str to str, optional
         Metadata of a manifest, which override those of the file and the column map.
     name : str, optional
