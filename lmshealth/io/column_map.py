@@ -237,6 +237,7 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
     rows_after: Annotated[Pattern, Meta(examples=["^Data:"])]
     # The number of its character is also found; blanks where nothing is.
     delimiter: Annotated[Pattern, Meta(examples=[","])]
+    required: list[str] = []  # beginnings of lines, without which a header is damaged
     decimal: Pattern | None = None  # found in the first rows where nothing is
     names: Pattern | None = None  # by default columns are called "0", "1", ...
     units: Pattern | None = None  # by default in brackets behind the names
@@ -254,8 +255,10 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
         given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
         given["start.find"] = self.start and self.start.find
         given = {key: [value] if isinstance(value, str) else value for key, value in given.items()}
-        faults = [f"{key}: {fault}" for key, value in given.items() if isinstance(value, list)
-                  for pattern in value if (fault := _fault(pattern)) and key != "name"]  # fmt: skip
+        plain_keys = ("name", "required")
+        faults = [f"{key}: {fault}" for key, value in given.items()
+                  if isinstance(value, list) and key not in plain_keys
+                  for pattern in value if (fault := _fault(pattern))]  # fmt: skip
         if not faults:
             marks = {"delimiter": self.delimiter, "decimal": self.decimal or "."}
             faults = [f"{key}: got {mark!r}, needed one character, or a group () around it"

@@ -149,6 +149,8 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
         raise corrupt(f"is a {layout.name} without a line {layout.rows_after!r} before its rows")
     start = text.count("\n", 0, end.end()) + (not end[0].endswith("\n"))
     header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
+    if absent := [key for key in layout.required if f"\n{key}" not in f"\n{header}"]:
+        raise corrupt(f"is a {layout.name} without a line {listed(absent)} before its rows")
     delimiter = _value(layout.delimiter, header) or " "
     delimiter = chr(int(delimiter)) if re.fullmatch(r"\d{1,3}", delimiter) else delimiter
     # The numbers of the first row may be whole.
@@ -393,6 +395,8 @@ def _channels(
         if time and k in timed:
             # One of several has the rate and the start of the channel behind it.
             own = channels[-1] if len(timed) > 1 and channels else Described("", "")
+            if len(timed) > 1 and own.rate is None:
+                raise corrupt(f"its header has no interval of samples for the column {own.name!r}")
             channels.append(Described("time", time.unit, own.rate, start=own.start))
             continue
         interval = _number(intervals[k])
