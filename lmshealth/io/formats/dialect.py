@@ -386,7 +386,10 @@ def _channels(
     named, *others = (pattern and pattern.replace(DELIMITER, mark) for pattern in patterns)
     rows = partial(_cells, header=header, delimiter=delimiter)
     # A row of names may be longer than the rows; other names are as many as the fields.
-    names = rows(named, n=0) or rows(named, n=len(row))
+    names = rows(named, n=0)
+    if named and not names and "(?P<column>" not in named:
+        raise corrupt(f"its header has no row of names, {layout.names!r}")
+    names = names or rows(named, n=len(row))
     units, intervals, offsets = (rows(pattern, n=len(names)) for pattern in others)
     time, channels = layout.time, list[Described]()
     timed = [k for k, name in enumerate(names)

@@ -196,6 +196,7 @@ def test_a_folder_has_layouts_of_different_names(folder: Path) -> None:
     [
         ("rows_after = '^", "rows_after = '^Never", "corrupt", "is a ACME recorder without a line"),
         ('delimiter = ";"', "delimiter = '^Axis(:..)'", "corrupt", "the delimiter ': a'"),
+        ("names = '^", "names = '^No", "corrupt", "its header has no row of names"),
         ("rows_after", "required = ['Gain']\nrows_after", "corrupt", "without a line Gain before"),
         ('"%d.%m', '"%d/%m', "metadata", "starts at '05.01.2026 08:15:30', no %d/%m"),
     ],
