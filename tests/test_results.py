@@ -11,11 +11,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from lmshealth import examples
+from lmshealth._private.tables import TABLES
 from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
-from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.track import track
@@ -143,8 +143,8 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
         (log, 1000, "time_s acc_x_m_s2 acc_y_m_s2"),
         (two_modes(), 2, "mode source channel frequency_hz"),
         (lives, 3, "stage log recorded_at travel_km mode source frequency_hz"),
-        (followed, 3, COLUMNS["track"]),
-        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), 2, COLUMNS["health"]),
+        (followed, 3, " ".join(TABLES["track"].names)),
+        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), 2, " ".join(TABLES["health"].names)),
         (make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4)), 2, "parameter limit"),
     ):
         assert 1 <= len(repr(result).splitlines()) <= 8

@@ -5,22 +5,22 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
 
+from lmshealth._private.tables import Row
 from lmshealth.cli.terminal import (
-    cells,
     print_line,
     print_refused,
     print_table,
     print_text,
+    print_view,
     short_names,
 )
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
 from lmshealth.report.assessment import Life, ParameterHealth, Summary
-from lmshealth.report.tables import Row, health_rows, track_rows
+from lmshealth.report.tables import events_rows, health_rows, track_rows
 from lmshealth.report.text import (
     GAP,
-    change,
     count,
     day,
     fixed,
@@ -31,7 +31,6 @@ from lmshealth.report.text import (
     percent,
     probability,
     probability_range,
-    signed,
     spell,
     time_left,
     travel_left,
@@ -58,63 +57,6 @@ _FLAGS = {
     "doubtful-name": "a resonance that no description has may be this mode: describe it.",
 }
 
-# Columns of the tables, as `cells` reads them.
-_MODES = (
-    "log {log} | mode {mode} | channel {channel} | frequency Hz {frequency} | "
-    "damping % {damping_ratio:.2p} ± {damping_ratio_std:.2p} | SNR {snr:.3n} | flags {flags}"
-)
-_OFF = (
-    "log {log} | mode {mode} | declared Hz {declared_hz:.3f} | found Hz {found_hz:.3f} | "
-    "off % {off} | declared damping % {declared_damping_ratio:.2p} | "
-    "found damping % {found_damping_ratio:.2p}"
-)
-_SHAPES = "log {log} | mode {mode} | channel {channel} | amplitude {size:.3f} | phase ° {phase}"
-_ERROR = (
-    "mm/s {velocity_mm_s:.3n} | s {duration_s:.3n} | min {min_um:.3n} | max {max_um:.3n} | "
-    "std {std_um:.3n} | mean {mean_um:.3n}"
-)
-_STRONGEST = (
-    "number {n_harmonics} | max µm {max_magnitude_um:.3n} | at Hz {strongest_hz:.4n} | "
-    "bandwidth Hz {bandwidth_hz:.4n} | share {share_explained:.1%}"
-)
-_ABOVE_FLOOR = (
-    "number {n_above_floor} | bandwidth Hz {bandwidth_above_floor_hz:.4n} | "
-    "share {share_explained_above_floor:.1%}"
-)
-_LINES = (
-    "channel {channel} | kind {kind} | Hz {frequency_hz:.2f} | largest mm/s² {largest:.3n} | "
-    "in logs {n_logs}"
-)
-_STAGE_MODES = (
-    "mode {mode} | tracked {answer} | Hz {frequency_hz:.1f} | "
-    "search band {searched_low_hz:.0f}-{searched_high_hz:.0f} | map Hz {map_hz:.1f} | "
-    "at limits {map_at_limits_hz:.1f} | map error {surrogate_error_ln_f:.1e} | "
-    "drift std {logs_reach_ln_f:.1e}"
-)
-_COVERAGE = (
-    "parameter {parameter} | baseline {baseline:g} | limit {limit:g} | "
-    "prior 90 % {prior_q05:.3g}-{prior_q95:.3g} | map {map_low:.3g}-{map_high:.3g} | "
-    "prior outside {outside:.1%}"
-)
-_IDENTIFIABILITY = (
-    "parameter {parameter} | prior {prior_std_ln:.1%} | change {change_std_ln:.1%} | "
-    "value {logs_std_ln:.1%} | endless {endless_logs_std_ln:.1%} | "
-    "informed {informed:.1%} | {answer}"
-)
-_PLAN = (
-    "s per log {seconds_per_log:g} | logs {n_logs} | power, 1 log {power_of_one_log:.1%} | "
-    "loss, 1 log {smallest_loss_of_one_log:.1%} | loss, N logs {smallest_loss:.1%} | "
-    "std of value {value_std_ln:.1%}"
-)
-_TRACK = (
-    "mode {mode} | frequency Hz {frequency_hz:.2f} ± {frequency_std_hz:.2f} | drift {drift} | "
-    "damping ratio {damping}"
-)
-_HEALTH = (
-    "parameter {parameter} | median {median:.3f} | 90 % interval {interval} | "
-    "informed {informed:.0%} | prior × 2 {prior} | ESS {ess:.0f} | R-hat {r_hat:.3f}"
-)
-
 
 # --- Single logs ---
 
@@ -128,17 +70,18 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] 
         if std >= 1:
             row["frequency"] = f"{number(frequency, 4)} ± {number(std, 2)}"
     if rows:
-        print_table("Modes (± one standard deviation)", cells(_MODES, shown), 3)
+        print_view("Modes (± one standard deviation)", "modes", shown)
         for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
             print_text(f"{flag}: {_FLAGS[flag]}")
     else:
         print_text("No modes found.")
-    shown = short_names(off, rows)
-    for row in shown:
-        row["off"] = signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1)
     if off:
+        shown = [
+            row | {"off": 100 * (row["found_hz"] / row["declared_hz"] - 1)}
+            for row in short_names(off, rows)
+        ]
         title = "Warning: the description differs; a mode may have a wrong name"
-        print_table(title, cells(_OFF, shown), 2)
+        print_view(title, "off_description", shown)
         print_text(
             "A new machine agrees with its description: correct it, or describe the modes that it "
             "lacks. Compare a worn machine with its baseline."
@@ -159,8 +102,7 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
                 phase = row[f"phase_deg_{channel}"]
                 shapes.append(row | {"channel": channel, "size": amplitude, "phase": round(phase)})
     if shapes:
-        title = "Mode shapes (accelerations relative to the largest)"
-        print_table(title, cells(_SHAPES, shapes), 3)
+        print_view("Mode shapes (accelerations relative to the largest)", "shapes", shapes)
     mac = {
         (pair["log"], *modes): pair["mac"]
         for pair in pairs
@@ -199,17 +141,15 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // constants.TERMINAL_LINES))
     gain = "gain" if fit["method"] == "measured" else "gain (SI)"
     lines = [
-        {
-            "Hz": f"{row['frequency_hz']:.5g}",
-            gain: f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
-            "phase °": f"{math.degrees(row['phase_rad']):.1f}",
-            "coherence": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
-            "fit": f"{row['fit_gain']:.4g}",
+        row
+        | {
+            "phase": math.degrees(row["phase_rad"]),
+            "seen": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
         }
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(lines)} of {len(frf)} lines"
-    print_table(title, lines, 0)
+    print_view(title, "frf", lines, headings={"gain": gain})
     n = fit["n_averages"]
     noise = "its noise is unknown and taken from the residual of the fit."
     if math.isfinite(fit["chi_square"]):
@@ -238,14 +178,13 @@ def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence
     """Print the following error: statistics and strongest harmonics."""
     if rows:
         rows, harmonics = short_names(rows), short_names(harmonics, rows)
-        several = len({row["channel"] for row in rows}) > 1
-        names = "log {log} | channel {channel} | " if several else "log {log} | "
-        for title, columns in (
-            ("Following error (µm)", _ERROR),
-            ("Strongest harmonics", _STRONGEST),
-            (f"Those above {rows[0]['floor_nm']:g} nm", _ABOVE_FLOOR),
+        alone = len({row["channel"] for row in rows}) == 1
+        for title, view in (
+            ("Following error (µm)", "statistics"),
+            ("Strongest harmonics", "strongest"),
+            (f"Those above {rows[0]['floor_nm']:g} nm", "above_floor"),
         ):
-            print_table(title, cells(names + columns, rows), 2 if several else 1)
+            print_view(title, "error", rows, view, {"channel": None} if alone else {})
         print_text(
             "bandwidth: highest minus lowest frequency; share: of the variance they explain."
         )
@@ -287,7 +226,7 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
         n_logs = len({row["log"] for row in of_line})
         shown.append(of_line[0] | {"largest": largest, "n_logs": n_logs})
     if shown:
-        print_table("Lines", cells(_LINES, shown), 2)
+        print_view("Lines", "lines", shown)
     print_refused(refused)
 
 
@@ -349,15 +288,15 @@ def _range(values: Sequence[float]) -> str:
 def print_stage(content: dict[str, list[Row]]) -> None:
     """Print the modes, parameters, sensitivities and findings of a stage description."""
     (stage,) = content["stage"]
-    modes = [row | {"answer": "yes" if row["tracked"] else "no"} for row in content["modes"]]
-    print_table(f"{stage['name']}: modes", cells(_STAGE_MODES, modes), 2)
+    print_view(f"{stage['name']}: modes", "stage_modes", content["modes"])
     parameters = []
     for row in content["parameters"]:
         outside = row["prior_below_map"] + row["prior_above_map"]
         parameters.append(row | {"outside": outside, "answer": row["verdict"].replace("-", " ")})
     if parameters:
-        print_table("Health parameters", cells(_COVERAGE, parameters))
-        print_table("Standard deviation of the parameters", cells(_IDENTIFIABILITY, parameters))
+        print_view("Health parameters", "stage_parameters", parameters, "coverage")
+        title = "Standard deviation of the parameters"
+        print_view(title, "stage_parameters", parameters, "identifiability")
         print_text(
             f"By {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline "
             "(Cramér-Rao bound). change: a small one since the baseline, where the map's error has "
@@ -398,8 +337,8 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             f"{name}: to detect a loss of {percent(asked['loss'], 1)} with power "
             f"{asked['power']:g}, false-alarm probability {asked['false_alarm']:g}"
         )
-        columns = _PLAN.replace("N logs", f"{asked['n_baseline']} logs")
-        print_table(title, cells(columns, rows), 0)
+        head = "loss, N logs"
+        print_view(title, "plan", rows, headings={head: f"loss, {asked['n_baseline']} logs"})
         alone = asked["seconds_for_one_log"]
         enough = "A single log of up to an hour is not enough."
         print_line(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
@@ -419,26 +358,10 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
 
 def print_track(track: Track) -> None:
     """Print the latest modes of a machine, its events and the consistency of the filter."""
-    rows = []
-    for row in track_rows(track, epochs=[len(track.logs) - 1]):
-        damping = f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
-        damping = damping if row["damping_ratio"] >= 0 else "–"
-        rows.append(row | {"drift": change(row["drift"], row["drift_std"]), "damping": damping})
     title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
-    print_table(title, cells(_TRACK, rows))
-    events = [
-        {
-            "since": day(track.recorded_at[event.epoch]),
-            "kind": event.kind,
-            "mode": event.mode,
-            "": "declared" if event.declared else "detected",
-            "size": change(event.size, event.std),
-            "ln Bayes factor": f"{event.evidence:.1f}",
-        }
-        for event in track.events
-    ]
-    if events:
-        print_table("Events", events, 4)
+    print_view(title, "track", track_rows(track)[-len(track.modes) :])
+    if track.events:
+        print_view("Events", "events", events_rows(track))
     print_text(_consistency(track))
 
 
@@ -469,12 +392,9 @@ def print_health(health: Health) -> None:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
         if not row["converged"]:
             row["interval"] = "not converged"
-        row["prior"] = "{prior_shift:+.2f} σ × {prior_ratio:.2f}".format(**row)
-        if math.isnan(row["prior_ratio"]):
-            row["prior"] = "–"
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
-    print_table(title, cells(_HEALTH, rows))
+    print_view(title, "health", rows)
     print_text(
         "informed: share of the prior variance of the ln parameter that the data remove; "
         "prior × 2: shift of the median and factor on the interval with priors twice as wide, "

@@ -97,7 +97,7 @@ def latest_modes(track: Track) -> list[dict[str, Any]]:
     """
     return [
         row | {"baseline_hz": row["frequency_hz"] * np.exp(-row["drift"])}
-        for row in track_rows(track, epochs=[len(track.logs) - 1])
+        for row in track_rows(track)[-len(track.modes) :]
         if np.isfinite([row["frequency_hz"], row["drift"]]).all()
     ]
 

@@ -1,6 +1,8 @@
 """Formats of numbers and names; pages, terminals and figures share them."""
 
+from collections.abc import Callable, Iterable, Mapping
 from datetime import datetime
+from string import Formatter
 from typing import Any, get_args
 
 import numpy as np
@@ -82,6 +84,16 @@ def percent(share: Number, digits: int | None = None) -> str:
     return f"{number(value) if digits is None else fixed(value, digits)}{GAP}%"
 
 
+def share(value: Number, digits: int) -> str:
+    """Format a share in percent with fixed decimals, without the sign."""
+    return fixed(100 * value, digits)
+
+
+def yes_or_no(value: object, yes: str = "yes", no: str = "no") -> str:
+    """Format a flag."""
+    return yes if value else no
+
+
 def interval(low: Number, high: Number) -> str:
     """Format an interval of shares in whole percent."""
     return f"{fixed(100 * low, 0)} to {percent(high, 0)}"
@@ -153,3 +165,62 @@ def quantiles(
 ) -> tuple[float, ...]:
     """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
+
+
+# Formats of a view of a table, beside those of Python.
+_FORMATS: dict[str, Callable[..., str]] = {
+    one.__name__: one
+    for one in (
+        *(change, count, fixed, number, percent, probability, probability_range, share, signed),
+        *(spell, time_left, travel_left, yes_or_no),
+    )
+}
+
+
+class _Cells(Formatter):
+    """Format strings with `_FORMATS`, as in ``{drift:change {drift_std}}``."""
+
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        if value is None or value != value:  # NaN
+            return "–"
+        name, *options = format_spec.split() or [""]
+        if name not in _FORMATS:
+            return format(value, format_spec)
+        return _FORMATS[name](value, *map(_option, options))
+
+
+_FORMATTER = _Cells()
+
+
+def _option(text: str) -> Any:
+    """Read an argument of a format: digits, a number, or a word."""
+    try:
+        return int(text) if text.isdecimal() else float(text)
+    except ValueError:
+        return text
+
+
+def view_columns(view: str, headings: Mapping[str, str | None] | None = None) -> dict[str, str]:
+    """Split a view of a table (see `Table.shown`) into the formats of its cells, by heading.
+
+    ``headings`` replace those of the view; a column under None is left out.
+    """
+    split = [column.partition("{") for column in view.split("|")]
+    forms = {head.strip(): (start + rest).strip() for head, start, rest in split}
+    shown = {head: (headings or {}).get(head, head) for head in forms}
+    return {name: forms[head] for head, name in shown.items() if name is not None}
+
+
+def first_field(form: str) -> str:
+    """Return the name of the first value in a format."""
+    return next(name for _, name, *_ in _FORMATTER.parse(form) if name)
+
+
+def cells(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[dict[str, str]]:
+    """Format the rows of a table by `view_columns`; a cell whose first value lacks is a dash."""
+    return [{head: _cell(form, row) for head, form in columns.items()} for row in rows]
+
+
+def _cell(form: str, row: Mapping[str, Any]) -> str:
+    value, _ = _FORMATTER.get_field(first_field(form), (), row)
+    return "–" if value is None or value != value else _FORMATTER.vformat(form, (), row)
