@@ -522,8 +522,7 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], constants.RUL_LEVELS
-    text = f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
-    text = "any limit" if one.parameter == "any" else text
+    text = one.name if one.parameter == "any" else f"{one.name} below {percent(one.share)}"
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):

@@ -119,7 +119,7 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         "delta_e_below_40hz_um": None if error is None else error / _MICRO,
         "sample_rate_hz": reading.sample_rate,
     }
-    rows = [TABLES["modes"].read(metadata, **of_log, **own) for own in _to_rows(modes.to_columns())]
+    rows = [TABLES["modes"].read(metadata, **of_log, **own) for own in to_rows(modes.to_columns())]
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
@@ -172,10 +172,10 @@ def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
     if smoothed is not None:
         later = mode_columns(smoothed)
         columns |= {f"{name}_smoothed": values for name, values in later.items()}
-    return _to_rows(columns)
+    return to_rows(columns)
 
 
-def _to_rows(columns: Row) -> list[Row]:
+def to_rows(columns: Row) -> list[Row]:
     """Return rows of columns of one length."""
     values = zip(*(np.asarray(own).tolist() for own in columns.values()), strict=True)
     return [dict(zip(columns, one, strict=True)) for one in values]
@@ -211,7 +211,7 @@ def events_rows(track: Track) -> list[Row]:
 
 def health_rows(health: Health) -> list[Row]:
     """Return a posterior of the health parameters, one row per epoch and parameter."""
-    return _to_rows(health.to_columns())
+    return to_rows(health.to_columns())
 
 
 def prognosis_rows(

@@ -1,6 +1,6 @@
 """Formats of numbers and names; pages, terminals and figures share them."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import datetime
 from string import Formatter
 from typing import Any, get_args
@@ -178,7 +178,17 @@ _FORMATS: dict[str, Callable[..., str]] = {
 
 
 class _Cells(Formatter):
-    """Format strings with `_FORMATS`, as in ``{drift:change {drift_std}}``."""
+    """Format strings with `_FORMATS`, as in ``{drift:change {drift_std}}``.
+
+    Values are those of a mapping, a sequence or an object.
+    """
+
+    def get_value(self, key: Any, args: Any, kwargs: Any) -> Any:
+        for values in args:
+            if key in values:
+                return values[key]
+        named = isinstance(kwargs, Mapping) or isinstance(key, int)
+        return kwargs[key] if named else getattr(kwargs, key)
 
     def format_field(self, value: Any, format_spec: str) -> Any:
         if value is None or value != value:  # NaN
@@ -216,11 +226,17 @@ def first_field(form: str) -> str:
     return next(name for _, name, *_ in _FORMATTER.parse(form) if name)
 
 
-def cells(columns: Mapping[str, str], rows: Iterable[Mapping[str, Any]]) -> list[dict[str, str]]:
-    """Format the rows of a table by `view_columns`; a cell whose first value lacks is a dash."""
-    return [{head: _cell(form, row) for head, form in columns.items()} for row in rows]
+def cells(
+    columns: Mapping[str, str], rows: Iterable[Any], values: Mapping[str, Any] | None = None
+) -> list[dict[str, str]]:
+    """Format the rows of a table by `view_columns`, and values that are the same in all rows.
+
+    A row is a mapping, a sequence or an object. A cell whose first value is missing is a dash.
+    """
+    common = [values or {}]
+    return [{head: _cell(form, row, common) for head, form in columns.items()} for row in rows]
 
 
-def _cell(form: str, row: Mapping[str, Any]) -> str:
-    value, _ = _FORMATTER.get_field(first_field(form), (), row)
-    return "–" if value is None or value != value else _FORMATTER.vformat(form, (), row)
+def _cell(form: str, row: Any, common: Sequence[Mapping[str, Any]]) -> str:
+    value, _ = _FORMATTER.get_field(first_field(form), common, row)
+    return "–" if value is None or value != value else _FORMATTER.vformat(form, common, row)
