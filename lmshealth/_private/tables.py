@@ -32,6 +32,8 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     columns: tuple[Column | str, ...]  # strings: names of shared columns
     further: tuple[Column, ...] = ()  # columns that follow where they are needed
     shown: dict[str, str] = {}  # views: ``heading {column:format}``, separated by bars
+    legend: str = ""  # explains headings of a view on a terminal
+    values: dict[str, dict[str, str]] = {}  # meanings of the values of columns
 
     @cached_property
     def names(self) -> tuple[str, ...]:

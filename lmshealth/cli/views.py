@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
 
-from lmshealth._private.tables import Row
+from lmshealth._private.tables import TABLES, Row
 from lmshealth.cli.terminal import (
     print_line,
     print_refused,
@@ -31,6 +31,7 @@ from lmshealth.report.text import (
     percent,
     probability,
     probability_range,
+    service_text,
     spell,
     time_left,
     travel_left,
@@ -39,23 +40,6 @@ from lmshealth.report.text import (
 from lmshealth.tracking.track import Track
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
-_HINDRANCES = {
-    "too-short": ("log too short", "its modes cannot be identified."),
-    "baseline": ("baseline too short", "more or longer baseline logs are needed."),
-    "parameters": ("hidden", "other parameters change the modes alike; track further modes."),
-}
-_FLAGS = {
-    "resolution-limited": "segments too short for the damping.",
-    "at-bound": "at the end of the search; check the description.",
-    "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
-    "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
-    "unsteady": "its excitation varies over time, which the standard deviations include.",
-    "coloured": "its excitation has no flat spectrum, which the standard deviations include.",
-    "cluster": "one estimate for two modes that the data do not separate.",
-    "levels": "a channel is coarsely quantised or lacks levels; see below.",
-    "rate": "the sample rate is in doubt, and with it all frequencies; see below.",
-    "doubtful-name": "a resonance that no description has may be this mode: describe it.",
-}
 
 
 # --- Single logs ---
@@ -72,7 +56,7 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] 
     if rows:
         print_view("Modes (± one standard deviation)", "modes", shown)
         for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
-            print_text(f"{flag}: {_FLAGS[flag]}")
+            print_text(f"{flag}: {TABLES['modes'].values['flags'][flag]}")
     else:
         print_text("No modes found.")
     if off:
@@ -185,9 +169,7 @@ def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence
             (f"Those above {rows[0]['floor_nm']:g} nm", "above_floor"),
         ):
             print_view(title, "error", rows, view, {"channel": None} if alone else {})
-        print_text(
-            "bandwidth: highest minus lowest frequency; share: of the variance they explain."
-        )
+        print_text(TABLES["error"].legend)
         if harmonics:
             _print_harmonics(rows, harmonics)
     print_refused(refused)
@@ -211,12 +193,7 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
         own = [row for row in rows if (row["stage"], row["channel"]) == (stage, channel)]
         _print_channel(f"{stage or 'unknown machine'}, {channel}", own)
     if rows:
-        print_line(
-            "grows: slope of ln level over ln velocity ± its standard deviation;\n"
-            "* significantly positive (one-sided, 5 % per row);\n"
-            "– fewer than two velocities or three logs: no slope;\n"
-            "~ the strongest harmonic is a spectral line, not a mode. RMS: of a band, in Hz."
-        )
+        print_line(TABLES["magnitudes"].legend)
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for row in lines:  # each spectral line once for all logs
         groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
@@ -297,14 +274,7 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         print_view("Health parameters", "stage_parameters", parameters, "coverage")
         title = "Standard deviation of the parameters"
         print_view(title, "stage_parameters", parameters, "identifiability")
-        print_text(
-            f"By {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline "
-            "(Cramér-Rao bound). change: a small one since the baseline, where the map's error has "
-            "no effect, as in `lmshealth plan`. value: anywhere in the prior, with the map's "
-            "error. endless: by unlimited logs. map error: of ln f. drift std: of the drift of "
-            "ln f between these two groups. informed: expected share of the prior variance of "
-            "the ln parameter that the logs remove; identifiable from 50 % on.\n"
-        )
+        print_text(TABLES["stage_parameters"].legend.format_map(stage))
         _print_sensitivities(content)
     for row in content["findings"]:
         print_text(row["text"], "+ " if row["good"] else "! ")
@@ -326,10 +296,12 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
 
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
     """Print the number of logs needed per length of log, one table per loss to detect."""
+    meanings = TABLES["plan"].values["hindrance"]
+    hindrances = {kind: meaning.split(": ") for kind, meaning in meanings.items()}
     for asked in detect:
         name = asked["parameter"]
         rows = [
-            row | ({"n_logs": _HINDRANCES[row["hindrance"]][0]} if row["hindrance"] else {})
+            row | ({"n_logs": hindrances[row["hindrance"]][0]} if row["hindrance"] else {})
             for row in plan
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
@@ -343,14 +315,8 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
         enough = "A single log of up to an hour is not enough."
         print_line(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
     for kind in dict.fromkeys(row["hindrance"] for row in plan if row["hindrance"]):
-        print_text(": ".join(_HINDRANCES[kind]))
-    print_text(
-        "Lower bound. Logs now and at the baseline have equal length; loss: the smallest that is "
-        "detected, a small change since the baseline, where the map's error has no effect. std of "
-        "value: of the parameter by as many logs as the baseline has, anywhere in its prior, with "
-        "the map's error, as in `lmshealth stage`.\n"
-        "Not included: temperature, scatter between logs."
-    )
+        print_text(": ".join(hindrances[kind]))
+    print_text(TABLES["plan"].legend)
 
 
 # --- Machines ---
@@ -395,11 +361,7 @@ def print_health(health: Health) -> None:
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
     print_view(title, "health", rows)
-    print_text(
-        "informed: share of the prior variance of the ln parameter that the data remove; "
-        "prior × 2: shift of the median and factor on the interval with priors twice as wide, "
-        "within the map."
-    )
+    print_text(TABLES["health"].legend)
     for one, other in combinations(rows, 2):
         first, second = one["parameter"], other["parameter"]
         rho = one[f"correlation_{second}"]
@@ -473,13 +435,6 @@ def _travel_left(life: Life | None) -> str:
         return "–"
     low, middle, high = (travel_left(life.any.travel[k], life.horizon) for k in (0, 3, 6))
     return middle if low == high else f"{middle} ({low} to {high})"
-
-
-def service_text(service: Service) -> str:
-    """Return when to service, in a few words."""
-    if service.by is not None and service.kind == "by":
-        return f"by {service.by.isoformat()}"
-    return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
 
 
 def print_life(

@@ -42,12 +42,8 @@ def csv_text(table: str, rows: Iterable[Row]) -> str:
     columns = dict.fromkeys(TABLES[table].names)
     for row in rows:
         columns |= dict.fromkeys(row)
-    target = io.StringIO()
-    writer = csv.writer(target, lineterminator="\n")
-    writer.writerow(columns)
     cells = ([row.get(name) for name in columns] for row in rows)
-    writer.writerows([cell if cell == cell else None for cell in own] for own in cells)
-    return target.getvalue()
+    return _lines([columns, *([cell if cell == cell else None for cell in own] for own in cells)])
 
 
 def join_csv(parts: Sequence[Any], read: Callable[[Any], str] = str) -> Iterator[str]:
@@ -57,27 +53,22 @@ def join_csv(parts: Sequence[Any], read: Callable[[Any], str] = str) -> Iterator
     """
     columns: dict[str, None] = {}
     for part in parts:
-        columns |= dict.fromkeys(_header(read(part)))
-    header = _line(columns)
+        columns |= dict.fromkeys(next(csv.reader(io.StringIO(read(part), newline=""))))
+    header = _lines([columns])
     yield header
     for part in parts:
         text = read(part)
         if text.startswith(header):
             yield text[len(header) :]
         else:
-            target = io.StringIO()
-            writer = csv.DictWriter(target, columns, lineterminator="\n")
-            writer.writerows(csv.DictReader(io.StringIO(text, newline="")))
-            yield target.getvalue()
+            rows = csv.DictReader(io.StringIO(text, newline=""))
+            yield _lines([row.get(name) for name in columns] for row in rows)
 
 
-def _header(text: str) -> list[str]:
-    return next(csv.reader(io.StringIO(text, newline="")))
-
-
-def _line(cells: Iterable[str]) -> str:
+def _lines(rows: Iterable[Iterable[Any]]) -> str:
+    """Write rows as CSV."""
     target = io.StringIO()
-    csv.writer(target, lineterminator="\n").writerow(cells)
+    csv.writer(target, lineterminator="\n").writerows(rows)
     return target.getvalue()
 
 

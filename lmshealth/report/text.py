@@ -1,14 +1,19 @@
 """Formats of numbers and names; pages, terminals and figures share them."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
 from string import Formatter
-from typing import Any, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.report import constants
+
+if TYPE_CHECKING:  # above, so that --help needs no scipy
+    from lmshealth.prognosis.maintenance_decision import Service
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
@@ -160,6 +165,13 @@ def time_left(days: float) -> str:
     return f"{coarse(days)}{GAP}days{years}"
 
 
+def service_text(service: Service) -> str:
+    """Return when to service, in a few words."""
+    if service.by is not None and service.kind == "by":
+        return f"by {service.by.isoformat()}"
+    return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
+
+
 def quantiles(
     values: FloatArray, levels: tuple[float, ...] = constants.LEVELS
 ) -> tuple[float, ...]:
@@ -167,18 +179,8 @@ def quantiles(
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
 
 
-# Formats of a view of a table, beside those of Python.
-_FORMATS: dict[str, Callable[..., str]] = {
-    one.__name__: one
-    for one in (
-        *(change, count, fixed, number, percent, probability, probability_range, share, signed),
-        *(spell, time_left, travel_left, yes_or_no),
-    )
-}
-
-
 class _Cells(Formatter):
-    """Format strings with `_FORMATS`, as in ``{drift:change {drift_std}}``.
+    """Format strings with functions of this module, as in ``{drift:change {drift_std}}``.
 
     Values are those of a mapping, a sequence or an object.
     """
@@ -194,9 +196,8 @@ class _Cells(Formatter):
         if value is None or value != value:  # NaN
             return "–"
         name, *options = format_spec.split() or [""]
-        if name not in _FORMATS:
-            return format(value, format_spec)
-        return _FORMATS[name](value, *map(_option, options))
+        function = globals().get(name)
+        return function(value, *map(_option, options)) if function else format(value, format_spec)
 
 
 _FORMATTER = _Cells()

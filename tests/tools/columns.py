@@ -51,6 +51,9 @@ def _lines() -> Iterator[str]:
                 yield from ("", f"**{name}{'.csv' if of_run else ''}**: {table.rows}")
                 yield from _HEAD
                 yield from _rows(table)
+                for column, meanings in table.values.items():
+                    yield from ("", f"Values of `{column}`:", "")
+                    yield from (f"- `{value}`: {meaning}" for value, meaning in meanings.items())
 
 
 def _rows(table: Table) -> Iterator[str]:
