@@ -238,7 +238,7 @@ def write_log(path: Path, preload: float, number: int, stage: str = MACHINE) -> 
     rng = np.random.default_rng([20261121, number])
     modes = [Mode(f * preload**slope, damping) for _, f, damping, slope in ARCHIVE_MODES]
     values = accelerations(rng, modes, round(_SECONDS * _RATE), _RATE, 1.0)
-    moment = datetime(2026, 1, 1, 8, tzinfo=UTC) + timedelta(days=10 * number)
+    moment = datetime(2024, 1, 1, 8, tzinfo=UTC) + timedelta(days=10 * number)
     path.parent.mkdir(parents=True, exist_ok=True)
     with h5py.File(path, "w") as file:
         file["acc_feed_m_s2"] = values[0]

@@ -35,7 +35,7 @@ ANSWER_TIMEOUT_S = 60
 """Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
 end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
-SCHEMA = 8
+SCHEMA = 9
 """Version of the tables of a store, part of their names: older tables are not read."""
 
 SETTLED_S = 10

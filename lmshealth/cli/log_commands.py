@@ -197,7 +197,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     """Identify the modes of single logs: natural frequency and damping ratio.
 
     json also lists complex mode shapes, their phase collinearity (MPC), the modal assurance
-    criterion (MAC) of each pair of modes, and spectral lines.
+    criterion (MAC) of each pair of modes, spectral lines, and the factors that make up std_factor.
     """
     stage, band = given["stage"], given["band"]
     _check_outputs(given)
@@ -220,6 +220,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for one in found for refusal in one.modes.refused]
     content["modes"] = rows
     content["lines"] = [row for r in found for row in tables.lines_rows(r.log, r.modes.lines)]
+    content["std_factors"] = [row for r in found for row in tables.factor_rows(r.log, r.modes)]
     off: list[Row] = []
     for one in found if stage else ():
         off += TABLES["off_description"].rows_of(compare(one.modes, stage), log=one.log)
@@ -439,6 +440,7 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         "lines": [
             row for log, own in found for row in tables.lines_rows(log.name, own.modes.lines)
         ],
+        "std_factors": [row for e in estimates for row in tables.factor_rows(e.log, e.modes)],
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
     if stage and given["style"] != "json":

@@ -7,7 +7,7 @@ import os
 import sys
 import unicodedata
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import Any
 
 import click
@@ -64,6 +64,8 @@ class _Stream(io.TextIOWrapper):
 
     def __init__(self, stream: io.TextIOWrapper) -> None:
         self._original = stream  # it closes the buffer when it is deleted
+        with suppress(OSError):
+            stream.flush()  # what was written before comes first
         self.charset = codecs.lookup(stream.encoding).name
         # click writes UTF-8 to whatever is ASCII.
         encoding = "latin-1" if self.charset == "ascii" else self.charset

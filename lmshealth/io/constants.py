@@ -113,6 +113,9 @@ EDGE, AT_EDGE = 6.0, 0.13
 distribution has a sharp edge: 10 at an edge, below 3 in tails of normal or exponential noise. Most
 samples are there if the 5 % quantile is nearer than this share of the median: 0.093 for |x| of
 normal x, 0.1 where the density is constant."""
+LOPSIDED = 1.25
+"""Least ratio, or inverse, of the distances of the 95 % and 5 % quantiles from the median: 2.1 for
+|x| of normal x, 0.5 for that of a sine, 1 for what is not rectified."""
 NEAR_ZERO, MAGNITUDE_SKEW = 0.05, 0.3
 """Least sample of a magnitude over its median, and its skewness: that of a vector has 0.49 in three
 and 0.63 in two dimensions, that of |x| 0.995; normal noise has none."""

@@ -267,13 +267,15 @@ def check_sign(values: Samples, rough: Roughness) -> None:
     if x.size < constants.FEWEST_FOR_SHAPE or np.unique(x).size < constants.FEWEST_LEVELS:
         return
     for own, low, high in ((x, rough.low, rough.high), (-x, -rough.high, -rough.low)):
-        q = np.quantile(own, [0.001, 0.01, 0.05, 0.5, 0.99, 0.999])
+        q = np.quantile(own, [0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999])
         below, above = q - low, high - q
         # Quantiles above an edge are proportional to their probability, those of a tail are not.
         edge = below[0] > 0 and below[1] > constants.EDGE * below[0]
         # Most samples are at the edge; the other end, unlike that of a sine, has none.
         edge &= below[2] < constants.AT_EDGE * below[3]
-        edge &= above[4] <= constants.EDGE / 2 * above[5]
+        edge &= above[5] <= constants.EDGE / 2 * above[6]
+        # A sine that decays, with one sample beyond an end, is as wide above its median as below.
+        edge &= abs(np.log((q[4] - q[3]) / (q[3] - q[2]))) > np.log(constants.LOPSIDED)
         scale = float(own.std())
         skew = float(np.mean((own - own.mean()) ** 3)) / scale**3
         from_zero = 0 <= low < constants.NEAR_ZERO * q[3] and skew > constants.MAGNITUDE_SKEW

@@ -37,7 +37,6 @@ from lmshealth.modal.naming import assign, likeness, name_together
 from lmshealth.modal.targets import (
     Target,
     check_band,
-    choose_channels,
     choose_targets,
     clusters,
     limit_channels,
@@ -149,7 +148,7 @@ def read_ambient(
     """Identify modes as `identify` does; return them with the spectra and their fit."""
     check_band(log, band)
     log = limit_channels(log, channels)
-    used = choose_channels(log)
+    used = log.channels
     targets, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
     while True:
         try:

@@ -16,6 +16,7 @@ from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.modes import Modes
+from lmshealth.modal.naming import assurance
 
 # Ordinates near the resonance that are averaged at least; passes, as shapes of neighbours change.
 _LEAST_ORDINATES, _ROUNDS = 3, 2
@@ -52,7 +53,7 @@ class ModeShapes:
 
         Shape ``(n_modes, n_modes)``; NaN for pairs with less than two common channels.
         """
-        return _assurance(self.shapes, self.shapes)
+        return assurance(self.shapes, self.shapes)
 
     def mac_with(self, other: "ModeShapes") -> FloatArray:
         """MAC of each mode with the mode of its name in another log, shape ``(n_modes,)``.
@@ -64,18 +65,9 @@ class ModeShapes:
             one.shapes[:, [one.channels.index(name) for name in common]] for one in (self, other)
         )
         named = np.array(self.names)[:, None] == np.array(other.names)
-        pairs = np.where(named, _assurance(own, others), np.nan)
+        pairs = np.where(named, assurance(own, others), np.nan)
         found = np.fmax.reduce(pairs, axis=1, initial=-1.0)
         return np.where(found < 0, np.nan, found)
-
-
-def _assurance(a: ComplexArray, b: ComplexArray) -> FloatArray:
-    """Return the MAC of shapes ``(n, n_channels)`` and ``(m, n_channels)``, shape ``(n, m)``."""
-    in_a, in_b = np.isfinite(a), np.isfinite(b)
-    a, b = np.nan_to_num(a), np.nan_to_num(b)
-    power = ((np.abs(a) ** 2) @ in_b.T) * (in_a @ (np.abs(b) ** 2).T)
-    several = in_a.astype(int) @ in_b.T.astype(int) > 1
-    return np.asarray(np.abs(a.conj() @ b.T) ** 2 / np.where(several, power, np.nan))
 
 
 def mode_shapes(modes: Modes, fitted: Sequence[FittedSpectrum]) -> ModeShapes:

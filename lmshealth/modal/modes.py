@@ -14,10 +14,11 @@ from numpy.typing import ArrayLike, NDArray
 from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth._private.result import Result
 from lmshealth.io.log import WARNINGS, Refusal
+from lmshealth.modal.credibility import Credibility, widened
 from lmshealth.signal.spectral_lines import Line
 
 # Fields of `Modes` with one entry per mode.
-_TEXTS = ("names", "sources", "channels", "flags")
+_TUPLES = ("names", "sources", "channels", "flags", "credibility")
 # Beginnings of names of measured channels; other channels are times and set points.
 _MEASURED = ("delta_e", "acc", "current")
 _ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion", "excitation")
@@ -61,11 +62,14 @@ class Modes(Result):
     # Root mean square acceleration of the mode in m/s², over time, as a norm over the channels;
     # NaN (the default) where it was not measured.
     excitation: FloatArray = None  # type: ignore[assignment]
+    credibility: tuple[Credibility, ...] = ()  # factors of ``cov`` per mode, by default unknown
 
     def __post_init__(self) -> None:
         n = len(self.names)
         if self.excitation is None:
             object.__setattr__(self, "excitation", np.full(n, np.nan))
+        if not self.credibility:
+            object.__setattr__(self, "credibility", (Credibility(),) * n)
         named = [pair for pair in zip(self.names, self.sources, strict=True) if pair[0]]
         if len(set(named)) != len(named):
             raise ValueError(f"mode names are not unique per source: {self.names}")
@@ -90,13 +94,14 @@ class Modes(Result):
             "correlation_f_zeta": self.correlation,
             "snr": self.snr,
             "dispersion": self.dispersion,
+            "std_factor": np.array([one.total for one in self.credibility]),
             "excitation_mm_s2": self.excitation / 1e-3,
             "flags": list(self.flags),
         }
 
     def digest_columns(self) -> dict[str, Any]:
         """Return the columns without those of the fit."""
-        left_out = ("source", "correlation_f_zeta", "dispersion", "excitation_mm_s2")
+        left_out = ("source", "correlation_f_zeta", "dispersion", "std_factor", "excitation_mm_s2")
         return {k: v for k, v in self.to_columns().items() if k not in left_out}
 
     @property
@@ -139,9 +144,13 @@ class Modes(Result):
         both = paired(index, len(self.names))
         rows = both[: len(index)]
         own: dict[str, Any] = {name: getattr(self, name)[rows] for name in (*_ARRAYS, "shapes")}
-        for name in _TEXTS:
+        for name in _TUPLES:
             own[name] = tuple(getattr(self, name)[i] for i in rows)
         return replace(self, **own, cov=self.cov[np.ix_(both, both)])
+
+    def widened(self, cause: str, cov: FloatArray) -> Self:
+        """Replace the covariance, and add what that does to standard deviations to the factors."""
+        return replace(self, cov=cov, credibility=widened(self.credibility, cause, self.cov, cov))
 
 
 def paired(index: ArrayLike, n_modes: int) -> NDArray[np.intp]:
@@ -151,11 +160,17 @@ def paired(index: ArrayLike, n_modes: int) -> NDArray[np.intp]:
 
 
 def estimates_only(
-    estimate: FloatArray, cov: FloatArray, snr: FloatArray, source: str, channels: Sequence[str]
+    estimate: FloatArray,
+    cov: FloatArray,
+    snr: FloatArray,
+    source: str,
+    channels: Sequence[str],
+    credibility: tuple[Credibility, ...] = (),
 ) -> Modes:
     """Return unnamed modes of one source without shapes, dispersion, lines or refusals.
 
-    ``estimate`` is ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, ``cov`` its covariance.
+    ``estimate`` is ``[ln f, ln ζ]``, shape ``(2 n_modes,)``, ``cov`` its covariance with the
+    factors of ``credibility``.
     """
     n = len(channels)
     return Modes(
@@ -172,6 +187,7 @@ def estimates_only(
         shapes=np.empty((n, 0)),
         lines=(),
         refused=(),
+        credibility=credibility,
     )
 
 
@@ -197,7 +213,7 @@ def merge(
         first += rows.size
 
     joined: dict[str, Any] = {}
-    for name in _TEXTS:
+    for name in _TUPLES:
         joined[name] = tuple(chain.from_iterable(getattr(part, name) for part in parts))
     for name in _ARRAYS:
         joined[name] = np.concatenate([np.empty(0), *(getattr(part, name) for part in parts)])

@@ -12,6 +12,7 @@ from itertools import combinations
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import softmax
 from scipy.stats import norm
 
@@ -134,10 +135,20 @@ def likeness(modes: Modes, targets: Sequence[Target]) -> FloatArray:
     NaN where fewer than two channels are in both.
     """
     described = [[target.shape.get(c, np.nan) for c in modes.shape_channels] for target in targets]
-    both = modes.shapes, np.array(described).reshape(len(targets), len(modes.shape_channels))
-    (a, b), (in_a, in_b) = map(np.nan_to_num, both), (np.isfinite(x) + 0.0 for x in both)
-    power = np.where(in_a @ in_b.T > 1, (a**2 @ in_b.T) * (in_a @ (b**2).T), np.nan)
-    return np.asarray((a @ b.T) ** 2 / np.where(power > 0, power, np.nan))
+    shapes = np.array(described).reshape(len(targets), len(modes.shape_channels))
+    return assurance(modes.shapes, shapes)
+
+
+def assurance(a: NDArray[Any], b: NDArray[Any]) -> FloatArray:
+    """Return the MAC of shapes ``(n, n_channels)`` and ``(m, n_channels)``, shape ``(n, m)``.
+
+    It is that of common channels [Allemang2003]; NaN where there are fewer than two.
+    """
+    in_a, in_b = np.isfinite(a), np.isfinite(b)
+    a, b = np.nan_to_num(a), np.nan_to_num(b)
+    power = ((np.abs(a) ** 2) @ in_b.T) * (in_a @ (np.abs(b) ** 2).T)
+    several = in_a.astype(int) @ in_b.T.astype(int) > 1
+    return np.asarray(np.abs(a.conj() @ b.T) ** 2 / np.where(several & (power > 0), power, np.nan))
 
 
 def name_together(

@@ -55,7 +55,8 @@ def choose_channels(log: Log, names: Sequence[str] | None = None) -> tuple[Chann
 def limit_channels(log: Log, names: Sequence[str] | None = None) -> Log:
     """Refuse (``surplus``) the channels beyond those that can be fitted together.
 
-    Names are those of `choose_channels`; the channels that add most to each other are kept.
+    The channels of the log that is returned are those of `choose_channels` with these names, or of
+    these the ones that add most to each other.
     """
     used = choose_channels(log, names)
     if len(used) <= constants.MOST_CHANNELS:

@@ -17,6 +17,7 @@ from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes
+from lmshealth.modal.modes import Modes
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
@@ -115,6 +116,12 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         channels = zip(modes.shape_channels, shape, strict=True)
         row |= {f"shape_{channel}": part for channel, part in channels}
     return rows
+
+
+def factor_rows(log: str, modes: Modes) -> list[Row]:
+    """Return the factors on the standard deviation of each mode, one row per mode and cause."""
+    table, each = TABLES["std_factors"], zip(modes.names, modes.credibility, strict=True)
+    return [table.row(log, name, *one) for name, own in each for one in own.factors]
 
 
 def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:

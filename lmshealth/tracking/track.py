@@ -18,6 +18,7 @@ from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
+from lmshealth.modal.credibility import dependence
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import (
@@ -589,7 +590,7 @@ def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Floa
     size = squares / np.maximum(count, 1)
     rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
     bound = stats.norm.isf(constants.WIDENING_P_VALUE) * np.sqrt(np.cumsum(sums**2))
-    factor = factor * np.where(np.cumsum(sums) > bound, (1 + rho) / (1 - rho), 1.0)
+    factor = factor * np.where(np.cumsum(sums) > bound, dependence(rho), 1.0)
     return np.asarray(np.sqrt(factor))
 
 

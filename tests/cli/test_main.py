@@ -159,7 +159,11 @@ def test_modes_as_json_have_the_keys_of_the_contract(folder: Path, stage: Path) 
     result = call("modes", log, "--stage", stage, "--format", "json")
     assert result.exit_code == 0
     content = strict(result.stdout)
-    assert set(content) == {"modes", "lines", "shapes", "mac", "refused"}
+    assert set(content) == {"modes", "lines", "std_factors", "shapes", "mac", "refused"}
+    own = [row for row in content["std_factors"] if row["mode"] == "pitch"]
+    assert [row["cause"] for row in own] == ["unsteady", "coloured"]
+    product = np.prod([row["std_factor"] for row in own])
+    assert content["modes"][1]["std_factor"] == pytest.approx(product)
     assert [shape["mode"] for shape in content["shapes"]] == ["roll", "pitch"]
     assert {pair["mode_b"] for pair in content["mac"]} == {"pitch"}
     assert [mode["mode"] for mode in content["modes"]] == ["roll", "pitch"]
@@ -499,7 +503,7 @@ def test_frf_as_json_has_the_response_and_its_modes(bench: Path) -> None:
     result = frf(bench, "--band", *BAND, "--period", 4, "--format", "json")
     assert (result.exit_code, result.stderr) == (0, "")
     content = strict(result.stdout)
-    assert set(content) == {"modes", "fit", "frf", "lines", "refused"}
+    assert set(content) == {"modes", "fit", "frf", "lines", "std_factors", "refused"}
     assert all(set(mode) >= MODE_KEYS for mode in content["modes"])
     assert [mode["source"] for mode in content["modes"]] == ["frf", "frf"]
     for mode, (f, _, _) in zip(content["modes"], MODES, strict=False):

@@ -116,14 +116,19 @@ def test_magnitudes_are_refused(name):
     assert caught.value.reason == "rectified"
 
 
-@pytest.mark.parametrize("name", ["vibration", "gravity", "sine", "ramp", "friction", "moves"])
+@pytest.mark.parametrize(
+    "name", ["vibration", "gravity", "sine", "decay", "ramp", "friction", "moves"]
+)
 def test_signed_channels_are_accepted(name):
     """Offsets, sines, ramps and one-sided errors of moves are no magnitudes."""
     x, t = vibration(), np.arange(N)
+    cycles = np.linspace(0, 20, 4000)
     values = {
         "vibration": x,
         "gravity": 9.81 + 0.1 * x,
         "sine": np.sin(0.1 * t),
+        # One sample of a knock at an end of the range.
+        "decay": np.append(0.99**cycles * np.sin(2 * np.pi * cycles), -1.2),
         "ramp": t + x,
         "friction": np.where(t // 5000 % 2, 3.0, 0.0) + 0.1 * x,
         "moves": 5 * np.exp(-(t % 2000) / 120) + 0.01 * x,

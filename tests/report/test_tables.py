@@ -298,7 +298,7 @@ def test_the_columns_are_those_of_the_contract() -> None:
         "modes": "log stage recorded_at travel_km temperature_c payload_kg position_mm servo_id "
         "delta_e_below_40hz_um mode source frequency_hz "
         "frequency_std_hz damping_ratio damping_ratio_std correlation_f_zeta snr dispersion "
-        "excitation_mm_s2 flags",
+        "std_factor excitation_mm_s2 flags",
         "events": "stage recorded_at travel_km kind mode source size std evidence",
         "verdict": "stage recorded_at verdict probability",
         "refused": "log channel mode source reason detail",

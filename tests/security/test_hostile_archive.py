@@ -12,7 +12,6 @@ from __future__ import annotations
 import html
 import json
 import os
-import resource
 import socket
 import subprocess
 import sys
@@ -36,6 +35,8 @@ Row = dict[str, Any]
 PASSWORD = "s3cr3t-pa55w0rd"
 # What Python, its libraries and a minute of samples take, and the most that a bomb may add.
 _MOST_MEMORY_MB = 400
+# Characters: two lines of a terminal for what is wrong, and a block of a description to copy.
+_LONGEST_MESSAGE = 700
 # On SQLite every so many of the names, SQL and markup, are tried; on PostgreSQL all.
 _EVERY = 19
 _TALKATIVE = (
@@ -146,19 +147,19 @@ def _links(folder: Path, out: Path) -> list[Path]:
 
 def _weigh(path: Path) -> Row:
     """Read a log in a process of its own; return why it is refused, and its peak memory in MB."""
+    # The high-water mark of the process: what `getrusage` gives starts at that of its parent.
     script = (
-        "import json, resource, sys\nfrom lmshealth.io.reading import read_log\n"
+        "import json, resource, sys\n"
+        "resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30))\n"
+        "from lmshealth.io.reading import read_log\n"
         "from lmshealth.errors import BadLog\n"
         "try:\n    read_log(sys.argv[1]); reason = ''\n"
         "except BadLog as error:\n    reason = error.reason\n"
-        "peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10\n"
-        "print(json.dumps({'refused': reason, 'peak_mb': peak}))"
+        "(peak,) = [line.split()[1] for line in open('/proc/self/status') if line[:5] == 'VmHWM']\n"
+        "print(json.dumps({'refused': reason, 'peak_mb': int(peak) >> 10}))"
     )
     command = [sys.executable, "-c", script, str(path)]
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=True,
-        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_AS, (8 << 30, 8 << 30)),
-    )  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
     found: Row = json.loads(done.stdout)
     return found
 
@@ -200,7 +201,7 @@ def test_no_address_shows_its_password(tmp_path: Path, form: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", hostile.BAD_STAGES)
-def test_a_hostile_description_is_refused_in_a_line(tmp_path: Path, name: str) -> None:
+def test_a_hostile_description_is_refused_by_one_short_message(tmp_path: Path, name: str) -> None:
     """The message acts on no terminal and quotes no other file."""
     (tmp_path / "outside").mkdir()
     (tmp_path / "outside" / "secret.txt").write_text(hostile.SECRET + "\n")
@@ -208,7 +209,10 @@ def test_a_hostile_description_is_refused_in_a_line(tmp_path: Path, name: str) -
     path.parent.mkdir()
     path.write_text(hostile.BAD_STAGES[name])
     done = lmshealth("stage", path, cwd=tmp_path)
-    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    # The log record of the message comes first.
+    _, found, message = done.stderr.partition("\nlmshealth: ")
+    assert (done.returncode, found, message.count("lmshealth: ")) == (1, "\nlmshealth: ", 0)
+    assert len(message) < _LONGEST_MESSAGE
     assert guards.acting(done.stderr) == []
     assert hostile.SECRET not in done.stderr + done.stdout
 
@@ -235,6 +239,9 @@ BOMBS = [(kind, suffix) for kind in KINDS if kind.reason == "too-large" for suff
 
 
 @pytest.mark.slow
+@pytest.mark.skipif(
+    not Path("/proc/self/status").exists(), reason="reads memory from Linux's /proc"
+)
 @pytest.mark.parametrize(("kind", "suffix"), BOMBS, ids=[f"{k.name}{s}" for k, s in BOMBS])
 def test_a_file_that_swells_is_refused(tmp_path: Path, kind: Kind, suffix: str) -> None:
     """A file that decodes to many times its size is refused within little memory."""

@@ -621,7 +621,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         channels=tuple(channels[c] for c in ratio.argmax(axis=0)),
         ln_frequency=estimate[:n],
         ln_damping=estimate[n:],
-        cov=cov * np.outer(wider, wider),
+        cov=cov,
         snr=ratio.sum(axis=0),
         dispersion=dispersion,
         excitation=np.sqrt(strength * np.pi * f / (4 * zeta)),
@@ -630,7 +630,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         shapes=_unit_shapes(data.unit * shapes),
         lines=(),
         refused=(),
-    )
+    ).widened("unsteady", cov * np.outer(wider, wider))
     judged = [
         _incredible(modes, i, one, duration) or _outside(modes, i, one, spectrum.frequency)
         for i, one in enumerate(targets)
@@ -662,18 +662,17 @@ def _averaged(
     modes: Modes, colour: Colour, wider: FloatArray, targets: tuple[Target, ...], duration: float
 ) -> Modes:
     """Replace estimates for a white force by those averaged over its spectra."""
-    white = np.concatenate([modes.ln_frequency, modes.ln_damping])
 
     def with_mean(mean: FloatArray, cov: FloatArray) -> Modes:
         ln_f, ln_zeta = np.split(mean, 2)
-        return replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov)
+        return replace(modes.widened("coloured", cov), ln_frequency=ln_f, ln_damping=ln_zeta)
 
     cov = colour.cov * np.outer(wider, wider)
     averaged = with_mean(colour.mean, cov)
     # Which modes are found does not depend on the average: where it is not credible the estimate
     # for a white force remains, and covers both.
     lost = [_incredible(averaged, i, one, duration) is not None for i, one in enumerate(targets)]
-    back = np.where(lost * 2, white - colour.mean, 0.0)
+    back = np.where(lost * 2, modes.estimate - colour.mean, 0.0)
     averaged = with_mean(colour.mean + back, cov + np.outer(back, back))
     if colour.probability <= constants.COLOURED:
         return averaged

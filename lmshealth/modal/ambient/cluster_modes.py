@@ -133,12 +133,13 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     for a, b in ((i, j), (m + i, m + j)):
         mean[a, [a, b]] = 0.5
     half = (modes.estimate[[i, m + i]] - modes.estimate[[j, m + j]]) / 2
+    apart = np.zeros(2 * m)
+    apart[[i, m + i]] = half**2
     cov = mean @ modes.cov @ mean.T
-    cov[[i, m + i], [i, m + i]] += half**2
     ln_f, ln_zeta = np.split(mean @ modes.estimate, 2)
     flags = [f"{flag} cluster".strip() if k == i else flag for k, flag in enumerate(modes.flags)]
     common = replace(modes, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, flags=tuple(flags))
-    return replace(found, modes=common)
+    return replace(found, modes=common.widened("cluster", cov + np.diag(apart)))
 
 
 def drop_duplicates(found: list[ClusterModes]) -> list[ClusterModes]:

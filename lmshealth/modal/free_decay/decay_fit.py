@@ -13,6 +13,7 @@ from scipy.special import softmax
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, stack
 from lmshealth.modal import constants
+from lmshealth.modal.credibility import Credibility, widened
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     Evaluation,
@@ -255,6 +256,7 @@ class DecayEstimate:
 
     mean: FloatArray  # [ln f, ln ζ], (2 n_modes,)
     cov: FloatArray  # (2 n_modes, 2 n_modes)
+    credibility: tuple[Credibility, ...]  # factors of it, (n_modes,)
     # mean square of each vibration at the stops over the ambient one, (n_modes,)
     excitation: FloatArray
 
@@ -359,8 +361,10 @@ def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstima
         wide = np.linalg.cholesky(cov[np.ix_(own[pair], own[pair])])
         narrow = np.linalg.cholesky(joint[np.ix_(pair, pair)])
         scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
+    cov = scales @ joint @ scales.T
+    credibility = widened((Credibility(),) * n, "ambient-level", joint, cov)
     excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]
-    return DecayEstimate(mean, scales @ joint @ scales.T, np.array(excitation))
+    return DecayEstimate(mean, cov, credibility, np.array(excitation))
 
 
 def stationarity(found: DecayFit) -> float:

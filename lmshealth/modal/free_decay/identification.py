@@ -28,7 +28,6 @@ from lmshealth.modal.naming import assign, is_near
 from lmshealth.modal.targets import (
     Target,
     check_band,
-    choose_channels,
     choose_targets,
     limit_channels,
 )
@@ -112,7 +111,7 @@ def identify_decays(
     """
     check_band(log, band)
     log = limit_channels(log, channels)
-    used = choose_channels(log)
+    used = log.channels
     segments = select_segments(log, "settling") if segments is None else segments
     longest = max((s.stop - s.start for s in segments), default=0)
     if longest < 8:
@@ -347,7 +346,8 @@ def _accept(
     found = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
     snr = np.array([one.snr for one in found])
     best = [channels[c].name for c in snr.argmax(axis=1)]
-    modes = estimates_only(result.mean, result.cov, snr.max(axis=1), source, best)
+    own = result.mean, result.cov, snr.max(axis=1)
+    modes = estimates_only(*own, source, best, result.credibility)
     credible = [k for k, one in enumerate(found) if one.rejection is None]
     return _BandModes(source, (*poles, *found), modes.select(credible))
 

@@ -276,7 +276,8 @@ def _modes(
     ]
     if nothing is not None:
         refused.append(Refusal(log, *nothing[:2], frf.output, source="frf"))
-    found = estimates_only(fit.estimate, fit.cov, fit.snr, "frf", [frf.output] * m)
+    own = fit.estimate, fit.cov, fit.snr
+    found = estimates_only(*own, "frf", [frf.output] * m, fit.credibility)
     kept = found.select([i for i in range(m) if i not in why])
     return numbered(merge([kept], lines, (*before, *refused)))
 

@@ -7,6 +7,13 @@ from scipy.optimize import minimize_scalar
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
 from lmshealth.modal import constants
+from lmshealth.modal.credibility import (
+    Credibility,
+    dependence,
+    neighbour_correlation,
+    small_sample,
+    widened,
+)
 from lmshealth.modal.frf.rational import (
     ModelOrder,
     Ordinates,
@@ -51,6 +58,7 @@ class ResponseFit(ReadOnly):
     outliers: FloatArray
     estimate: FloatArray  # [ln f, ln ζ], (2 n_modes,)
     cov: FloatArray  # its covariance, linear unknowns marginalised, (2 n_modes, 2 n_modes)
+    credibility: tuple[Credibility, ...]  # factors of it, (n_modes,)
     noise_cov: FloatArray  # the part of it by noise alone: scatter of repeated measurements
     snr: FloatArray  # power at the resonance over noise and distortion in one line, (n_modes,)
     over_distortion: FloatArray  # the same over the distortion alone; infinite where there is none
@@ -130,16 +138,13 @@ class _State:
 
     @property
     def colour(self) -> float:
-        """Correlation of neighbouring errors where it exceeds three of its standard deviations."""
-        white = self.white
-        n = white.size
-        found = np.sum((white[1:] * white[:-1].conj()).real) / np.sum(np.abs(white) ** 2)
-        return float(found) if found > 3 / np.sqrt(2 * n) else 0.0
+        """Correlation of neighbouring errors where it is clear."""
+        return neighbour_correlation(self.white)
 
     @property
     def dependent_lines(self) -> float:
         """Number of lines that count as one independent line."""
-        return (1 + self.colour) / (1 - self.colour)
+        return dependence(self.colour)
 
     @property
     def penalty(self) -> float:
@@ -331,7 +336,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     m, n = order.n_modes, state.variance.size
     rank = np.argsort(order.theta[:m], kind="stable")
     both = paired(rank, m)
-    noise_cov, cov = _covariances(state)
+    noise_cov, cov, credibility = _covariances(state)
     f, zeta = order.modes
     centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
     peak = np.abs(solution.residues / (zeta * f / centre)) ** 2
@@ -350,6 +355,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
         outliers=np.column_stack([everything.frequency[outlying], np.abs(error)]),
         estimate=order.theta[both],
         cov=cov[np.ix_(both, both)],
+        credibility=tuple(credibility[i] for i in rank),
         noise_cov=noise_cov[np.ix_(both, both)],
         snr=(peak / np.interp(f, ordinates.frequency, level))[rank],
         over_distortion=over[rank],
@@ -360,20 +366,27 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     )
 
 
-def _covariances(state: _State) -> tuple[FloatArray, FloatArray]:
-    """Return the covariance of ``[ln f, ln ζ]`` by noise, and by noise and distortion."""
-    ordinates = state.ordinates
+def _covariances(state: _State) -> tuple[FloatArray, FloatArray, tuple[Credibility, ...]]:
+    """Return the covariance of ``[ln f, ln ζ]`` by noise, and by noise and distortion.
+
+    The factors of the second on that of a known variance and independent lines are returned, too.
+    """
+    ordinates, lines = state.ordinates, state.dependent_lines
     slope = slopes(ordinates, state.order, state.variance, state.solution)
     prior = np.eye(slope.shape[1]) / _PRIOR_STD**2
     inverse = np.asarray(np.linalg.inv(slope.T @ slope + prior), dtype=np.float64)
     if not ordinates.scatter:
-        freedom = min(_NOISE_LINES, state.variance.size)
-        by_noise = inverse * (freedom / (freedom - 2))
-        return by_noise, by_noise * state.dependent_lines
-    share = np.tile(ordinates.noise / state.variance, 2)[:, None]
-    by_noise = inverse @ (slope.T @ (share * slope) + prior) @ inverse
-    by_noise *= (ordinates.freedom - 1) / (ordinates.freedom - 2)
-    by_distortion = inverse @ (slope.T @ ((1 - share) * slope)) @ inverse
-    f, zeta = state.order.modes
-    lines = np.tile(np.sqrt(np.maximum(state.dependent_lines, 2 * zeta * f / ordinates.spacing)), 2)
-    return by_noise, by_noise * state.dependent_lines + by_distortion * np.outer(lines, lines)
+        by_noise = inverse * small_sample(min(_NOISE_LINES, state.variance.size))
+        error, cov = by_noise, by_noise * lines
+    else:
+        share = np.tile(ordinates.noise / state.variance, 2)[:, None]
+        by_noise = inverse @ (slope.T @ (share * slope) + prior) @ inverse
+        by_noise *= small_sample(ordinates.freedom, unbiased=True)
+        by_distortion = inverse @ (slope.T @ ((1 - share) * slope)) @ inverse
+        f, zeta = state.order.modes
+        own = np.tile(np.sqrt(np.maximum(lines, 2 * zeta * f / ordinates.spacing)), 2)
+        error = by_noise + by_distortion
+        cov = by_noise * lines + by_distortion * np.outer(own, own)
+    credibility = (Credibility(),) * state.order.n_modes
+    credibility = widened(credibility, "noise-estimate", inverse, error)
+    return by_noise, cov, widened(credibility, "dependent-lines", error, cov)

@@ -16,6 +16,7 @@ from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, freez
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal import constants
+from lmshealth.modal.credibility import inverse_bias
 from lmshealth.modal.frf.periods import cut_periods
 from lmshealth.modal.frf.rational import Ordinates
 
@@ -47,12 +48,11 @@ def average_noise(
 ) -> tuple[FloatArray, float]:
     """Average the power of noise over neighbours as needed; return it and its degrees of freedom.
 
-    It has ``freedom`` complex ones in each line. The inverse of a variance of ν degrees of freedom
-    is too large by ν/(ν - 1) on average, which is corrected.
+    It has ``freedom`` complex ones in each line. The bias of its inverse is corrected.
     """
     width = max(1, 2 * int(np.ceil((_FREEDOM / freedom - 1) / 2)) + 1)
     total = float(width * freedom)
-    return smooth_noise(power, np.abs(response) ** 2, width) * (total / (total - 1)), total
+    return smooth_noise(power, np.abs(response) ** 2, width) * inverse_bias(total), total
 
 
 # Complex degrees of freedom that a variance needs; few periods are supplemented by neighbours.

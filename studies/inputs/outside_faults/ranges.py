@@ -20,7 +20,7 @@ from studies.inputs.outside_faults.case import Case, Program, Seen, is_traceback
 
 KIND = "ranges"
 START = datetime(2024, 3, 1, 6, tzinfo=UTC)
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 SHIPPED = ROOT / "lmshealth" / "stage" / "descriptions"
 
 Change = Callable[[pd.DataFrame], None]

@@ -151,7 +151,7 @@ def _run(program: Program, folder: Path, logs: list[Recording]) -> tuple[dict[st
         own.write(archive / f"{k:02d}.h5", stage="M-Y", recorded_at=moment, travel_km=10.0 * k)
     done = program("run", archive, "--stage", "lms-y", "--out", folder / "out", "--epochs", "1")
     table = folder / "out" / "refused.csv"
-    rows = list(csv.DictReader(table.open())) if table.exists() else []
+    rows = csv.DictReader(table.read_text("utf-8").splitlines()) if table.exists() else ()
     return {
         row["log"]: f"{row['reason']}: {row['detail']}"
         for row in rows

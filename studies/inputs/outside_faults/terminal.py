@@ -117,7 +117,12 @@ def _identified(out: Path) -> bool:
 
     try:
         with sqlite3.connect(out / "lmshealth.sqlite") as store:
-            return bool(store.execute("SELECT count(*) FROM identified").fetchone()[0])
+            # The name of the table ends with the version of its columns.
+            query = (
+                "SELECT name FROM sqlite_master WHERE name LIKE 'identified%' AND type = 'table'"
+            )
+            names = [name for (name,) in store.execute(query)]
+            return any(store.execute(f"SELECT 1 FROM {name}").fetchone() for name in names)
     except sqlite3.Error:
         return False
 

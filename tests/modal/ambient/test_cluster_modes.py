@@ -70,6 +70,8 @@ def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     half = (fit.modes.estimate[1] - fit.modes.estimate[0]) / 2
     own = (fit.modes.cov[0, 0] + fit.modes.cov[1, 1] + 2 * fit.modes.cov[0, 1]) / 4
     assert kept.modes.cov[0, 0] == pytest.approx(own + half**2)
+    cause, factor = kept.modes.credibility[0].factors[-1]
+    assert (cause, factor) == ("cluster", pytest.approx(np.sqrt(1 + half**2 / own)))
     assert kept.modes.cov.shape == (2, 2)
 
 

@@ -91,6 +91,21 @@ def test_bursts_widen_the_intervals_and_are_flagged() -> None:
     assert (wider < 2.4).all()
 
 
+def test_the_factors_lead_from_a_steady_white_force_to_what_is_published(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Their product is the ratio to the standard deviation of a likelihood without allowances."""
+    log = forced(3, bursts(0.3))
+    found = identify(log, STAGE)
+    (unsteady, coloured) = found.credibility[0].factors
+    assert (unsteady.cause, coloured.cause) == ("unsteady", "coloured")
+    assert 1.4 < unsteady.value < 2.4
+    monkeypatch.setattr(cluster_fit, "unsteadiness", lambda *_: Unsteadiness(1.0, 0))
+    monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
+    ratio = np.sqrt(found.cov[0, 0] / identify(log, STAGE).cov[0, 0])
+    assert found.credibility[0].total == pytest.approx(ratio)
+
+
 def test_excitation_is_the_level_of_the_mode() -> None:
     """Root mean square of the noise-free acceleration; four times the force, four times as much."""
     weak, strong = (identify(forced(4, np.full(24_000, i), 1e-3), STAGE) for i in (1.0, 16.0))

@@ -69,6 +69,20 @@ def test_excitation_compares_a_stop_with_the_ambient_response() -> None:
     assert result.excitation[0] == pytest.approx(50, rel=0.5)
 
 
+def test_the_average_over_ambient_levels_is_a_factor() -> None:
+    """It leads from the standard deviation at the mean level to the published one."""
+    found = fitted(stops(4, [Ring(60.37, 0.01, ambient=0.1)], n_stops=3, noise=1e-3))
+    result = estimate(found)
+    (factor,) = result.credibility[0].factors
+    free = np.array([0, 1, 3, 4])
+    mean, _ = average_ambient(found.likelihood, found.p, 0, free)
+    held = found.p.copy()
+    held[2] = mean[2]
+    at_level = invert(maximise(found.likelihood, held, free), free)
+    assert factor.cause == "ambient-level"
+    assert factor.value == pytest.approx(np.sqrt(result.cov[0, 0] / at_level[0, 0]))
+
+
 @pytest.mark.slow
 def test_two_channels_know_more_than_one() -> None:
     """A second channel with the same noise shrinks the standard deviation by about √2."""

@@ -68,6 +68,9 @@ def test_modes_of_the_band_are_found_and_no_others(clean: ResponseFit) -> None:
 def test_covariance_by_noise_alone_is_all_there_is(clean: ResponseFit) -> None:
     """Without distortion the two covariances are one, positive definite."""
     np.testing.assert_allclose(clean.cov, clean.noise_cov)
+    for one in clean.credibility:
+        assert [factor.cause for factor in one.factors] == ["noise-estimate", "dependent-lines"]
+        assert one.total == pytest.approx(np.sqrt(15 / 14))  # variances of 16 degrees of freedom
     assert np.linalg.eigvalsh(clean.cov).min() > 0
 
 
@@ -152,6 +155,8 @@ def test_errors_that_neighbours_share_widen_all() -> None:
     fit = fit_response(Ordinates(LINES, ordinates.given, answer, noise, 1e6, periodic=True))
     # Correlation 0.8 of neighbours; those of a random input would not show it.
     assert fit.colour > 0
+    expected = np.sqrt((1 + fit.colour) / (1 - fit.colour))
+    assert [one.total for one in fit.credibility] == pytest.approx([expected] * 2, rel=1e-3)
     assert (np.diag(fit.cov) > 2 * np.diag(fit.noise_cov)).all()
 
 
