@@ -168,6 +168,23 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
     assert repr(many).splitlines()[-1] == "… and 3 more"
 
 
+def test_columns_of_results_are_those_of_their_tables() -> None:
+    """Frames have columns of the table of their result, in its order, or further ones of it."""
+    draws = np.random.default_rng(1).lognormal(-0.2, 0.02, (40, 2))
+    for name, result in (
+        ("modes", two_modes()),
+        ("track", track(history())),
+        ("health", make_health(draws)),
+        ("prognosis", make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4))),
+    ):
+        table, found = TABLES[name], list(result.to_frame())
+        own = [column for column in found if column in table.names]
+        further = {one.names.partition("<")[0] for one in table.further} - {""}
+        assert all(c.startswith(tuple(further)) for c in found if c not in own)
+        if name != "prognosis":  # its frame has the probabilities in another order
+            assert own == [column for column in table.names if column in own]
+
+
 def test_results_are_plotted_by_name() -> None:
     """Every result draws itself in given Axes; a name that it lacks is refused with its own."""
     rng = np.random.default_rng(2)
