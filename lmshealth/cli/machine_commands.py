@@ -82,11 +82,9 @@ def track(table: Path, **given: Any) -> None:
         refused += outlier_refusals(history, found)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
-        rows["track"] += tables.track_rows(found, smoothed)
-        rows["track_cov"] += tables.track_cov_rows(found)
-        rows["effects"] += tables.effects_rows(found)
-        rows["events"] += tables.events_rows(found)
-        rows["refused"] += tables.refused_rows(refused)
+        own = tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
+        for name in _TABLES:
+            rows[name] += own[name]
         notes += _notes(history, refused)
         views.print_track(found)
     print_notes(notes)
@@ -164,7 +162,7 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
-    rows = [row for health in found for row in tables.health_rows(health)]
+    rows = [row for health in found for row in tables.to_rows(health.to_columns())]
     _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
 
 

@@ -18,7 +18,7 @@ from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
 from lmshealth.report.assessment import Life, ParameterHealth, Summary
-from lmshealth.report.tables import events_rows, health_rows, track_rows
+from lmshealth.report.tables import events_rows, to_rows, track_rows
 from lmshealth.report.text import (
     GAP,
     count,
@@ -353,7 +353,7 @@ def _consistency(track: Track) -> str:
 
 def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
-    rows = health_rows(health)[-len(health.parameters) :]
+    rows = to_rows(health.to_columns())[-len(health.parameters) :]
     for row in rows:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
         if not row["converged"]:

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from lmshealth._private.tables import TABLES, Row
-from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.modal.frf.identification import FrfReading
@@ -83,12 +82,9 @@ def machine_tables(assessment: Assessment) -> dict[str, list[Row]]:
     """Return the rows of the tables of one machine without those of its logs, by table."""
     rows: dict[str, list[Row]] = {}
     if assessment.track is not None:
-        rows["track"] = track_rows(assessment.track)
-        rows["track_cov"] = track_cov_rows(assessment.track)
-        rows["effects"] = effects_rows(assessment.track)
-        rows["events"] = events_rows(assessment.track)
+        rows |= track_tables(assessment.track)
     if assessment.health is not None:
-        rows["health"] = health_rows(assessment.health)
+        rows["health"] = to_rows(assessment.health.to_columns())
     if assessment.prognosis is not None:
         life = summarise_life(assessment.prognosis, assessment.stage, assessment.calibration)
         rows["prognosis"] = prognosis_rows(life, assessment.service())
@@ -173,25 +169,25 @@ def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
     return to_rows(columns)
 
 
+def track_tables(track: Track, smoothed: Smoothed | None = None) -> dict[str, list[Row]]:
+    """Return the rows of a track, its covariances, effects other than wear and events, by table."""
+    modes, cov = track.modes, TABLES["track_cov"]
+    return {
+        "track": track_rows(track, smoothed),
+        "track_cov": [
+            cov.row(track.stage, moment, modes[a], modes[b], own[a, b])
+            for moment, own in zip(track.recorded_at, track.drift_cov, strict=True)
+            for a, b in combinations(range(len(modes)), 2)
+        ],
+        "effects": TABLES["effects"].rows_of(track.effects, stage=track.stage),
+        "events": events_rows(track),
+    }
+
+
 def to_rows(columns: Row) -> list[Row]:
     """Return rows of columns of one length."""
     values = zip(*(np.asarray(own).tolist() for own in columns.values()), strict=True)
     return [dict(zip(columns, one, strict=True)) for one in values]
-
-
-def track_cov_rows(track: Track) -> list[Row]:
-    """Return the covariances of the drifts of one epoch, one row per pair of modes."""
-    table, modes = TABLES["track_cov"], track.modes
-    return [
-        table.row(track.stage, moment, modes[a], modes[b], cov[a, b])
-        for moment, cov in zip(track.recorded_at, track.drift_cov, strict=True)
-        for a, b in combinations(range(len(modes)), 2)
-    ]
-
-
-def effects_rows(track: Track) -> list[Row]:
-    """Return effects other than wear, one row per mode and cause."""
-    return TABLES["effects"].rows_of(track.effects, stage=track.stage)
 
 
 def events_rows(track: Track) -> list[Row]:
@@ -205,11 +201,6 @@ def events_rows(track: Track) -> list[Row]:
         )
         for one in track.events
     ]
-
-
-def health_rows(health: Health) -> list[Row]:
-    """Return a posterior of the health parameters, one row per epoch and parameter."""
-    return to_rows(health.to_columns())
 
 
 def prognosis_rows(
