@@ -11,6 +11,7 @@ from typing import Any, TypeVar
 
 import click
 import pandas as pd
+from msgspec.structs import replace
 
 from lmshealth._private.files import write_text
 from lmshealth._private.tables import TABLES, Row
@@ -71,6 +72,7 @@ _PLOT = click.option(
     help="Sample rate of logs that state neither times nor a rate.",
 )
 @_OVERWRITE
+@options.LAYOUTS
 @options.MOST_MEMORY
 @options.ALLOW_FUTURE
 @click.pass_context
@@ -86,10 +88,12 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
     how = {name: given[name] for name in ("rate", "max_memory", "latest")}
-    text, guesses = propose(logs[0], **how)
+    layouts = options.layouts()
+    text, guesses = propose(logs[0], **how, layouts=layouts)
     rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
     terminal.print_table(f"Columns of {logs[0]}", rows, 3)
-    ctx.params |= {"logs": logs, "columns": decode(text.encode(), ColumnMap)}
+    columns = replace(decode(text.encode(), ColumnMap), layouts=layouts)
+    ctx.params |= {"logs": logs, "columns": columns}
     first: list[Log] = []
 
     paths = {shown(path): path for path in logs}
@@ -97,7 +101,7 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     def tried(log: Log) -> Row:
         first[:] = first or [log]
         path, own = paths[log.name], log.metadata
-        moment, remark = moment_of(path, log)
+        moment, remark = moment_of(path, log, layouts)
         return {
             "file": path.absolute(),
             "stage": own.stage or path.absolute().parent.name,
@@ -135,6 +139,8 @@ def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[
     """Name the commands that read a log by its proposed map."""
     by = {one.kind: one.name for one in reversed(log.channels)}
     what = f"{shlex.quote(log.name)} --columns {shlex.quote(str(map_file))}"
+    if folder := options.layouts_folder():
+        what += f" --layouts {shlex.quote(str(folder))}"
     steps = [f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")]
     if "current" in by:
         output = by.get("acceleration", by.get("displacement"))

@@ -21,7 +21,7 @@ from lmshealth.io.manifest import find_logs
 from lmshealth.io.reading import read_log
 from lmshealth.testing import check_format
 from tests.io.conftest import META, signals, write, write_uff
-from tests.io.formats.test_vendor_files import rtx, trace
+from tests.io.formats.test_instruments import rtx, trace
 
 X = np.random.default_rng(2).normal(0, 1, 64)
 
