@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from functools import cached_property
-from itertools import count, pairwise
+from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
@@ -394,18 +394,18 @@ def _guesses(columns: list[_Column]) -> list[Guess]:
         ]
     kept: set[str] = set()
     for k, guess in enumerate(guesses):
-        if guess.target:
-            names = (_numbered(guess.target, n) for n in count(1))
-            name = next(name for name in names if name not in kept)
-            guesses[k] = guess._replace(target=name)
-            kept.add(name)
+        target, name = guess.target, guess.target
+        for n in range(2, len(guesses) + 2):
+            if name not in kept or not target:
+                break
+            name = _numbered(target, n)
+        guesses[k] = guess._replace(target=name)
+        kept.add(name)
     return guesses
 
 
 def _numbered(target: str, n: int) -> str:
-    """Write the name of the n-th signal of a name, from the second on with n before the unit."""
-    if n == 1:
-        return target
+    """Write the name of a further signal of the same name, with its number before the unit."""
     try:
         stem = parse_column(target).name
     except Unusable:
