@@ -357,7 +357,12 @@ def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) ->
     seen: list[str] = []
     page.on("console", lambda message: seen.append(message.text))
     page.on("pageerror", lambda error: seen.append(str(error)))
-    page.on("dialog", lambda dialog: (seen.append(dialog.message), dialog.dismiss()))
+
+    def dismiss(dialog: Any) -> None:
+        seen.append(dialog.message)
+        dialog.dismiss()
+
+    page.on("dialog", dismiss)
     outside = ("data:", path.as_uri())
     page.on(
         "request",

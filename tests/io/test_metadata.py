@@ -128,6 +128,7 @@ def test_scalars_of_pandas_and_numpy_become_plain_or_are_refused():
     assert type(same.recorded_at) is datetime and same.recorded_at == MOMENT
     assert fingerprint(same) == fingerprint(plain)
     zoned = Metadata(recorded_at=pd.Timestamp(MOMENT).tz_convert("Europe/Berlin"))
+    assert zoned.recorded_at is not None
     assert zoned.recorded_at.isoformat() == "2026-03-01T09:30:00+01:00"
 
 

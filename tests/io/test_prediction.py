@@ -33,6 +33,7 @@ def test_the_expectation_is_that_of_the_joint_normal_distribution():
     """Of an autoregressive process it equals the conditional mean by its covariance matrix."""
     x = resonance(300_000)
     model = fit_prediction(x, NONE)
+    assert model is not None
     unknown = np.array([ORDER, ORDER + 1, ORDER + 5])
     part = x[: 3 * ORDER]
     found = model.expected(part.copy(), unknown)

@@ -5,6 +5,7 @@ import hashlib
 import os
 import subprocess
 import sys
+from datetime import timedelta
 from pathlib import Path
 
 import h5py
@@ -41,7 +42,8 @@ def test_formats_hold_the_same_log(make, file):
     log, other = read_log(path), read_log(make("other.h5"))
     assert log.metadata == other.metadata
     assert log.metadata.travel == 123500.0
-    assert log.metadata.recorded_at.utcoffset().total_seconds() == 3600
+    moment = log.metadata.recorded_at
+    assert moment is not None and moment.utcoffset() == timedelta(hours=1)
     assert log.sample_rate == 2000.0 and log.pieces == ((0, 400),) and log.refused == ()
     assert [c.name for c in log.channels] and {c.name for c in log.channels} == {
         "delta_e",
@@ -50,7 +52,7 @@ def test_formats_hold_the_same_log(make, file):
     values = {c.name: c.values for c in log.channels}
     for channel in other.channels:
         np.testing.assert_allclose(values[channel.name], channel.values, rtol=1e-12)
-    assert 1e-8 < values["delta_e"].std() < 1e-7
+    assert 1e-8 < values["delta_e"][:].std() < 1e-7
     np.testing.assert_allclose(log.reference_velocity, 0.1)
     assert log.digest == content_digest(path) == hashlib.sha256(path.read_bytes()).hexdigest()
 
@@ -267,8 +269,10 @@ def test_velocity_from_position(make):
     time[250:] += 5 / 2000
     columns = {"reference_velocity_mm_s": None, "reference_position_mm": 50 * time, "time_s": time}
     log = read_log(make(columns=columns))
+    velocity = log.reference_velocity
+    assert velocity is not None
     for start, stop in log.pieces:
-        np.testing.assert_allclose(log.reference_velocity[start:stop], 0.05)
+        np.testing.assert_allclose(velocity[start:stop], 0.05)
 
 
 def test_useless_set_point(make):
@@ -287,7 +291,7 @@ def test_too_few_samples(make, n):
 def test_arrays_are_read_only(make):
     """A log cannot be changed by who reads it."""
     with pytest.raises(ValueError, match="read-only"):
-        read_log(make()).channels[0].values[0] = 1.0
+        read_log(make()).channels[0].values[:][0] = 1.0
 
 
 def test_the_limit_of_memory_is_an_option(make):

@@ -65,7 +65,7 @@ def test_a_plant_seed_draws_the_machine(tmp_path):
     first, second, nominal = tables
     assert set(first["plant_seed"]) == {1} and set(second["plant_seed"]) == {2}
     assert first["plant_block_stiffness"][0] != second["plant_block_stiffness"][0]
-    assert not [column for column in nominal if column.startswith("plant_")]
+    assert not [column for column in nominal if str(column).startswith("plant_")]
     for option in ("--plant-seed", "--seed"):
         wrong = CliRunner().invoke(cli, [*common, option, "-1", "--out", str(tmp_path / "x")])
         assert wrong.exit_code == 2

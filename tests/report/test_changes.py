@@ -57,8 +57,8 @@ def summary(state: dict[str, Any]) -> Summary:
     own = dict(state)
     by, remaining = own.pop("service_by"), own.pop("remaining")
     health = [
-        ParameterHealth(name, True, True, 1.0, *values, None, np.nan)
-        for name, values in own.pop("health").items()
+        ParameterHealth(name, True, True, 1.0, low, median, high, None, np.nan)
+        for name, (low, median, high) in own.pop("health").items()
     ]
     life = None
     if remaining is not None:

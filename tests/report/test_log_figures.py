@@ -77,7 +77,7 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
     """The level of white noise, the interval of a mode, a line in its channel, a candidate."""
     whole = draw(modes_figure(log, read(log, some_modes(0.01, 62.0)), band=(40.0, 90.0)))
     first, second, _ = whole.axes  # then the singular values
-    curves: dict[str, Any] = {line.get_label(): line for line in first.lines}
+    curves: dict[str, Any] = {str(line.get_label()): line for line in first.lines}
     x, y = np.asarray(first.lines[0].get_data(), dtype=float)
     away = np.abs(x - 50) > 2
     assert y[away].mean() == pytest.approx(1.0, abs=5 / np.sqrt(away.sum() * 4))

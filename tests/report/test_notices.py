@@ -67,8 +67,9 @@ def test_gauges_verdict_and_service_agree_where_methods_disagree(make: Maker, po
     assert good.health is not None and good.prognosis is not None
     by_laws = np.quantile(good.prognosis.health[:, 0], (0.05, 0.95))
     chains = 0.5 * (good.health.chains / np.median(good.health.chains[-1, ..., 0])) ** power
-    low = replace(good, health=replace(good.health, chains=np.clip(chains, 0.05, 0.6)))
-    own = np.quantile(low.health.samples[-1, :, 0], (0.05, 0.95))
+    health = replace(good.health, chains=np.clip(chains, 0.05, 0.6))
+    low = replace(good, health=health)
+    own = np.quantile(health.samples[-1, :, 0], (0.05, 0.95))
     assert own[1] < by_laws[0] and codes(low) >= {"methods-disagree"}
     assert good.service().kind != "now"  # by the laws alone
     gauge, service = summarise(low, low.service()).health[0], low.service()
@@ -114,6 +115,7 @@ def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) ->
     good = make()
     assert good.health is not None and good.prognosis is not None
     preload, mount = good.stage.description.parameter
+    assert preload.limit is not None
     limit = structs.replace(preload.limit, below=5e3 * preload.limit.below)
     in_newton = structs.replace(preload, baseline=5e3, unit="N", limit=limit)
     described = structs.replace(good.stage.description, parameter=(in_newton, mount))

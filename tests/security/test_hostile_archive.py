@@ -267,6 +267,7 @@ def test_what_acts_is_noticed(tmp_path: Path) -> None:
     guards.plant(url)
     engine = create_engine(url)
     raw = engine.raw_connection()
+    assert raw.driver_connection is not None
     raw.driver_connection.executescript(
         f"CREATE TABLE t_1 (name TEXT); INSERT INTO t_1 VALUES ('{hostile.MACHINES[0]}');"
     )

@@ -15,7 +15,7 @@ SINES = ((3, 2.5e-6, 0.4), (117, 4e-8, -2.9), (250, 1e-6, 1.5))
 def sines(n: int, mean: float = -1.2e-7) -> np.ndarray:
     """Sum cosines of known amplitude and phase with whole periods in the record."""
     t = np.arange(n)
-    return mean + sum(a * np.cos(2 * np.pi * k * t / n + p) for k, a, p in SINES)
+    return np.asarray(mean + sum(a * np.cos(2 * np.pi * k * t / n + p) for k, a, p in SINES))
 
 
 @pytest.mark.parametrize("n", [4000, 4001])

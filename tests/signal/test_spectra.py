@@ -317,7 +317,7 @@ def parts(*lengths: int, velocity: float = 0.1) -> list[Segment]:
 
 def averaged(values: np.ndarray | Stored, segments: list[Segment]) -> tuple[Spectrum, ...]:
     """Transform an acceleration."""
-    channel = Channel("x", "acceleration", values)  # type: ignore[arg-type]
+    channel = Channel("x", "acceleration", values)
     return tuple(of_channel(s) for s in cross_spectra([channel], segments, RATE, 500.0))
 
 

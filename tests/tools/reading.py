@@ -48,8 +48,8 @@ def analysed(folder: Path, name: str) -> Path:
     life, seed = LIVES[name]
     logs, out = folder / name, folder / f"{name}-result"
     call("models", "simulate", "lms-y", "--life", life, "--logs", 40, "--seconds", 20,
-         "--seed", seed, "--out", logs)  # fmt: skip
-    call("lmshealth", "run", logs, "--stage", "lms-y", "--out", out)
+         "--seed", seed, "--out", logs, quick=False)  # fmt: skip
+    call("lmshealth", "run", logs, "--stage", "lms-y", "--out", out, quick=False)
     return out
 
 

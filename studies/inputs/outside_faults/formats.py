@@ -48,7 +48,7 @@ def record(seed: int = 0, rate: float = RATE, seconds: float = SECONDS_OF_LOG) -
 
 def table(path: Path, names: str, *columns: object, end: str = "", sep: str = ",") -> Path:
     """Write columns of numbers or text, with a line of names where there is one."""
-    rows = (sep.join(map(str, row)) for row in zip(*columns, strict=True))  # type: ignore[call-overload]
+    rows = (sep.join(map(str, row)) for row in zip(*columns, strict=True))
     path.write_text("\n".join([*([names] if names else []), *rows, end]), encoding="utf-8")
     return path
 

@@ -106,10 +106,13 @@ def test_properties_are_metadata(tmp_path):
     root = {"stage": "demo-Y", "travel_km": 12.5, "baseline": True}
     log = read_log(write(tmp_path / "log.tdms", channel, root=root))
     assert (log.metadata.stage, log.metadata.travel) == ("demo-Y", 12_500.0)
-    assert log.metadata.baseline and log.metadata.recorded_at.isoformat().endswith("07:30:00+00:00")
+    recorded_at = log.metadata.recorded_at
+    assert recorded_at is not None and recorded_at.isoformat().endswith("07:30:00+00:00")
+    assert log.metadata.baseline
     never = ("x", NOISE, {"unit_string": "g", "wf_start_time": np.datetime64(0, "us"), **RATE})
     path = write(tmp_path / "b.tdms", never, root={**root, "recorded_at": "2026-01-01T00:00:00Z"})
-    assert read_log(path).metadata.recorded_at.year == 2026
+    recorded_at = read_log(path).metadata.recorded_at
+    assert recorded_at is not None and recorded_at.year == 2026
 
 
 def test_velocity_is_metadata(tmp_path):
@@ -366,7 +369,8 @@ def test_a_channel_of_moments_is_the_time(tmp_path, name):
     path = write(tmp_path / "a.tdms", (name, stamps, {}), ("a", NOISE, {"unit_string": "g"}))
     log = read_log(path)
     assert log.sample_rate == pytest.approx(2000.0)
-    assert log.metadata.recorded_at.isoformat() == "2026-03-01T08:00:00+00:00"
+    moment = log.metadata.recorded_at
+    assert moment is not None and moment.isoformat() == "2026-03-01T08:00:00+00:00"
     mapped = ColumnMap(columns={"time_ms": name, "acc_b_g": "a"})
     assert read_log(path, columns=mapped).sample_rate == pytest.approx(2000.0)
     rated = write(tmp_path / "b.tdms", (name, stamps[:1].repeat(2000), {}), ("a", NOISE, clock()))

@@ -54,7 +54,8 @@ def test_twincat_scope(tmp_path, delimiter, decimal, compressed):
     assert [channel.name for channel in log.channels] == ["acc_acc_one", "acc_acc_two"]
     np.testing.assert_allclose(log.channels[0].values, X, atol=1e-12)
     np.testing.assert_allclose(log.channels[1].values, 1e-3 * Y, atol=1e-12)
-    assert log.sample_rate == 1000 and log.metadata.recorded_at.year == 2023
+    moment = log.metadata.recorded_at
+    assert log.sample_rate == 1000 and moment is not None and moment.year == 2023
     assert [(r.channel, r.reason) for r in log.refused] == [("acc_slow_m_s2", "time")]
 
 

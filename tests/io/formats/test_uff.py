@@ -1,8 +1,6 @@
 """UFF58: names, units and rates from the headers; damage that pyuff passes over."""
 
-import importlib.util
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,19 +14,13 @@ from lmshealth.io.refusal import Unusable
 from tests.io.conftest import write_uff
 from tests.io.handmade import uff_set
 
-_SPEC = importlib.util.spec_from_file_location(
-    "_writers", Path(__file__).parents[1] / "conftest.py"
-)
-_WRITERS = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(_WRITERS)
-
 NOISE = np.random.default_rng(0).normal(size=(3, 300))
 
 
 def write(path, *, n=2, **entries):
     """Write noise in up to three records."""
     names = ("feed", "pitch", "yaw")[:n]
-    return _WRITERS.write_uff(path, dict(zip(names, NOISE, strict=False)), **entries)
+    return write_uff(path, dict(zip(names, NOISE, strict=False)), **entries)
 
 
 def refused(path, reason, *words, **options):
@@ -103,7 +95,7 @@ def test_functions_of_frequency(tmp_path):
 
 def test_complex_record(tmp_path):
     """Complex values are no samples."""
-    path = _WRITERS.write_uff(tmp_path / "log.uff", {"feed": NOISE[0] + 1j})
+    path = write_uff(tmp_path / "log.uff", {"feed": NOISE[0] + 1j})
     refused(path, "columns", "no time record")
 
 

@@ -381,7 +381,8 @@ def test_derivatives_of_modes_are_those_of_their_response() -> None:
     at, h = np.log([120.0, 0.02]), 1e-5
 
     def moved(*step: float) -> np.ndarray:
-        return response(*np.exp(at + step), F)
+        frequency, zeta = np.exp(at + step)
+        return response(frequency, zeta, F)
 
     found = receptance(np.array([[120.0]]), np.array([[0.02]]), F)[:, 0]
     np.testing.assert_allclose(found[0], moved(0, 0), rtol=1e-12)

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lmshealth._private.arrays import stack
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     TransientLikelihood,
     pole_columns,
-    stack,
     transform_decays,
     transient,
     unit_level,

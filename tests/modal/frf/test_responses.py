@@ -170,9 +170,9 @@ def test_a_record_has_the_coherence_of_its_noise() -> None:
 def test_the_difference_is_undone() -> None:
     """Signals that were differenced give the amplitudes of those that were not."""
     given, answer = periodic(np.random.default_rng(7), QUIET, SIZE, 5)
-    differenced = [np.roll(x, 1) - 2 * x + np.roll(x, -1) for x in (given, answer)]
+    changes, moved = (np.roll(x, 1) - 2 * x + np.roll(x, -1) for x in (given, answer))
     _, plain = from_periods(pair(given, answer), BAND, SIZE)
-    _, undone = from_periods(pair(*differenced, lag=1), BAND, SIZE)
+    _, undone = from_periods(pair(changes, moved, lag=1), BAND, SIZE)
     np.testing.assert_allclose(np.abs(undone.answer), np.abs(plain.answer), rtol=1e-6)
 
 

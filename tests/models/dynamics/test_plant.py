@@ -140,7 +140,7 @@ def test_retuned_loop_keeps_its_margins(name, rigid):
     s = 2j * np.pi * hertz
     gain = controller(tuning)(s, squeeze=True) * current_loop(tuning)(s, squeeze=True)
     if rigid:
-        plant = 1 / (stage.moving_mass.value * s**2)
+        plant: np.ndarray = 1 / (stage.moving_mass.value * s**2)
     else:
         structure = build_structure(stage)
         point, encoder = stage.motor_point.value, sensor_rows(stage, structure)["delta_e"]

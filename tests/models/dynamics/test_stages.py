@@ -1,6 +1,7 @@
 """Tests of the stages' numbers."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from models.errors import BadParameter, UnknownServo, UnknownStage
 
 def test_every_number_has_unit_and_source():
     """No number of a stage or of an elastic part is without unit or source."""
-    owners = [*STAGES.values(), *FULL_STAGES.values()]
+    owners: list[Any] = [*STAGES.values(), *FULL_STAGES.values()]
     for stage in FULL_STAGES.values():
+        assert stage.flexible is not None
         owners += [stage.flexible, *stage.flexible.parts]
     plain = {"name", "identity_suffix", "flexible", "parts"}
     plain |= {"body", "along", "bends", "parity", "moves", "encoder"}
@@ -66,6 +68,7 @@ def test_unknown_source_is_refused():
 def test_impossible_elastic_part_is_refused(bad):
     """An elastic part whose stiffness is not positive raises."""
     flexible = FULL_STAGES["lms-x-full"].flexible
+    assert flexible is not None
     part = replace(flexible.parts[0], stiffness=Number(bad, "N m²", "our choice"))
     with pytest.raises(BadParameter, match=r"stiffness is .* a positive number"):
         replace(flexible, parts=(part,))

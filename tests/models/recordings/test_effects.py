@@ -33,7 +33,9 @@ GROUND = [NOISE_INPUTS.index(f"ground_{axis}") for axis in "xyz"]
 def changed(effects, position, seed=0):
     """Return what effects make of noise of ones (noise input, time)."""
     white = np.ones((len(NOISE_INPUTS), position.size))
-    changes(STAGE, effects, position, np.random.default_rng(seed), 20000.0)(0, white)
+    change = changes(STAGE, effects, position, np.random.default_rng(seed), 20000.0)
+    assert change is not None
+    change(0, white)
     return white
 
 
@@ -77,6 +79,7 @@ def test_hits_come_at_random_and_chunks_join():
     position, parts = np.zeros(400000), np.ones((len(NOISE_INPUTS), 400000))
     whole = changed(blows, position, seed=3)
     change = changes(STAGE, blows, position, np.random.default_rng(3), 20000.0)
+    assert change is not None
     for start in range(0, 400000, 70000):
         change(start, parts[:, start : start + 70000])
     np.testing.assert_array_equal(whole, parts)

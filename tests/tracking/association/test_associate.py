@@ -25,7 +25,7 @@ from lmshealth.tracking.association.associate import (
     associate_log,
     measurements_of,
 )
-from lmshealth.tracking.association.hypotheses import Hypotheses
+from lmshealth.tracking.association.hypotheses import Hypotheses, extend
 
 Array = NDArray[np.float64]
 STD_F, STD_ZETA = 1e-3, 0.1
@@ -554,7 +554,6 @@ def test_chances_are_those_of_all_sequences_of_assignments(
         seen.append(extended.probabilities(2))
         return extended
 
-    extend = module.extend
     monkeypatch.setattr(module, "extend", watched)
     rng = np.random.default_rng(seed)
     ln_f = 4.8 + np.array([-1e-3, 1e-3]) * rng.uniform(0.5, 2) + STD_F * rng.standard_normal((4, 2))
