@@ -105,12 +105,12 @@ def smallest_losses(name: str, parameter: str, counts: tuple[int, ...]) -> Row:
 
 def refused(name: str, parameter: str) -> Row:
     """Return the answer of planning to a parameter that the modes do not constrain."""
-    said = None
+    message = None
     try:
         plan(load_stage(name), parameter, 0.05)
     except BadQuestion as error:
-        said = str(error)
-    return {"stage": name, "parameter": parameter, "message": said}
+        message = str(error)
+    return {"stage": name, "parameter": parameter, "message": message}
 
 
 def checks(name: str, parameter: str, trials: int) -> list[Row]:
