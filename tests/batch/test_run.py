@@ -724,7 +724,7 @@ def test_only_what_is_stale_is_assessed_again(
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
 
-    def again(**options: int) -> list[str]:
+    def again(**options: Any) -> list[str]:
         assessed.clear()
         run(logs, [modes_only], out, Settings(**options))
         return list(assessed)

@@ -233,7 +233,7 @@ def test_a_frozen_server_is_not_waited_for(
         put_in(store, "before", reading())
         with pytest.raises(StoreError, match="has not answered for 1 s; its results are kept"):
             _ask(store, "SELECT pg_sleep(20)")
-        [frozen] = [row[0] for row in _ask(store, "SELECT pg_backend_pid()")]
+        [frozen] = [int(str(row[0])) for row in _ask(store, "SELECT pg_backend_pid()")]
         begun = time.monotonic()
         try:
             os.kill(frozen, signal.SIGSTOP)

@@ -123,7 +123,7 @@ def test_scalars_of_pandas_and_numpy_become_plain_or_are_refused():
     plain = Metadata("A", MOMENT, 5e3, {"temperature_c": 21.0}, baseline=True)
     same = Metadata(
         np.str_("A"), pd.Timestamp(MOMENT), np.float64(5e3), {"temperature_c": np.float64(21)},
-        baseline=np.bool_(True),
+        baseline=np.bool_(True),  # type: ignore[arg-type]
     )  # fmt: skip
     assert type(same.recorded_at) is datetime and same.recorded_at == MOMENT
     assert fingerprint(same) == fingerprint(plain)

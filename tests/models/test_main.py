@@ -79,7 +79,8 @@ def test_a_drawn_machine_has_a_drawn_life(tmp_path):
         folder = ["--plant-seed", "4", "--out", str(tmp_path / name)]
         assert CliRunner().invoke(cli, [*common, *more, *folder]).exit_code == 0
         tables.append(pd.read_csv(tmp_path / name / "truth.csv"))
-    pd.testing.assert_frame_equal(*tables)
+    one, other = tables
+    pd.testing.assert_frame_equal(one, other)
     wrong = CliRunner().invoke(cli, [*common, "--out", str(tmp_path / "x")])
     assert wrong.exit_code == 2
     assert "--life is missing" in wrong.output and "--plant-seed" in wrong.output

@@ -106,7 +106,7 @@ def unchained(history: History, stage: Stage) -> LifePosterior:
 def forked(unchained: LifePosterior) -> LifePosterior:
     """Make two ways of it, the second with the same draws backwards, with checks of their own."""
     (way,) = unchained.scenarios
-    steps = np.arange(way.scenario.n_dim)
+    steps = np.arange(way.scenario.n_dim, dtype=float)
     ways = tuple(
         replace(
             way,

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -102,7 +103,11 @@ def test_settings_of_the_process_do_not_reach_a_page() -> None:
         ax.legend()
 
     expected = plots.svg(draw, salt="one")
-    others = {"axes.linewidth": 5.0, "legend.fontsize": 30, "figure.constrained_layout.w_pad": 1.0}
+    others: Any = {
+        "axes.linewidth": 5.0,
+        "legend.fontsize": 30,
+        "figure.constrained_layout.w_pad": 1.0,
+    }
     with matplotlib.rc_context(others):
         assert plots.svg(draw, salt="one") == expected
         assert matplotlib.rcParams["axes.linewidth"] == others["axes.linewidth"]
@@ -250,7 +255,9 @@ def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, tra
     waterfall = make_waterfall(history)
     assert plots.plot_waterfall(ax, waterfall, history, track) is ax
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
-    shown = np.ma.filled(mesh.get_array(), np.nan)[:, ::2].T
+    levels = mesh.get_array()
+    assert levels is not None
+    shown = np.ma.filled(levels, np.nan)[:, ::2].T
     np.testing.assert_array_equal(shown, waterfall.level)
     x = np.asarray(mesh.get_coordinates())[0, :, 0].reshape(-1, 2)
     km = history.travel / 1000

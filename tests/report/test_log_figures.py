@@ -209,9 +209,13 @@ def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -
     other = replace(reading, fitted=tuple(fitted), sought=sought)
     again = draw(modes_figure(log, other, band=(40.0, 90.0)))
     (first,), (second,) = (
-        [one.get_ydata() for one in figure.axes[0].lines if one.get_label() == "fit"]
+        [
+            np.asarray(one.get_ydata(), dtype=float)
+            for one in figure.axes[0].lines
+            if one.get_label() == "fit"
+        ]
         for figure in (whole, again)
-    )
-    assert np.isfinite(np.asarray(first, dtype=float)).any()
+    )  # fmt: skip
+    assert np.isfinite(first).any()
     np.testing.assert_allclose(first, second, rtol=0.05)
     assert any("wanders" in str(patch.get_label()) for patch in again.axes[0].patches)

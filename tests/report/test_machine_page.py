@@ -85,8 +85,8 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
     plan = f"Order and plan a preload adjustment before {by.isoformat()}; until then a log"
     assert plan in first.replace("\u2011", "-")
     assert "Guide preload over 1 600 km: 1" in plain(first) and "limit of 60 %" in plain(first)
-    late = [probability_before(assessment.prognosis, by + timedelta(7 * k)) for k in (1, 8)]
     assert assessment.prognosis is not None
+    late = [probability_before(assessment.prognosis, by + timedelta(7 * k)) for k in (1, 8)]
     for weeks, risk in zip(("1 week", "8 weeks"), late, strict=True):
         day = (by + timedelta(7 * int(weeks[0]))).isoformat()
         shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -41,7 +42,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     assert health is not None and prognosis is not None and track is not None
     last = np.arange(len(health.recorded_at)) == len(health.recorded_at) - 1
     low = replace(health, chains=health.chains * 0.5)
-    wrong = {
+    wrong: dict[str, dict[str, Any]] = {
         "names-in-doubt": {"doubt": "The names of the modes are in doubt."},
         "filter-inconsistent": {"track": replace(track, nis=track.nis * 9)},
         "not-converged": {"health": replace(health, converged=health.converged & ~last)},
@@ -99,7 +100,7 @@ def test_methods_that_overlap_but_differ_about_the_verdict_are_pooled(make: Make
     good = make()
     assert good.health is not None and good.prognosis is not None
     rng = np.random.default_rng(1)
-    chains = [0.91, 0.99] * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
+    chains = np.array([0.91, 0.99]) * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
     draws = good.prognosis.health * 0 + 0.885 * np.exp(0.01 * rng.standard_normal((4000, 1)))
     draws[:, 1] = 0.99
     edge = replace(good, health=replace(good.health, chains=chains),

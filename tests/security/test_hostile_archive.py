@@ -64,7 +64,16 @@ def attack(folder: Path, url: str, password: str, *, every: int) -> dict[str, li
     links = _links(folder, out)
     guards.plant(url)
     before = guards.snapshot(folder, [out])
-    words = ["--stage", folder / "stage.toml", "--store", url, "--workers", "1", "--epochs", "1"]
+    words = [
+        "--stage",
+        str(folder / "stage.toml"),
+        "--store",
+        url,
+        "--workers",
+        "1",
+        "--epochs",
+        "1",
+    ]
     done = [lmshealth("run", logs, *words, "--out", out, cwd=folder)]
     if every == 1:
         words = ["--store", url, "--workers", "1"]

@@ -33,7 +33,7 @@ def test_sums_of_sines_read_their_amplitudes_and_phases(n: int) -> None:
 
 def test_half_the_sample_rate_reads_its_amplitude() -> None:
     """A cosine at every second sample counts fully: amplitude 3, mean square 9."""
-    found = decompose(3.0 * (-1.0) ** np.arange(100), RATE)
+    found = decompose(3.0 * (-1.0) ** np.arange(100.0), RATE)
     assert found.amplitude[-1] == pytest.approx(3.0, rel=1e-12)
     assert found.power[-1] == pytest.approx(9.0, rel=1e-12)
 

@@ -100,9 +100,7 @@ def test_a_joint_prior_is_cut_to_its_box(joint: JointPrior) -> None:
     for j, (_, book) in enumerate(PAIRS):
         below, upto = book.cdf(np.exp([joint.low[j], joint.high[j]]))
 
-        def cut(
-            values: np.ndarray, book: Any = book, a: float = below, b: float = upto
-        ) -> np.ndarray:
+        def cut(values: Any, book: Any = book, a: float = below, b: float = upto) -> Any:
             return np.clip((book.cdf(values) - a) / (b - a), 0, 1)
 
         assert stats.kstest(x[:, j], cut).pvalue > 1e-4
@@ -142,7 +140,9 @@ def test_a_joint_density_is_that_of_the_logarithms(joint: JointPrior) -> None:
 
 def test_shared_parameters_stand_once(joint: JointPrior) -> None:
     """What two machines share has the box that both allow; their own parameters stay apart."""
-    other = JointPrior(("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), *np.log([[1, 0.5], [9, 2]]))
+    other = JointPrior(
+        ("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), np.log([1, 0.5]), np.log([9, 2])
+    )
     both = combine_priors([joint, other], [(0, 1, 2), (1, 3)])
     assert both.names == ("a", "b", "c", "d")
     np.testing.assert_allclose(np.exp(both.low), [1.0, 1.0, 0.4, 0.5])

@@ -94,7 +94,7 @@ def test_a_plug_in_is_a_format(tmp_path, plugged, caplog):
     with caplog.at_level(logging.ERROR):
         logs = [read_log(path) for path in find_logs(tmp_path).logs]
     assert [log.sample_rate for log in logs] == [1000, 2000]
-    np.testing.assert_allclose(logs[0].channels[0].values, 9.80665 * X)
+    np.testing.assert_allclose(logs[0].channels[0].values[:], 9.80665 * X)
     said = [record.getMessage() for record in caplog.records]
     broken = {"missing": "No module", "number": "is a int", "taken": ".my.csv", "again": "taken"}
     assert len(said) == len(broken)
@@ -123,7 +123,9 @@ def test_formats_with_metadata_conform(tmp_path, file):
     columns = {name: values for name, values in signals().items() if name != "time_s"}
     path = write(tmp_path / file, columns, META)
     known = {} if file.endswith(("tdms", "mat")) else META
-    check_format(registry.format_of(path), path, columns, metadata=known)
+    found = registry.format_of(path)
+    assert found is not None
+    check_format(found, path, columns, metadata=known)
 
 
 def test_formats_with_a_map_conform(tmp_path):
@@ -171,7 +173,7 @@ def _of_nothing(path, columns, max_memory):
     return load_raw(path, columns, max_memory)
 
 
-WRONG = {
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "suffix": ({"suffixes": (".RAW", ".raw")}, "lower case"),
     "name": ({"name": ""}, "printable"),
     "sniff": ({"sniff": lambda head: True}, "return False"),

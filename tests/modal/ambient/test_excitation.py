@@ -76,7 +76,7 @@ def test_without_transforms_a_force_counts_as_steady() -> None:
         replace(s, transforms=None)
         for s in cross_spectra(log.channels, [Segment(0, 24_000, 0.0)], RATE, 150.0)
     ]
-    expected = [np.tile(np.eye(2), (s.frequency.size, 1, 1)) + 0j for s in spectra]
+    expected = [np.tile(np.eye(2, dtype=complex), (s.frequency.size, 1, 1)) for s in spectra]
     found = unsteadiness(spectra, [s.free for s in spectra], expected, 100.0, 0.02, np.ones(2))
     assert found == (1.0, 0)
 

@@ -115,7 +115,7 @@ def test_overhang_is_a_chain_of_masses(bends, parity):
         for side in (1, -1):
             point = (root[0], root[1] + side * at * reach, root[2])
             moved = np.eye(3)[bends] * clamped_bending(at) * (parity if side < 0 else 1)
-            expected += np.sqrt(mass) / 800 * (point_motion(point, centre).T @ moved)
+            expected += np.sqrt(mass) / 800 * (point_motion(point, tuple(centre)).T @ moved)
     np.testing.assert_allclose(mode.momentum, expected, atol=1e-4)
     heavier = overhang_mode(part, centre, 1.2)
     assert heavier.omega == pytest.approx(mode.omega / np.sqrt(1.2))

@@ -88,7 +88,8 @@ def test_impossible_mass_or_stiffness_is_refused(field, bad):
     with pytest.raises(
         BadParameter, match=f"{field} is .* needed: (a positive number|finite numbers)"
     ):
-        replace(STAGES["lms-y"], **{field: Number(bad, unit, "our choice")})
+        changed: dict[str, Any] = {field: Number(bad, unit, "our choice")}
+        replace(STAGES["lms-y"], **changed)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), 1e3])
@@ -137,9 +138,9 @@ def test_payload_adds_its_mass_matrix(name, added):
         build_structure(stage, Condition(added_payload=a)).bodies[PLATFORM] for a in (0.0, added)
     )
     x, y, z = stage.payload_box.value
-    radii = tuple(float(np.hypot(*edges) / 12**0.5) for edges in ((y, z), (x, z), (x, y)))
+    a, b, c = (float(np.hypot(*edges) / 12**0.5) for edges in ((y, z), (x, z), (x, y)))
     centre = (*bare.centre[:2], stage.payload_height.value)
-    block = replace(bare, mass=1.0, centre=centre, radii=radii)
+    block = replace(bare, mass=1.0, centre=centre, radii=(a, b, c))
     expected = about_origin(bare) + added * about_origin(block)
     np.testing.assert_allclose(about_origin(loaded), expected, rtol=1e-12, atol=1e-12)
 

@@ -148,9 +148,8 @@ def test_refuses_what_no_stage_has(wrong):
 @pytest.mark.slow
 def test_effects_leave_the_rest_of_a_seed_alone():
     """The noise of a seed is the same with effects: gusts and hits have a stream of their own."""
-    seconds = {"seconds": 0.5, "rng": None}
     logs = [
-        record(STAGE, **{**seconds, "rng": np.random.default_rng(5)}, effects=effects)
+        record(STAGE, seconds=0.5, rng=np.random.default_rng(5), effects=effects)
         for effects in (LINEAR, Effects(floor=Floor(wander=0.0, gusts_per_s=0.0)), FULL)
     ]
     assert all(tuple(log.columns) == COLUMNS for log in logs)
