@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from lmshealth._private.tables import TABLES
 from lmshealth.cli.main import main
 from tests.signals import write_archive, write_archive_stage
 
@@ -269,3 +270,51 @@ def test_the_check_notices_a_broken_contract(output: Path, tmp_path: Path, compl
     shutil.copytree(output, out)
     BREAKS[complaint](out)
     assert any(complaint in item for item in complaints(out)), complaints(out)
+
+
+def _moment(cell: str) -> None:
+    if datetime.fromisoformat(cell).tzinfo is None:
+        raise ValueError
+
+
+# What reads a cell of a column with this type; all others are numbers with a unit.
+READERS: dict[str, Callable[[str], object]] = {
+    "text": str,
+    "moment": _moment,
+    "day": date.fromisoformat,
+    "flag": {"True": True, "False": False}.__getitem__,
+    "count": int,
+}
+
+
+def wrong_types(name: str, rows: list[Row]) -> list[str]:
+    """List the cells of a table that are not of the type of their column."""
+    units, found = TABLES[name].units, []
+    for row in rows:
+        for column, cell in row.items():
+            unit = units.get(column, "1")
+            try:
+                if cell:
+                    READERS.get(unit, float)(cell)
+            except (KeyError, ValueError):
+                found.append(f"{name}.{column} ({unit}): {cell!r}")
+    return found
+
+
+@pytest.mark.slow
+def test_cells_have_the_types_of_their_columns(output: Path) -> None:
+    """Every cell of every file is a number, a moment, a day or a flag as specified."""
+    assert [one for name in TABLES for one in _wrong_of_file(output / f"{name}.csv")] == []
+
+
+def _wrong_of_file(path: Path) -> list[str]:
+    return wrong_types(path.stem, read(path)[1]) if path.is_file() else []
+
+
+def test_a_cell_of_another_type_is_found() -> None:
+    """The check reports a word in a column of numbers, and a moment without its zone."""
+    right = {"recorded_at": "2026-01-02T03:04:05+00:00", "travel_km": "1.5", "declared": "True"}
+    assert wrong_types("events", [right]) == []
+    for column, cell in (("travel_km", "far"), ("recorded_at", "2026-01-02"), ("declared", "1")):
+        (found,) = wrong_types("events", [right | {column: cell}])
+        assert found.startswith(f"events.{column} ")

@@ -11,11 +11,11 @@ import pytest
 from matplotlib.figure import Figure
 
 from lmshealth import examples
+from lmshealth._private.tables import TABLES
 from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
-from lmshealth.report.tables import COLUMNS
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.track import track
@@ -143,8 +143,8 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
         (log, 1000, "time_s acc_x_m_s2 acc_y_m_s2"),
         (two_modes(), 2, "mode source channel frequency_hz"),
         (lives, 3, "stage log recorded_at travel_km mode source frequency_hz"),
-        (followed, 3, COLUMNS["track"]),
-        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), 2, COLUMNS["health"]),
+        (followed, 3, " ".join(TABLES["track"].names)),
+        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), 2, " ".join(TABLES["health"].names)),
         (make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4)), 2, "parameter limit"),
     ):
         assert 1 <= len(repr(result).splitlines()) <= 8
@@ -166,6 +166,23 @@ def test_results_are_short_in_print_and_long_as_tables() -> None:
         cov=np.tile(1e-6 * np.eye(16), (3, 1, 1)),
     )
     assert repr(many).splitlines()[-1] == "… and 3 more"
+
+
+def test_columns_of_results_are_those_of_their_tables() -> None:
+    """Frames have columns of the table of their result, in its order, or further ones of it."""
+    draws = np.random.default_rng(1).lognormal(-0.2, 0.02, (40, 2))
+    for name, result in (
+        ("modes", two_modes()),
+        ("track", track(history())),
+        ("health", make_health(draws)),
+        ("prognosis", make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4))),
+    ):
+        table, found = TABLES[name], list(result.to_frame())
+        own = [column for column in found if column in table.names]
+        further = {one.names.partition("<")[0] for one in table.further} - {""}
+        assert all(str(c).startswith(tuple(further)) for c in found if c not in own)
+        if name != "prognosis":  # its frame has the probabilities in another order
+            assert own == [column for column in table.names if column in own]
 
 
 def test_results_are_plotted_by_name() -> None:

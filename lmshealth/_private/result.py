@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from lmshealth._private.tables import MOMENTS
+
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
@@ -40,8 +42,8 @@ class Result:
         import pandas as pd
 
         table = pd.DataFrame(self.to_columns())
-        if "recorded_at" in table:
-            table["recorded_at"] = pd.to_datetime(table["recorded_at"], utc=True, format="ISO8601")
+        for name in table.columns.intersection(MOMENTS):
+            table[name] = pd.to_datetime(table[name], utc=True, format="ISO8601")
         return table
 
     def plot(self, what: str = "", ax: Axes | None = None) -> Axes:

@@ -12,13 +12,14 @@ from pathlib import Path
 
 from lmshealth._private.files import replacing, write_text
 from lmshealth._private.serialize import pack, unpack
+from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch.assess import LogRows, reason_if_failed
 from lmshealth.batch.status import Status, coming_states, make_status, points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
-from lmshealth.report.tables import COLUMNS, Row, csv_text, join_csv, machine_tables
+from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT
 
 # matplotlib's settings are shared by the threads of a Dask worker.
@@ -102,7 +103,7 @@ def write_tables(
     """
     parts = [tables[machine] for machine in ("", *machines) if machine in tables]
     with ExitStack() as stack:
-        for name in COLUMNS:
+        for name in RUN_TABLES:
             target = stack.enter_context(replacing(folder / f"{name}.csv"))
             own = [pack(csv_text(name, [])), *(part[name] for part in parts if name in part)]
             target.writelines(join_csv(own, partial(unpack, kind=str)))

@@ -9,11 +9,12 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from lmshealth._private.tables import Row
 from lmshealth.batch import constants
 from lmshealth.health.verdict import NO_HEALTH, degraded_words, undeclared_events
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.notices import notices
-from lmshealth.report.tables import Row, prognosis_rows
+from lmshealth.report.tables import prognosis_rows
 from lmshealth.stage.constants import INFORMED
 
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]

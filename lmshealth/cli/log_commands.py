@@ -3,7 +3,7 @@
 import math
 import re
 import shlex
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -11,8 +11,10 @@ from typing import Any, TypeVar
 
 import click
 import pandas as pd
+from msgspec.structs import replace
 
 from lmshealth._private.files import write_text
+from lmshealth._private.tables import TABLES, Row
 from lmshealth._private.toml import decode
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import BadLog, BadStage
@@ -31,7 +33,6 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
 from lmshealth.report import log_figures, tables
-from lmshealth.report.tables import Row
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
@@ -71,6 +72,7 @@ _PLOT = click.option(
     help="Sample rate of logs that state neither times nor a rate.",
 )
 @_OVERWRITE
+@options.LAYOUTS
 @options.MOST_MEMORY
 @options.ALLOW_FUTURE
 @click.pass_context
@@ -86,10 +88,12 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     if there and not given["overwrite"]:
         raise click.UsageError(f"{', '.join(there)} would be replaced; set --overwrite or --out.")
     how = {name: given[name] for name in ("rate", "max_memory", "latest")}
-    text, guesses = propose(logs[0], **how)
+    layouts = options.layouts()
+    text, guesses = propose(logs[0], **how, layouts=layouts)
     rows = [{"column": g.source, "read as": g.target or "-", "why": g.why} for g in guesses]
     terminal.print_table(f"Columns of {logs[0]}", rows, 3)
-    ctx.params |= {"logs": logs, "columns": decode(text.encode(), ColumnMap)}
+    columns = replace(decode(text.encode(), ColumnMap), layouts=layouts)
+    ctx.params |= {"logs": logs, "columns": columns}
     first: list[Log] = []
 
     paths = {shown(path): path for path in logs}
@@ -97,7 +101,7 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
     def tried(log: Log) -> Row:
         first[:] = first or [log]
         path, own = paths[log.name], log.metadata
-        moment, remark = moment_of(path, log)
+        moment, remark = moment_of(path, log, layouts)
         return {
             "file": path.absolute(),
             "stage": own.stage or path.absolute().parent.name,
@@ -135,6 +139,8 @@ def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[
     """Name the commands that read a log by its proposed map."""
     by = {one.kind: one.name for one in reversed(log.channels)}
     what = f"{shlex.quote(log.name)} --columns {shlex.quote(str(map_file))}"
+    if folder := options.layouts_folder():
+        what += f" --layouts {shlex.quote(str(folder))}"
     steps = [f"next: lmshealth modes {what}" + (f" --band {band[0]} {band[1]}" if band else "")]
     if "current" in by:
         output = by.get("acceleration", by.get("displacement"))
@@ -218,10 +224,13 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     found, lost = _each(ctx, estimate)
     rows = [row for one in found for row in tables.modes_rows(one)]
     refused = [refusal for one in found for refusal in one.modes.refused]
-    content["modes"], content["lines"] = rows, _line_rows((r.log, r.modes.lines) for r in found)
+    content["modes"] = rows
+    content["lines"] = [row for r in found for row in tables.lines_rows(r.log, r.modes.lines)]
     content["std_factors"] = [row for r in found for row in tables.factor_rows(r.log, r.modes)]
-    pairs = [(r.log, one) for r in found if stage for one in compare(r.modes, stage)]
-    if off := [{"log": log, **one._asdict()} for log, one in pairs]:
+    off: list[Row] = []
+    for one in found if stage else ():
+        off += TABLES["off_description"].rows_of(compare(one.modes, stage), log=one.log)
+    if off:
         content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
@@ -348,7 +357,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     growth = find_growth(magnitudes)
     of_logs = [(own.log, line) for own in found for line in own.lines]
     rows = tables.magnitudes_rows(magnitudes, growth, of_logs)
-    lines = _line_rows((own.log, own.lines) for own in found)
+    lines = [row for own in found for row in tables.lines_rows(own.log, own.lines)]
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
@@ -434,7 +443,9 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         "modes": rows,
         "fit": [tables.fit_row(log.name, own) for log, own in found],
         "frf": [row for log, own in found for row in tables.frf_rows(log.name, own)],
-        "lines": _line_rows((log.name, own.modes.lines) for log, own in found),
+        "lines": [
+            row for log, own in found for row in tables.lines_rows(log.name, own.modes.lines)
+        ],
         "std_factors": [row for e in estimates for row in tables.factor_rows(e.log, e.modes)],
     }
     refused = [refusal for _, own in found for refusal in own.modes.refused]
@@ -481,17 +492,11 @@ def _print(
     """
     if ctx.params["style"] == "csv":
         name, rows = next(iter(content.items()))
-        table = tables.frame({**tables.COLUMNS, **tables.LOG_COLUMNS}[name], rows)
-        click.echo(table.to_csv(index=False), nl=False)
+        click.echo(tables.csv_text(name, rows), nl=False)
     elif ctx.params["style"] == "json":
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     elif found:
         show(tables.refused_rows(refused))
-
-
-def _line_rows(lines: Iterable[tuple[str, Any]]) -> list[Row]:
-    """Return the spectral lines of logs, with the log in the first column."""
-    return [{"log": log, **row} for log, own in lines for row in tables.lines_rows(own)]
 
 
 def _each(

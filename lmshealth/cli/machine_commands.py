@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from numpy.linalg import LinAlgError
 
 from lmshealth._private.files import write_draws, write_text
+from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
@@ -27,7 +28,6 @@ from lmshealth.prognosis.remaining_life import prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
-from lmshealth.report.tables import Row
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision, load_stage
 from lmshealth.tracking.history import History, missing_mode_notices
@@ -82,17 +82,15 @@ def track(table: Path, **given: Any) -> None:
         refused += outlier_refusals(history, found)
         if given["smoothed"]:
             smoothed = smooth(accepted_estimates(history, found), found, stage)
-        rows["track"] += tables.track_rows(found, smoothed)
-        rows["track_cov"] += tables.track_cov_rows(found)
-        rows["effects"] += tables.effects_rows(found)
-        rows["events"] += tables.events_rows(found)
-        rows["refused"] += tables.refused_rows(refused)
+        own = tables.track_tables(found, smoothed) | {"refused": tables.refused_rows(refused)}
+        for name in _TABLES:
+            rows[name] += own[name]
         notes += _notes(history, refused)
         views.print_track(found)
     print_notes(notes)
     for name in _TABLES:
         if targets[name]:
-            _write(targets[name], name, rows[name])
+            write_text(targets[name], tables.csv_text(name, rows[name]))
 
 
 def _reading(given: dict[str, Any]) -> dict[str, Any]:
@@ -164,7 +162,7 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
         found, lost = _infer_machines(table, given, progress)
     for health in found:
         views.print_health(health)
-    rows = [row for health in found for row in tables.health_rows(health)]
+    rows = [row for health in found for row in tables.to_rows(health.to_columns())]
     _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
 
 
@@ -316,10 +314,6 @@ def _prognose_machines(
     return found, lost
 
 
-def _write(target: Path, name: str, rows: list[Row]) -> None:
-    write_text(target, tables.frame(tables.COLUMNS[name], rows).to_csv(index=False))
-
-
 def _finish(
     ctx: click.Context, name: str, rows: list[Row], draws: Mapping[str, Any], lost: Sequence[str]
 ) -> None:
@@ -327,7 +321,7 @@ def _finish(
     print_errors(lost)
     if not rows:
         ctx.exit(1)
-    _write(ctx.params["out"], name, rows)
+    write_text(ctx.params["out"], tables.csv_text(name, rows))
     if ctx.params["posterior"]:
         trees = [posterior.to_arviz() for posterior in draws.values()]
         write_draws(ctx.params["posterior"], list(draws), trees)

@@ -13,11 +13,12 @@ from typing import Any
 
 import click
 from loky import cpu_count
+from msgspec.structs import replace
 
 from lmshealth.batch.constants import NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
-from lmshealth.io.column_map import load_columns
+from lmshealth.io.column_map import ColumnMap, Layout, load_columns, load_layouts
 from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, MAX_MEMORY
 from lmshealth.io.log import MOMENTS
 from lmshealth.signal.segments import PARTS
@@ -137,11 +138,38 @@ out_option = partial(click.option, "--out", required=True, type=OUT)
 store_option = partial(
     click.option, "--store", envvar="LMSHEALTH_STORE", show_envvar=True, metavar="URL"
 )
+
+
+def layouts() -> tuple[Layout, ...]:
+    """Load the layouts of ``--layouts``."""
+    folder = layouts_folder()
+    return load_layouts(folder) if folder else ()
+
+
+def layouts_folder() -> Path | None:
+    """Return the folder of ``--layouts``."""
+    folder: Path | None = click.get_current_context().meta.get(_LAYOUTS)
+    return folder
+
+
+def _columns(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
+    """Load a column map, with the layouts of ``--layouts``; None without both."""
+    own = layouts()
+    if path is None and not own:
+        return None
+    return replace(ColumnMap() if path is None else load_columns(path), layouts=own)
+
+
+_LAYOUTS = f"{__name__}.layouts"
+LAYOUTS = eager_option(
+    "--layouts",
+    type=FOLDER,
+    metavar="FOLDER",
+    callback=lambda ctx, option, folder: ctx.meta.update({_LAYOUTS: folder}),
+    help="Folder of layouts (*.toml), by which text of further programs is read.",
+)
 _COLUMNS = click.option(
-    "--columns",
-    type=click.Path(),
-    callback=lambda ctx, option, path: path if path is None else load_columns(path),
-    help="Column map of the export.",
+    "--columns", type=click.Path(), callback=_columns, help="Column map of the export."
 )
 MOST_MEMORY = click.option(
     "--max-memory",
@@ -213,8 +241,8 @@ PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stag
 
 
 def reading_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add the options by which logs are read: --columns, --max-memory (bytes), --allow-future."""
-    return _COLUMNS(MOST_MEMORY(ALLOW_FUTURE(command)))
+    """Add the options by which logs are read: a map, layouts, memory in bytes, later dates."""
+    return _COLUMNS(LAYOUTS(MOST_MEMORY(ALLOW_FUTURE(command))))
 
 
 def alert_options(command: Callable[..., Any]) -> Callable[..., Any]:

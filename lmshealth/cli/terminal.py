@@ -14,9 +14,8 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from string import Formatter
 from textwrap import wrap
-from typing import TYPE_CHECKING, Any, TextIO
+from typing import Any, TextIO
 
 import click
 import msgspec
@@ -25,18 +24,15 @@ from rich.cells import cell_len
 from rich.console import Console, RenderableType
 from rich.table import Table
 
+from lmshealth._private.tables import TABLES, TEXTS, Row
 from lmshealth.cli import streams
 from lmshealth.io.log import WARNINGS
-from lmshealth.report.text import GAP, fixed, number, percent, plain
-
-if TYPE_CHECKING:  # so that --help does not import pandas and scipy
-    from lmshealth.report.tables import Row
+from lmshealth.report.text import GAP, cells, first_field, plain, view_columns
 
 # Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
 _WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000
 _NARROWEST = 12  # columns of a terminal: the text of a narrower one is as wide as this
 PATIENCE = 2.0  # seconds without a progress bar
-_REFUSED = "log {log} | channel {channel} | mode {mode} | reason {reason} | detail {detail}"
 # Names up to this length are not split in a table that is too wide; the last text becomes as
 # narrow as the other.
 _NAME, _SHORT = 16, 10
@@ -126,36 +122,12 @@ def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons, and apart from them warnings about what is used."""
     for title, in_part in (("Refused", False), ("Used in part", True)):
         if own := [row for row in rows if _is_warning(row) == in_part]:
-            print_table(title, cells(_REFUSED, short_names(own)), 5)
+            print_view(title, "refused", short_names(own))
 
 
 def _is_warning(row: Row) -> bool:
     # Whole logs are refused for the same reasons, without a channel.
     return row["reason"] in WARNINGS and bool(row["channel"])
-
-
-class _Numbers(Formatter):
-    """Format strings with numbers of `lmshealth.report.text`; a missing one is a dash.
-
-    ``n`` is for significant digits, ``%`` for a share in percent, ``p`` for one without the sign.
-    """
-
-    def format_field(self, value: Any, spec: str) -> str:
-        if value is None or value != value:  # NaN
-            return "–"
-        if spec.endswith("n"):
-            return number(value, int(spec[1:-1]))
-        if spec.endswith("p"):
-            return fixed(100 * value, int(spec[1:-1]))
-        return percent(value, int(spec[1:-1])) if spec.endswith("%") else format(value, spec)
-
-
-def cells(columns: str, rows: Iterable[Row]) -> list[dict[str, str]]:
-    """Format the cells of a table with columns ``heading {key:format}``, separated by bars."""
-    split = [column.partition("{") for column in columns.split("|")]
-    forms = {head.strip(): (start + rest).strip() for head, start, rest in split}
-    fill = _Numbers().vformat
-    return [{head: fill(form, (), row) for head, form in forms.items()} for row in rows]
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +184,23 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
     with console.capture() as captured:
         console.print(table)
     click.echo(captured.get(), nl=False)
+
+
+def print_view(
+    title: str,
+    table: str,
+    rows: Sequence[Row],
+    view: str = "terminal",
+    headings: Mapping[str, str | None] | None = None,
+) -> None:
+    """Print rows of a table of `TABLES` by one of its views, some under other headings.
+
+    A column under the heading None is left out.
+    """
+    spec = TABLES[table]
+    columns = view_columns(spec.shown[view], headings)
+    is_text = [spec.units.get(first_field(form)) in TEXTS for form in columns.values()]
+    print_table(title, cells(columns, rows), [*is_text, False].index(False))
 
 
 def _fitting(columns: Sequence[_Column], room: int) -> list[int] | None:

@@ -5,22 +5,22 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
 
+from lmshealth._private.tables import TABLES, Row
 from lmshealth.cli.terminal import (
-    cells,
     print_line,
     print_refused,
     print_table,
     print_text,
+    print_view,
     short_names,
 )
 from lmshealth.health.results import Health
 from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
 from lmshealth.report.assessment import Life, ParameterHealth, Summary
-from lmshealth.report.tables import Row, health_rows, track_rows
+from lmshealth.report.tables import events_rows, to_rows, track_rows
 from lmshealth.report.text import (
     GAP,
-    change,
     count,
     day,
     fixed,
@@ -31,7 +31,7 @@ from lmshealth.report.text import (
     percent,
     probability,
     probability_range,
-    signed,
+    service_text,
     spell,
     time_left,
     travel_left,
@@ -40,80 +40,6 @@ from lmshealth.report.text import (
 from lmshealth.tracking.track import Track
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
-_HINDRANCES = {
-    "too-short": ("log too short", "its modes cannot be identified."),
-    "baseline": ("baseline too short", "more or longer baseline logs are needed."),
-    "parameters": ("hidden", "other parameters change the modes alike; track further modes."),
-}
-_FLAGS = {
-    "resolution-limited": "segments too short for the damping.",
-    "at-bound": "at the end of the search; check the description.",
-    "loose-fit": "the residual scatters more than noise, and the standard deviations may be too "
-    "small: spectral lines, further modes or unsteady operation; it is about the fit, not bolts.",
-    "unsteady": "its excitation varies over time, which the standard deviations include.",
-    "coloured": "its excitation has no flat spectrum, which the standard deviations include.",
-    "cluster": "one estimate for two modes that the data do not separate.",
-    "levels": "a channel is coarsely quantised or lacks levels; see below.",
-    "rate": "the sample rate is in doubt, and with it all frequencies; see below.",
-    "doubtful-name": "a resonance that no description has may be this mode: describe it.",
-}
-
-# Columns of the tables, as `cells` reads them.
-_MODES = (
-    "log {log} | mode {mode} | channel {channel} | frequency Hz {frequency} | "
-    "damping % {damping_ratio:.2p} ± {damping_ratio_std:.2p} | SNR {snr:.3n} | flags {flags}"
-)
-_OFF = (
-    "log {log} | mode {mode} | declared Hz {declared_hz:.3f} | found Hz {found_hz:.3f} | "
-    "off % {off} | declared damping % {declared_damping_ratio:.2p} | "
-    "found damping % {found_damping_ratio:.2p}"
-)
-_SHAPES = "log {log} | mode {mode} | channel {channel} | amplitude {size:.3f} | phase ° {phase}"
-_ERROR = (
-    "mm/s {velocity_mm_s:.3n} | s {duration_s:.3n} | min {min_um:.3n} | max {max_um:.3n} | "
-    "std {std_um:.3n} | mean {mean_um:.3n}"
-)
-_STRONGEST = (
-    "number {n_harmonics} | max µm {max_magnitude_um:.3n} | at Hz {strongest_hz:.4n} | "
-    "bandwidth Hz {bandwidth_hz:.4n} | share {share_explained:.1%}"
-)
-_ABOVE_FLOOR = (
-    "number {n_above_floor} | bandwidth Hz {bandwidth_above_floor_hz:.4n} | "
-    "share {share_explained_above_floor:.1%}"
-)
-_LINES = (
-    "channel {channel} | kind {kind} | Hz {frequency_hz:.2f} | largest mm/s² {largest:.3n} | "
-    "in logs {n_logs}"
-)
-_STAGE_MODES = (
-    "mode {mode} | tracked {answer} | Hz {frequency_hz:.1f} | "
-    "search band {searched_low_hz:.0f}-{searched_high_hz:.0f} | map Hz {map_hz:.1f} | "
-    "at limits {map_at_limits_hz:.1f} | map error {surrogate_error_ln_f:.1e} | "
-    "drift std {logs_reach_ln_f:.1e}"
-)
-_COVERAGE = (
-    "parameter {parameter} | baseline {baseline:g} | limit {limit:g} | "
-    "prior 90 % {prior_q05:.3g}-{prior_q95:.3g} | map {map_low:.3g}-{map_high:.3g} | "
-    "prior outside {outside:.1%}"
-)
-_IDENTIFIABILITY = (
-    "parameter {parameter} | prior {prior_std_ln:.1%} | change {change_std_ln:.1%} | "
-    "value {logs_std_ln:.1%} | endless {endless_logs_std_ln:.1%} | "
-    "informed {informed:.1%} | {answer}"
-)
-_PLAN = (
-    "s per log {seconds_per_log:g} | logs {n_logs} | power, 1 log {power_of_one_log:.1%} | "
-    "loss, 1 log {smallest_loss_of_one_log:.1%} | loss, N logs {smallest_loss:.1%} | "
-    "std of value {value_std_ln:.1%}"
-)
-_TRACK = (
-    "mode {mode} | frequency Hz {frequency_hz:.2f} ± {frequency_std_hz:.2f} | drift {drift} | "
-    "damping ratio {damping}"
-)
-_HEALTH = (
-    "parameter {parameter} | median {median:.3f} | 90 % interval {interval} | "
-    "informed {informed:.0%} | prior × 2 {prior} | ESS {ess:.0f} | R-hat {r_hat:.3f}"
-)
 
 
 # --- Single logs ---
@@ -128,17 +54,18 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] 
         if std >= 1:
             row["frequency"] = f"{number(frequency, 4)} ± {number(std, 2)}"
     if rows:
-        print_table("Modes (± one standard deviation)", cells(_MODES, shown), 3)
+        print_view("Modes (± one standard deviation)", "modes", shown)
         for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
-            print_text(f"{flag}: {_FLAGS[flag]}")
+            print_text(f"{flag}: {TABLES['modes'].values['flags'][flag]}")
     else:
         print_text("No modes found.")
-    shown = short_names(off, rows)
-    for row in shown:
-        row["off"] = signed(100 * (row["found_hz"] / row["declared_hz"] - 1), 1)
     if off:
+        shown = [
+            row | {"off": 100 * (row["found_hz"] / row["declared_hz"] - 1)}
+            for row in short_names(off, rows)
+        ]
         title = "Warning: the description differs; a mode may have a wrong name"
-        print_table(title, cells(_OFF, shown), 2)
+        print_view(title, "off_description", shown)
         print_text(
             "A new machine agrees with its description: correct it, or describe the modes that it "
             "lacks. Compare a worn machine with its baseline."
@@ -159,8 +86,7 @@ def print_shapes(rows: Sequence[Row], pairs: Sequence[Row]) -> None:
                 phase = row[f"phase_deg_{channel}"]
                 shapes.append(row | {"channel": channel, "size": amplitude, "phase": round(phase)})
     if shapes:
-        title = "Mode shapes (accelerations relative to the largest)"
-        print_table(title, cells(_SHAPES, shapes), 3)
+        print_view("Mode shapes (accelerations relative to the largest)", "shapes", shapes)
     mac = {
         (pair["log"], *modes): pair["mac"]
         for pair in pairs
@@ -199,17 +125,15 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     step = max(1, -(-len(frf) // constants.TERMINAL_LINES))
     gain = "gain" if fit["method"] == "measured" else "gain (SI)"
     lines = [
-        {
-            "Hz": f"{row['frequency_hz']:.5g}",
-            gain: f"{row['gain']:.4g} ± {row['gain_std']:.2g}",
-            "phase °": f"{math.degrees(row['phase_rad']):.1f}",
-            "coherence": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
-            "fit": f"{row['fit_gain']:.4g}",
+        row
+        | {
+            "phase": math.degrees(row["phase_rad"]),
+            "seen": "" if math.isnan(row["coherence"]) else f"{row['coherence']:.4f}",
         }
         for row in frf[step // 2 :: step]
     ]
     title = f"Response of {fit['output']} to {fit['input']}, {len(lines)} of {len(frf)} lines"
-    print_table(title, lines, 0)
+    print_view(title, "frf", lines, headings={"gain": gain})
     n = fit["n_averages"]
     noise = "its noise is unknown and taken from the residual of the fit."
     if math.isfinite(fit["chi_square"]):
@@ -238,17 +162,14 @@ def print_error(rows: Sequence[Row], harmonics: Sequence[Row], refused: Sequence
     """Print the following error: statistics and strongest harmonics."""
     if rows:
         rows, harmonics = short_names(rows), short_names(harmonics, rows)
-        several = len({row["channel"] for row in rows}) > 1
-        names = "log {log} | channel {channel} | " if several else "log {log} | "
-        for title, columns in (
-            ("Following error (µm)", _ERROR),
-            ("Strongest harmonics", _STRONGEST),
-            (f"Those above {rows[0]['floor_nm']:g} nm", _ABOVE_FLOOR),
+        alone = len({row["channel"] for row in rows}) == 1
+        for title, view in (
+            ("Following error (µm)", "statistics"),
+            ("Strongest harmonics", "strongest"),
+            (f"Those above {rows[0]['floor_nm']:g} nm", "above_floor"),
         ):
-            print_table(title, cells(names + columns, rows), 2 if several else 1)
-        print_text(
-            "bandwidth: highest minus lowest frequency; share: of the variance they explain."
-        )
+            print_view(title, "error", rows, view, {"channel": None} if alone else {})
+        print_text(TABLES["error"].legend)
         if harmonics:
             _print_harmonics(rows, harmonics)
     print_refused(refused)
@@ -272,12 +193,7 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
         own = [row for row in rows if (row["stage"], row["channel"]) == (stage, channel)]
         _print_channel(f"{stage or 'unknown machine'}, {channel}", own)
     if rows:
-        print_line(
-            "grows: slope of ln level over ln velocity ± its standard deviation;\n"
-            "* significantly positive (one-sided, 5 % per row);\n"
-            "– fewer than two velocities or three logs: no slope;\n"
-            "~ the strongest harmonic is a spectral line, not a mode. RMS: of a band, in Hz."
-        )
+        print_line(TABLES["magnitudes"].legend)
     groups: dict[tuple[str, str, float], list[Row]] = {}
     for row in lines:  # each spectral line once for all logs
         groups.setdefault((row["channel"], row["kind"], round(row["frequency_hz"])), []).append(row)
@@ -287,7 +203,7 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
         n_logs = len({row["log"] for row in of_line})
         shown.append(of_line[0] | {"largest": largest, "n_logs": n_logs})
     if shown:
-        print_table("Lines", cells(_LINES, shown), 2)
+        print_view("Lines", "lines", shown)
     print_refused(refused)
 
 
@@ -349,23 +265,16 @@ def _range(values: Sequence[float]) -> str:
 def print_stage(content: dict[str, list[Row]]) -> None:
     """Print the modes, parameters, sensitivities and findings of a stage description."""
     (stage,) = content["stage"]
-    modes = [row | {"answer": "yes" if row["tracked"] else "no"} for row in content["modes"]]
-    print_table(f"{stage['name']}: modes", cells(_STAGE_MODES, modes), 2)
+    print_view(f"{stage['name']}: modes", "stage_modes", content["modes"])
     parameters = []
     for row in content["parameters"]:
         outside = row["prior_below_map"] + row["prior_above_map"]
         parameters.append(row | {"outside": outside, "answer": row["verdict"].replace("-", " ")})
     if parameters:
-        print_table("Health parameters", cells(_COVERAGE, parameters))
-        print_table("Standard deviation of the parameters", cells(_IDENTIFIABILITY, parameters))
-        print_text(
-            f"By {stage['n_logs']} logs of {stage['seconds_per_log']:g} s now and at the baseline "
-            "(Cramér-Rao bound). change: a small one since the baseline, where the map's error has "
-            "no effect, as in `lmshealth plan`. value: anywhere in the prior, with the map's "
-            "error. endless: by unlimited logs. map error: of ln f. drift std: of the drift of "
-            "ln f between these two groups. informed: expected share of the prior variance of "
-            "the ln parameter that the logs remove; identifiable from 50 % on.\n"
-        )
+        print_view("Health parameters", "stage_parameters", parameters, "coverage")
+        title = "Standard deviation of the parameters"
+        print_view(title, "stage_parameters", parameters, "identifiability")
+        print_text(TABLES["stage_parameters"].legend.format_map(stage))
         _print_sensitivities(content)
     for row in content["findings"]:
         print_text(row["text"], "+ " if row["good"] else "! ")
@@ -387,10 +296,12 @@ def _print_sensitivities(content: dict[str, list[Row]]) -> None:
 
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
     """Print the number of logs needed per length of log, one table per loss to detect."""
+    meanings = TABLES["plan"].values["hindrance"]
+    hindrances = {kind: meaning.split(": ") for kind, meaning in meanings.items()}
     for asked in detect:
         name = asked["parameter"]
         rows = [
-            row | ({"n_logs": _HINDRANCES[row["hindrance"]][0]} if row["hindrance"] else {})
+            row | ({"n_logs": hindrances[row["hindrance"]][0]} if row["hindrance"] else {})
             for row in plan
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
@@ -398,20 +309,14 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             f"{name}: to detect a loss of {percent(asked['loss'], 1)} with power "
             f"{asked['power']:g}, false-alarm probability {asked['false_alarm']:g}"
         )
-        columns = _PLAN.replace("N logs", f"{asked['n_baseline']} logs")
-        print_table(title, cells(columns, rows), 0)
+        head = "loss, N logs"
+        print_view(title, "plan", rows, headings={head: f"loss, {asked['n_baseline']} logs"})
         alone = asked["seconds_for_one_log"]
         enough = "A single log of up to an hour is not enough."
         print_line(f"One log is enough from {alone} s on.\n" if alone else f"{enough}\n")
     for kind in dict.fromkeys(row["hindrance"] for row in plan if row["hindrance"]):
-        print_text(": ".join(_HINDRANCES[kind]))
-    print_text(
-        "Lower bound. Logs now and at the baseline have equal length; loss: the smallest that is "
-        "detected, a small change since the baseline, where the map's error has no effect. std of "
-        "value: of the parameter by as many logs as the baseline has, anywhere in its prior, with "
-        "the map's error, as in `lmshealth stage`.\n"
-        "Not included: temperature, scatter between logs."
-    )
+        print_text(": ".join(hindrances[kind]))
+    print_text(TABLES["plan"].legend)
 
 
 # --- Machines ---
@@ -419,26 +324,10 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
 
 def print_track(track: Track) -> None:
     """Print the latest modes of a machine, its events and the consistency of the filter."""
-    rows = []
-    for row in track_rows(track, epochs=[len(track.logs) - 1]):
-        damping = f"{fixed(100 * row['damping_ratio'], 2)} ± {percent(row['damping_ratio_std'], 2)}"
-        damping = damping if row["damping_ratio"] >= 0 else "–"
-        rows.append(row | {"drift": change(row["drift"], row["drift_std"]), "damping": damping})
     title = f"{track.stage}: modes after {len(track.logs)} logs (± one standard deviation)"
-    print_table(title, cells(_TRACK, rows))
-    events = [
-        {
-            "since": day(track.recorded_at[event.epoch]),
-            "kind": event.kind,
-            "mode": event.mode,
-            "": "declared" if event.declared else "detected",
-            "size": change(event.size, event.std),
-            "ln Bayes factor": f"{event.evidence:.1f}",
-        }
-        for event in track.events
-    ]
-    if events:
-        print_table("Events", events, 4)
+    print_view(title, "track", track_rows(track)[-len(track.modes) :])
+    if track.events:
+        print_view("Events", "events", events_rows(track))
     print_text(_consistency(track))
 
 
@@ -464,22 +353,15 @@ def _consistency(track: Track) -> str:
 
 def print_health(health: Health) -> None:
     """Print the health parameters at the last epoch with their diagnostics, and what limits use."""
-    rows = health_rows(health)[-len(health.parameters) :]
+    rows = to_rows(health.to_columns())[-len(health.parameters) :]
     for row in rows:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
         if not row["converged"]:
             row["interval"] = "not converged"
-        row["prior"] = "{prior_shift:+.2f} σ × {prior_ratio:.2f}".format(**row)
-        if math.isnan(row["prior_ratio"]):
-            row["prior"] = "–"
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
-    print_table(title, cells(_HEALTH, rows))
-    print_text(
-        "informed: share of the prior variance of the ln parameter that the data remove; "
-        "prior × 2: shift of the median and factor on the interval with priors twice as wide, "
-        "within the map."
-    )
+    print_view(title, "health", rows)
+    print_text(TABLES["health"].legend)
     for one, other in combinations(rows, 2):
         first, second = one["parameter"], other["parameter"]
         rho = one[f"correlation_{second}"]
@@ -555,13 +437,6 @@ def _travel_left(life: Life | None) -> str:
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def service_text(service: Service) -> str:
-    """Return when to service, in a few words."""
-    if service.by is not None and service.kind == "by":
-        return f"by {service.by.isoformat()}"
-    return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
-
-
 def print_life(
     life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
 ) -> None:
@@ -602,8 +477,7 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], constants.RUL_LEVELS
-    text = f"{spell(one.parameter)} below {percent(one.limit / one.baseline)}"
-    text = "any limit" if one.parameter == "any" else text
+    text = one.name if one.parameter == "any" else f"{one.name} below {percent(one.share)}"
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):

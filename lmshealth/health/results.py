@@ -11,6 +11,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth._private.result import Result
+from lmshealth._private.tables import TABLES
 from lmshealth.health import constants
 from lmshealth.stage.constants import INFORMED
 
@@ -132,26 +133,18 @@ class Health(Result):
         """Return the columns of ``health.csv``, one row per epoch and parameter."""
         n, p = len(self.recorded_at), len(self.parameters)
         quantiles = self.quantile(np.array(list(QUANTILES.values())))
-        columns: dict[str, FloatArray | BoolArray] = {
+        columns = TABLES["health"].read(
+            self,
+            recorded_at=np.array([moment.isoformat() for moment in self.recorded_at])[:, None],
+            travel_km=self.travel[:, None] / 1000,
+            parameter=self.parameters,
+            converged=self.converged[:, None],
+            fit=self.fit[:, None],
             **dict(zip(QUANTILES, quantiles, strict=True)),
-            "ess": self.ess,
-            "r_hat": self.r_hat,
-            "converged": np.repeat(self.converged[:, None], p, axis=1),
-            "identifiable": self.identifiable,
-            "at_edge": self.at_edge,
-            "fit": np.repeat(self.fit[:, None], p, axis=1),
-            "prior_width": np.tile(self.prior_width, (n, 1)),
-        }
-        columns |= {name: getattr(self, name) for name in ("informed", *CHECKS)}
+        )
         names = enumerate(self.parameters)
         columns |= {f"correlation_{name}": self.correlation[:, :, j] for j, name in names}
-        return {
-            "stage": np.repeat(self.stage, n * p),
-            "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], p),
-            "travel_km": np.repeat(self.travel / 1000, p),
-            "parameter": np.tile(self.parameters, n),
-            **{name: values.ravel() for name, values in columns.items()},
-        }
+        return {name: np.broadcast_to(own, (n, p)).ravel() for name, own in columns.items()}
 
     def to_arviz(self) -> DataTree:
         """Return the draws, with the ensembles as chains, and the diagnostics for ArviZ.

@@ -1,6 +1,7 @@
-"""Column names, their units, and column maps that translate the names of an export.
+"""What is stated about exports: column names and units, column maps, and layouts of text.
 
 A column name of the log contract gives the quantity by its prefix and the unit by its suffix.
+A column map translates the names of one export, a layout states how a program writes its text.
 """
 
 import re
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from msgspec import Meta, Struct
+from msgspec.structs import asdict
 
 from lmshealth._private.files import read_table
 from lmshealth._private.toml import decode, within
@@ -170,8 +172,122 @@ class MatLayout(Struct, frozen=True, forbid_unknown_fields=True):
     variable: str | None = None
 
 
-class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
-    """Translation of an export into the log contract; by default its columns are the contract's."""
+# A text that is taken as it is, or a regular expression, of which the last group is the value.
+Pattern = Annotated[str, Meta(min_length=1, max_length=500)]
+# Where it finds a row, DELIMITER stands for the delimiter.
+DELIMITER = "{d}"
+# Beginnings of tables that belong to no vendor: no layout may recognise them.
+_PLAIN_TABLES = (
+    "",
+    "0,1\n0.001,2.5\n0.002,-1\n",
+    "time;a;b\n0,1;2\n0,2;3\n",
+    "Time\tPosition\ns\tmm\n0.001\t0.1\n",
+    "# stage: A-1\ntime_s,delta_e_um,acc_x_g\n0.001,0.1,0.2\n",
+)
+
+
+class TimeColumns(Struct, frozen=True, forbid_unknown_fields=True):
+    """Columns of times in a layout; of several each belongs to the columns up to the next.
+
+    A column that is empty in the first row holds no times.
+    """
+
+    name: Annotated[str, Meta(examples=["Time"])]  # of the column
+    unit: Literal["s", "ms", "us", "ns"] = "s"
+
+
+class StartMoment(Struct, frozen=True, forbid_unknown_fields=True):
+    """Moment of the first sample in a layout.
+
+    What the patterns find is joined by blanks and read by ``format``: ``filetime`` (ticks of 100 ns
+    since 1601), ``unix`` (s since 1970), directives of `strptime`, or ISO 8601.
+    """
+
+    find: Annotated[list[Pattern], Meta(min_length=1)]
+    format: str = "iso"
+
+
+class Segments(Struct, frozen=True, forbid_unknown_fields=True):
+    """Further headers between the rows of a layout, which are left out.
+
+    Their lines that begin with a key of ``same`` must be those of the first header. Without one
+    column of times, which places the rows, there may be no more of them than the largest number in
+    the line that begins with the key ``rows``; ``needed`` names the setting of the program that
+    writes one.
+    """
+
+    same: Annotated[list[str], Meta(min_length=1, examples=[["Channels"]])]
+    rows: Annotated[str, Meta(min_length=1, examples=["Samples"])]
+    needed: Annotated[str, Meta(min_length=1, examples=["X values"])]
+
+
+class Layout(Struct, frozen=True, forbid_unknown_fields=True):
+    """How a program writes its text: a header of its own, and rows.
+
+    Every pattern of ``recognise`` is found in the first lines of such a file, and not all in
+    others. The rows begin behind the line in which the first match of ``rows_after`` ends; the
+    lines before them are the header, in which the last match of each pattern counts. ``names``,
+    ``units``, ``interval`` (between samples) and ``offset`` (in s, of the first sample) find a row
+    with a field for each column, or one field for all; with a group ``column``, all matches count,
+    each for the column of that number. The README of this folder has an example.
+    """
+
+    name: Annotated[str, Meta(min_length=1, max_length=60, examples=["ACME recorder"])]
+    recognise: Annotated[list[Pattern], Meta(min_length=1, examples=[["\\AACME recorder"]])]
+    rows_after: Annotated[Pattern, Meta(examples=["^Data:"])]
+    # The number of its character is also found; blanks where nothing is.
+    delimiter: Annotated[Pattern, Meta(examples=[","])]
+    required: list[str] = []  # beginnings of lines, without which a header is damaged
+    decimal: Pattern | None = None  # found in the first rows where nothing is
+    names: Pattern | None = None  # by default columns are called "0", "1", ...
+    units: Pattern | None = None  # by default in brackets behind the names
+    interval: Pattern | None = None
+    interval_unit: Literal["s", "ms", "us", "ns"] = "s"
+    offset: Pattern | None = None
+    time: TimeColumns | None = None
+    start: StartMoment | None = None
+    metadata: dict[str, Pattern] = {}  # keys of the contract
+    segments: Segments | None = None
+
+    def __post_init__(self) -> None:
+        """Check what the types do not state; the error lists every fault."""
+        given = asdict(self)
+        given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
+        given["start.find"] = self.start and self.start.find
+        given = {key: [value] if isinstance(value, str) else value for key, value in given.items()}
+        plain_keys = ("name", "required")
+        faults = [f"{key}: {fault}" for key, value in given.items()
+                  if isinstance(value, list) and key not in plain_keys
+                  for pattern in value if (fault := _fault(pattern))]  # fmt: skip
+        if not faults:
+            marks = {"delimiter": self.delimiter, "decimal": self.decimal or "."}
+            faults = [f"{key}: got {mark!r}, needed one character, or a group () around it"
+                      for key, mark in marks.items()
+                      if len(mark) > 1 and not re.compile(mark).groups]  # fmt: skip
+            if plain := [text for text in _PLAIN_TABLES if self.recognises(text)]:
+                needed = "needed lines that only files of this layout have"
+                faults.append(f"recognise: also fits other tables, as {plain[0][:40]!r}; {needed}")
+        if unknown := sorted(set(self.metadata) - set(KEYS)):
+            faults.append(f"metadata: got {listed(unknown)}; known keys are {listed(KEYS)}")
+        if faults:
+            raise ValueError("; ".join(faults))
+
+    def recognises(self, text: str) -> bool:
+        """Return whether a text begins as files of this layout do."""
+        return all(re.search(pattern, text, re.MULTILINE) for pattern in self.recognise)
+
+
+def _fault(pattern: str) -> str:
+    """Return what is wrong with a regular expression; empty where nothing is."""
+    try:
+        re.compile(pattern, re.MULTILINE)
+    except re.error as error:
+        return f"{pattern!r} is no regular expression: {error}"
+    return ""
+
+
+class _MapFile(Struct, frozen=True, forbid_unknown_fields=True):
+    """Keys of the file of a column map."""
 
     columns: dict[str, str] = {}  # contract name to the name in the file
     # Contract name without unit suffix to its unit, or to the SI value of one count.
@@ -180,6 +296,16 @@ class ColumnMap(Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     sample_rate_hz: Annotated[float, within(*constants.RANGES["sample_rate_hz"])] | None = None
     csv: CsvLayout = CsvLayout()
     mat: MatLayout = MatLayout()
+
+
+class ColumnMap(_MapFile, frozen=True, forbid_unknown_fields=True, dict=True):
+    """Translation of an export into the log contract; by default its columns are the contract's.
+
+    ``layouts`` are the user's; one with the name of a shipped layout replaces it. They travel with
+    the map because a log that is read by another layout is another log.
+    """
+
+    layouts: tuple[Layout, ...] = ()
 
     @cached_property
     def _targets(self) -> dict[str, str]:
@@ -223,13 +349,32 @@ def load_columns(path: str | Path) -> ColumnMap:
     that are not in the log contract.
     """
     try:
-        columns = decode(read_table(Path(path)), ColumnMap)
+        columns = ColumnMap(**asdict(decode(read_table(Path(path)), _MapFile)))
         _check(columns)
     except (OSError, ValueError) as error:
         raise BadTable(f"column map {path}: {error}") from error
     except Unusable as error:
         raise BadTable(f"column map {path}: {error.detail}") from error
     return columns
+
+
+def load_layouts(folder: str | Path) -> tuple[Layout, ...]:
+    """Read the layouts of text from a folder: one TOML file each.
+
+    `BadTable` if there is none, one cannot be read or breaks the schema, or two have one name.
+    """
+    layouts: dict[str, Layout] = {}
+    for path in sorted(Path(folder).glob("*.toml")):
+        try:
+            layout = decode(read_table(path), Layout)
+            if layout.name in layouts:
+                raise ValueError(f"name: another file of the folder has {layout.name!r}, too")
+        except (OSError, ValueError) as error:
+            raise BadTable(f"layout {path}: {error}") from error
+        layouts[layout.name] = layout
+    if not layouts:
+        raise BadTable(f"{folder}: holds no layout; needed files *.toml, one for each layout")
+    return tuple(layouts.values())
 
 
 def _check(columns: ColumnMap) -> None:

@@ -22,8 +22,7 @@ from lmshealth.io.channel_checks import (
 )
 from lmshealth.io.column_map import ColumnMap, Role, Signal
 from lmshealth.io.consistency import Findings, Motion, compare
-from lmshealth.io.formats.content import Content
-from lmshealth.io.formats.foreign import frequency_column, over_frequency
+from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
@@ -63,7 +62,8 @@ def read_log(
     path : str or Path
         The file; its suffix names the format and its content must agree.
     columns : ColumnMap, optional
-        How an export is read; by default the columns are those of the log contract.
+        How an export is read, and layouts of the user; by default the columns are those of the log
+        contract.
     overrides : mapping of str to str, optional
         Metadata of a manifest, which override those of the file and the column map.
     name : str, optional

@@ -28,7 +28,7 @@ from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
 from lmshealth.modal.targets import choose_channels
-from lmshealth.report import figures
+from lmshealth.report import figures, tables
 from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
 from lmshealth.signal.segments import select_segments
@@ -383,7 +383,8 @@ def write_figure(path: Path, figure: LogFigure) -> None:
     """Write a figure as ``.svg``, ``.png`` or an HTML page with tables of modes and refusals."""
     if path.suffix == ".html":
         svg = figures.inline(figure.draw, salt="log", size=figure.size)
-        page = render("log.html.j2", title=figure.title, modes=figure.modes, svg=svg)
+        rows = tables.to_rows(figure.modes.to_columns())
+        page = render("log.html.j2", title=figure.title, modes=figure.modes, rows=rows, svg=svg)
         write_text(path, page)
         return
     notes = _notes(figure.modes)

@@ -80,7 +80,6 @@ def make_page(
         key: figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
         for k, (key, plot) in enumerate(draw.items())
     }
-    content["mac"] = _mac(assessment)
     for key, (whole, size) in _log_pictures(assessment).items():
         pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
@@ -90,14 +89,20 @@ def make_page(
     return render("stage.html.j2", generated, **content)
 
 
-def latest_modes(track: Track) -> list[dict[str, Any]]:
-    """Return rows of ``track.csv`` of the last epoch, with ``baseline_hz``; untracked modes last.
+def latest_modes(track: Track, stage: Stage, mac: Mapping[str, float]) -> list[dict[str, Any]]:
+    """Return rows of ``track.csv`` of the last epoch, with the frequency at the baseline.
 
-    A mode without an estimate yet is left out.
+    Untracked modes are last; a mode without an estimate yet is left out.
     """
+    declared = {mode.name: mode.frequency_hz for mode in stage.modes}
     return [
-        row | {"baseline_hz": row["frequency_hz"] * np.exp(-row["drift"])}
-        for row in track_rows(track, epochs=[len(track.logs) - 1])
+        row
+        | {
+            "baseline_hz": row["frequency_hz"] * np.exp(-row["drift"]),
+            "declared_hz": declared.get(row["mode"]),
+            "mac": mac.get(row["mode"]),
+        }
+        for row in track_rows(track)[-len(track.modes) :]
         if np.isfinite([row["frequency_hz"], row["drift"]]).all()
     ]
 
@@ -113,13 +118,13 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
 
 def _postponed(
     prognosis: Prognosis | None, service: Service
-) -> Iterator[tuple[date, int, tuple[float, float]]]:
-    """Yield days of a postponed service, weeks late, and bounds of the risk until then."""
+) -> Iterator[tuple[date, int | None, tuple[float, float]]]:
+    """Yield days of a postponed service, weeks late (or None), and bounds of the risk."""
     for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
         assert prognosis is not None and service.by is not None
         if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
             reached = probability_before(prognosis, day)
-            yield day, weeks, (float(reached.at_least[-1]), float(reached.at_most[-1]))
+            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
 
 
 def _track_content(assessment: Assessment) -> dict[str, Any]:
@@ -127,11 +132,12 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
     track, history, stage = assessment.track, assessment.history, assessment.stage
     influences: tuple[CovariateEffect, ...] = ()
     content: dict[str, Any] = dict.fromkeys(("consistency", "nis", "noise_scale", "widening"))
-    content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0}
+    mac = _mac(assessment)
+    content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0, "mac": mac}
     if track is not None:
         influences = covariate_effects.find_covariate_effects(history, track, stage)
         content |= {
-            "modes": latest_modes(track),
+            "modes": latest_modes(track, stage, mac),
             "events": _grouped(track.events, attrgetter("kind", "epoch", "source")).values(),
             "effects": [effect for effect in track.effects if _is_shown(effect)],
             "consistency": track.consistency(),
@@ -142,7 +148,6 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
         }
     corrected = [one for one in influences if one.values.size]
     return content | {
-        "declared": {mode.name: mode.frequency_hz for mode in stage.modes},
         "seen": _seen(history),
         "influences": influences,
         "corrected": _grouped(corrected, attrgetter("covariate")),

@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from lmshealth._private.files import write_bytes
+from lmshealth._private.tables import TABLES
 from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
 
@@ -57,7 +58,7 @@ def _environment() -> Any:
     )
     pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
     pages.filters |= {"place": place, "sha256": sha256}
-    pages.globals |= {"covariate": text.covariate, "constants": constants}
+    pages.globals |= {"covariate": text.covariate, "constants": constants, "tables": TABLES}
     return pages
 
 

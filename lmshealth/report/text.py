@@ -1,12 +1,19 @@
 """Formats of numbers and names; pages, terminals and figures share them."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
 from datetime import datetime
-from typing import Any, get_args
+from string import Formatter
+from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.report import constants
+
+if TYPE_CHECKING:  # above, so that --help needs no scipy
+    from lmshealth.prognosis.maintenance_decision import Service
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
@@ -82,6 +89,16 @@ def percent(share: Number, digits: int | None = None) -> str:
     return f"{number(value) if digits is None else fixed(value, digits)}{GAP}%"
 
 
+def share(value: Number, digits: int) -> str:
+    """Format a share in percent with fixed decimals, without the sign."""
+    return fixed(100 * value, digits)
+
+
+def yes_or_no(value: object, yes: str = "yes", no: str = "no") -> str:
+    """Format a flag."""
+    return yes if value else no
+
+
 def interval(low: Number, high: Number) -> str:
     """Format an interval of shares in whole percent."""
     return f"{fixed(100 * low, 0)} to {percent(high, 0)}"
@@ -148,8 +165,79 @@ def time_left(days: float) -> str:
     return f"{coarse(days)}{GAP}days{years}"
 
 
+def service_text(service: Service) -> str:
+    """Return when to service, in a few words."""
+    if service.by is not None and service.kind == "by":
+        return f"by {service.by.isoformat()}"
+    return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
+
+
 def quantiles(
     values: FloatArray, levels: tuple[float, ...] = constants.LEVELS
 ) -> tuple[float, ...]:
     """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
+
+
+class _Cells(Formatter):
+    """Format strings with functions of this module, as in ``{drift:change {drift_std}}``.
+
+    Values are those of a mapping, a sequence or an object.
+    """
+
+    def get_value(self, key: Any, args: Any, kwargs: Any) -> Any:
+        for values in args:
+            if key in values:
+                return values[key]
+        named = isinstance(kwargs, Mapping) or isinstance(key, int)
+        return kwargs[key] if named else getattr(kwargs, key)
+
+    def format_field(self, value: Any, format_spec: str) -> Any:
+        if value is None or value != value:  # NaN
+            return "–"
+        name, *options = format_spec.split() or [""]
+        function = globals().get(name)
+        return function(value, *map(_option, options)) if function else format(value, format_spec)
+
+
+_FORMATTER = _Cells()
+
+
+def _option(text: str) -> Any:
+    """Read an argument of a format: digits, a number, or a word."""
+    try:
+        return int(text) if text.isdecimal() else float(text)
+    except ValueError:
+        return text
+
+
+def view_columns(view: str, headings: Mapping[str, str | None] | None = None) -> dict[str, str]:
+    """Split a view of a table (see `Table.shown`) into the formats of its cells, by heading.
+
+    ``headings`` replace those of the view; a column under None is left out.
+    """
+    split = [column.partition("{") for column in view.split("|")]
+    forms = {head.strip(): (start + rest).strip() for head, start, rest in split}
+    shown = {head: (headings or {}).get(head, head) for head in forms}
+    return {name: forms[head] for head, name in shown.items() if name is not None}
+
+
+def first_field(form: str) -> str:
+    """Return the name of the first value in a format."""
+    return next(name for _, name, *_ in _FORMATTER.parse(form) if name)
+
+
+def cells(
+    columns: Mapping[str, str], rows: Iterable[Any], values: Mapping[str, Any] | None = None
+) -> list[dict[str, str]]:
+    """Format the rows of a table by `view_columns`, and values that are the same in all rows.
+
+    A row is a mapping, a sequence or an object. A cell whose first value is missing is a dash.
+    """
+    common = [values or {}]
+    return [{head: _cell(form, row, common) for head, form in columns.items()} for row in rows]
+
+
+def _cell(form: str, row: Any, common: Sequence[Mapping[str, Any]]) -> str:
+    value, _ = _FORMATTER.get_field(first_field(form), common, row)
+    return "–" if value is None or value != value else _FORMATTER.vformat(form, common, row)

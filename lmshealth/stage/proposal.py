@@ -5,7 +5,7 @@ For a column names and units decide first, the samples where neither does, each 
 
 import glob
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
@@ -21,12 +21,11 @@ from lmshealth._private.toml import quoted
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks, in_unit
-from lmshealth.io.column_map import SI_TIMES, ColumnMap, parse_column, role_of, unit_key
-from lmshealth.io.formats.content import Content
-from lmshealth.io.formats.foreign import frequency_column, over_frequency
-from lmshealth.io.formats.moments import SINCE_EPOCH
+from lmshealth.io.column_map import SI_TIMES, ColumnMap, Layout, parse_column, role_of, unit_key
+from lmshealth.io.formats.channels import SINCE_EPOCH
+from lmshealth.io.formats.content import Content, frequency_column, over_frequency
+from lmshealth.io.formats.dialect import LOCAL_TIME
 from lmshealth.io.formats.registry import load
-from lmshealth.io.formats.text_layouts import LOCAL_TIME
 from lmshealth.io.log import Log
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
@@ -76,6 +75,9 @@ _DATE = re.compile(
 _DEPTH = 3  # of structs in structs
 # Widest search of a mode, in relative distances of neighbouring modes, and its least value.
 _NEIGHBOURS, _LEAST_SEARCH = 2.0, 0.02
+# Columns of a map that reads the header only, and function that reads others, with their units.
+_NO_COLUMN = {"acc_none": "\0"}
+_Load = Callable[..., Content]
 _UNIT = re.compile(r"(?P<name>.+) \[(?P<unit>[^\]]*)\]")
 
 
@@ -141,17 +143,25 @@ def propose(
     rate: float | None = None,
     max_memory: float = constants.MAX_MEMORY,
     latest: datetime | None = None,
+    layouts: tuple[Layout, ...] = (),
 ) -> tuple[str, list[Guess]]:
     """Propose the column map of a file, as TOML with comments; return all guesses too.
 
-    Times are read by the functions of `read_log`. ``rate`` is the sample rate in Hz where the file
-    has none. `BadLog` if the file cannot be read, nothing in it may be a signal, or its sample rate
-    is unknown, contradicted or depends on a unit that nothing states.
+    Times are read by the functions of `read_log`, with the layouts of the user. ``rate`` is the
+    sample rate in Hz where the file has none. `BadLog` if the file cannot be read, nothing in it
+    may be a signal, or its sample rate is unknown, contradicted or depends on a unit that nothing
+    states.
     """
     label = shown(path)
+
+    def read(columns: dict[str, str], units: dict[str, str | float] | None = None) -> Content:
+        """Read columns of the file under names of the contract."""
+        how = ColumnMap(columns=columns, units=units or {}, layouts=layouts)
+        return load(path, how, max_memory)
+
     content_digest(path, name=label)
     try:
-        content, columns, rest = _columns(path, max_memory)
+        content, columns, rest = _columns(read)
         axis = frequency_column(content.present)
         if axis and all(one.is_even for one in columns[:1]):
             raise over_frequency(axis)
@@ -159,7 +169,7 @@ def propose(
         if rate and stated and abs(rate / stated - 1) > constants.AGREEMENT:
             detail = f"the file states {stated:.8g} Hz, --sample-rate is {rate:.8g} Hz"
             raise Unusable("time", f"{detail}; leave the option out, or correct the file")
-        times = _times(path, columns, content, rate or stated, max_memory)
+        times = _times(read, columns, content, rate or stated)
         others = [one for one in columns if one.name not in times]
         guesses = [*times.values(), *_guesses(others), *rest]
         if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
@@ -178,14 +188,16 @@ def propose(
     return "\n".join(_lines(label, content, guesses, None if timed else rate)), guesses
 
 
-def moment_of(path: Path, log: Log) -> tuple[str, str]:
+def moment_of(path: Path, log: Log, layouts: tuple[Layout, ...] = ()) -> tuple[str, str]:
     """Return when a log was recorded (ISO 8601), and where that is stated; empty where it is not.
 
-    A moment without a time zone gets that of this computer.
+    Its header is read with the layouts of the user, too. A moment without a time zone gets that of
+    this computer.
     """
     if log.metadata.recorded_at:
         return log.metadata.recorded_at.isoformat(), "stated in the file"
-    local = load(path, ColumnMap(columns={"acc_none": "\0"})).metadata.get(LOCAL_TIME, "")
+    header = load(path, ColumnMap(columns=_NO_COLUMN, layouts=layouts))
+    local = header.metadata.get(LOCAL_TIME, "")
     where = "header of the file"
     if not local and (date := _DATE.search(path.name)):
         clock = f"{date['h']}:{date['min']}:{date['s'] or '00'}" if date["h"] else "00:00"
@@ -197,16 +209,16 @@ def moment_of(path: Path, log: Log) -> tuple[str, str]:
     return moment, f"{where}, time zone of this computer"
 
 
-def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], list[Guess]]:
+def _columns(load_by: _Load) -> tuple[Content, list[_Column], list[Guess]]:
     """Read all columns as they are; those that hold no such series of numbers are left out."""
-    content = load(path, ColumnMap(columns={"acc_none": "\0"}), max_memory)
+    content = load_by(_NO_COLUMN)
     read: dict[str, _Column] = {}
     tried: set[str] = set()
     for _ in range(_DEPTH):
         pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
         units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
         new = [name for name in units if name not in tried]
-        for found, moments in _contents(path, new, max_memory):
+        for found, moments in _contents(load_by, new):
             # A struct is opened by its name.
             there = max(content.present, found.present, key=len)
             content = replace(content, metadata=content.metadata | found.metadata, present=there)
@@ -222,27 +234,25 @@ def _columns(path: Path, max_memory: float) -> tuple[Content, list[_Column], lis
     return content, kept, rest
 
 
-def _contents(
-    path: Path, names: Sequence[str], max_memory: float
-) -> Iterator[tuple[Content, bool]]:
+def _contents(load_by: _Load, names: Sequence[str]) -> Iterator[tuple[Content, bool]]:
     """Yield contents with columns of numbers, as many at once as can be, and with moments."""
     targets = {f"acc_probed_{k}_g": name for k, name in enumerate(names)}
     try:
         if names:
-            yield load(path, ColumnMap(columns=targets), max_memory), False
+            yield load_by(targets), False
     except Unusable:
         if len(names) > 1:
             for half in (names[: len(names) // 2], names[len(names) // 2 :]):
-                yield from _contents(path, half, max_memory)
+                yield from _contents(load_by, half)
             return
         with suppress(Unusable):
-            found = load(path, ColumnMap(columns={"time_s": names[0]}), max_memory)
+            found = load_by({"time_s": names[0]})
             if names[0] in found.columns:
                 yield found, True
 
 
 def _times(
-    path: Path, columns: list[_Column], content: Content, rate: float | None, max_memory: float
+    load_by: _Load, columns: list[_Column], content: Content, rate: float | None
 ) -> dict[str, Guess]:
     """Guess which column holds the times: the first that states its unit, has a name, or is even.
 
@@ -266,7 +276,7 @@ def _times(
             continue
         unit = stated[one.name]
         try:
-            found[one.name] = _in_unit(one, *_rate_of(path, one, unit, max_memory), rate, content)
+            found[one.name] = _in_unit(one, *_rate_of(load_by, one, unit), rate, content)
         except _Contradiction:
             raise
         except _Question as question:
@@ -287,15 +297,15 @@ class _Question(Unusable):
     """Times whose unit nothing states."""
 
 
-def _rate_of(path: Path, one: _Column, unit: str, max_memory: float) -> tuple[float, str]:
+def _rate_of(load_by: _Load, one: _Column, unit: str) -> tuple[float, str]:
     """Return the sample rate in Hz that `read_log` finds in times, and their unit.
 
     Without a unit it is that of times in s, unless they are counted from an epoch.
     """
     target, scale = _time_target(unit or "s")
-    layout = ColumnMap(columns={target: one.name}, units=scale)
-    content = load(path, layout, max_memory)
-    values = in_unit(content.columns[one.name], layout.signal(target).factor, np.inf)
+    content = load_by({target: one.name}, scale)
+    factor = parse_column(target, scale.get(target)).factor
+    values = in_unit(content.columns[one.name], factor, np.inf)
     is_epoch = any(text.endswith(SINCE_EPOCH) for text in content.guessed)
     rate = time_axis(values, None).sample_rate
     # A counter of another unit may be as large, but not at a rate of vibrations.

@@ -15,6 +15,7 @@ from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth._private.result import Result
+from lmshealth._private.tables import TABLES
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.modal.credibility import dependence
@@ -165,17 +166,15 @@ class Track(Result):
     def to_columns(self) -> dict[str, Any]:
         """Return the columns of ``track.csv``, one row per epoch and mode."""
         n, m = len(self.logs), len(self.modes)
-        return {
-            "stage": np.repeat(self.stage, n * m),
-            "recorded_at": np.repeat([moment.isoformat() for moment in self.recorded_at], m),
-            "travel_km": np.repeat(self.travel / 1000, m),
-            "mode": np.tile(self.modes, n),
-            **mode_columns(self),
-            "nis": np.repeat(self.nis, m),
-            "nis_dof": np.repeat(self.nis_dof, m),
-            "noise_scale": np.repeat(self.noise_scale.max(axis=1, initial=0.0), m),
-            "widening": np.repeat(self.widening, m),
-        }
+        scale = self.noise_scale.max(axis=1, initial=0.0)
+        return TABLES["track"].row(
+            np.repeat(self.stage, n * m),
+            np.repeat([moment.isoformat() for moment in self.recorded_at], m),
+            np.repeat(self.travel / 1000, m),
+            np.tile(self.modes, n),
+            *mode_columns(self).values(),
+            *(np.repeat(own, m) for own in (self.nis, self.nis_dof, scale, self.widening)),
+        )
 
     def digest_columns(self) -> dict[str, Any]:
         """Return the modes at the last epoch."""

@@ -9,10 +9,11 @@ from typing import Any
 import pytest
 
 from lmshealth._private.serialize import pack
+from lmshealth._private.tables import RUN_TABLES, TABLES
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.outputs import MachineRecord, machine_output, write_tables
 from lmshealth.io.log import Refusal
-from lmshealth.report.tables import COLUMNS, csv_text, refused_rows
+from lmshealth.report.tables import csv_text, refused_rows
 from tests.assessments import worn
 
 
@@ -47,7 +48,7 @@ def test_parts_may_have_columns_of_their_own(tmp_path: Path) -> None:
     tables = {"A": effect("roll", note='two\nlines, "quoted"'), "B": effect("pitch", other=1)}
     write_tables(tmp_path, ["A", "B"], tables)
     one, two = read(tmp_path / "effects.csv")
-    assert list(one) == [*COLUMNS["effects"].split(), "note", "other"]
+    assert list(one) == [*TABLES["effects"].names, "note", "other"]
     assert (one["note"], one["other"]) == ('two\nlines, "quoted"', "")
     assert (two["mode"], two["note"], two["other"]) == ("pitch", "", "1")
     assert (float(two["coefficient"]), two["std"]) == (0.1 + 0.2, "")
@@ -65,9 +66,9 @@ def test_what_belongs_to_no_machine_comes_first(tmp_path: Path) -> None:
     rows = refused_rows([Refusal("a.h5", "empty", "0 bytes")])
     write_tables(tmp_path, [], {"": {"refused": pack(csv_text("refused", rows))}})
     assert [row["log"] for row in read(tmp_path / "refused.csv")] == ["a.h5"]
-    for name, columns in COLUMNS.items():
+    for name, table in RUN_TABLES.items():
         head = (tmp_path / f"{name}.csv").read_text(encoding="utf-8").splitlines()[0]
-        assert head == ",".join(columns.split())
+        assert head == ",".join(table.names)
 
 
 def test_tables_that_are_not_finished_leave_those_of_before(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from sqlalchemy import text
 
 from lmshealth import examples
 from lmshealth._private.serialize import pack, unpack
+from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
@@ -49,7 +50,7 @@ from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.machine_page import make_page
-from lmshealth.report.tables import COLUMNS, log_tables, machine_tables
+from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.track import accepted_estimates, track
@@ -122,7 +123,7 @@ def modes_only(tmp_path: Path) -> Stage:
 @pytest.mark.slow
 def test_all_tables_and_pages_are_written(done: Done) -> None:
     """Every table of the contract, the index and a page per stage are there, no half files."""
-    assert set(done.written) == {f"{name}.csv" for name in COLUMNS}
+    assert set(done.written) == {f"{name}.csv" for name in RUN_TABLES}
     assert done.result.index == done.out / "index.html"
     assert done.result.index.is_file()
     assert [page.name for page in done.result.pages] == ["test-A.html"]

@@ -12,8 +12,8 @@ import pytest
 import xarray
 from click.testing import CliRunner, Result
 
+from lmshealth._private.tables import TABLES
 from lmshealth.cli.main import main
-from lmshealth.report.tables import COLUMNS
 from tests.lives import FADING, FOOT, MOUNT, make_stage, true_drift
 
 N = 30
@@ -180,7 +180,7 @@ def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
     result = infer(drifts, "--stage", toml, "--out", out, "--posterior", draws)
     assert result.exit_code == 0, result.output
     table = pd.read_csv(out)
-    assert list(table.columns[:11]) == COLUMNS["health"].split()[:11]
+    assert tuple(table.columns[:11]) == TABLES["health"].names[:11]
     last = table[table["recorded_at"].str.startswith("2026-03-03")].set_index(
         ["stage", "parameter"]
     )

@@ -21,12 +21,12 @@ import pytest
 from click import Context
 from click.testing import CliRunner, Result
 
+from lmshealth._private.tables import TABLES
 from lmshealth.batch import constants
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.io.reading import read_log
-from lmshealth.report.tables import COLUMNS, LOG_COLUMNS
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
@@ -36,7 +36,7 @@ from studies.modes.frf.records import BAND, MODES, RATE, Machine, periodic
 from tests.assessments import nothing, worn
 from tests.signals import Mode, accelerations, write_archive, write_archive_stage, write_log
 
-MODE_KEYS = set(COLUMNS["modes"].split())
+MODE_KEYS = set(TABLES["modes"].names)
 
 
 def call(*arguments: object) -> Result:
@@ -393,7 +393,7 @@ def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:
     assert set(content) == {"error", "harmonics", "refused"}
     assert [row["velocity_mm_s"] for row in content["error"]] == pytest.approx([5, 20, 100, 400])
     for row in content["error"]:
-        assert set(row) == set(LOG_COLUMNS["error"].split())
+        assert set(row) == set(TABLES["error"].names)
         own = [h for h in content["harmonics"] if h["log"] == row["log"]]
         assert len(own) == 20
         assert own[0]["amplitude_um"] == row["max_magnitude_um"]
@@ -430,7 +430,7 @@ def test_spectrum_as_json_contains_growth(strokes: list[Path]) -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     content = strict(result.stdout)
     assert set(content) == {"magnitudes", "growth", "lines", "refused"}
-    assert all(set(row) == set(LOG_COLUMNS["magnitudes"].split()) for row in content["magnitudes"])
+    assert all(set(row) == set(TABLES["magnitudes"].names) for row in content["magnitudes"])
     assert len(content["magnitudes"]) == 4 * 2 * 7  # logs, accelerometers, bands
     pitch = [row for row in content["growth"] if row["band"] == "pitch"]
     assert [row["grows"] for row in pitch] == [True, True]
@@ -510,11 +510,11 @@ def test_frf_as_json_has_the_response_and_its_modes(bench: Path) -> None:
     for mode, (f, _, _) in zip(content["modes"], MODES, strict=False):
         assert mode["frequency_hz"] == pytest.approx(f, rel=2e-3)
     (fit,) = content["fit"]
-    assert set(fit) == set(LOG_COLUMNS["fit"].split())
+    assert set(fit) == set(TABLES["fit"].names)
     assert fit["period_s"] == pytest.approx(4)
     assert fit["n_lines"] == len(content["frf"]) == 305
     for row in content["frf"]:
-        assert set(row) == set(LOG_COLUMNS["frf"].split())
+        assert set(row) == set(TABLES["frf"].names)
     keys = ("gain", "fit_gain", "gain_std")
     gain, fitted, std = np.array([[row[k] for k in keys] for row in content["frf"]], dtype=float).T
     assert np.abs((gain - fitted) / std).max() < 5
@@ -661,8 +661,8 @@ def test_plan_as_json_has_the_question_and_one_row_per_length() -> None:
     assert (result.exit_code, result.stderr) == (0, "")
     content = strict(result.stdout)
     assert set(content) == {"detect", "plan"}
-    assert all(set(row) == set(LOG_COLUMNS["detect"].split()) for row in content["detect"])
-    assert all(set(row) == set(LOG_COLUMNS["plan"].split()) for row in content["plan"])
+    assert all(set(row) == set(TABLES["detect"].names) for row in content["detect"])
+    assert all(set(row) == set(TABLES["plan"].names) for row in content["plan"])
     assert [(row["parameter"], row["loss"], row["n_baseline"]) for row in content["detect"]] == [
         ("guide_preload", 0.05, 5), ("mount_stiffness", 0.02, 5),
     ]  # fmt: skip

@@ -10,11 +10,11 @@ import pytest
 import xarray
 from click.testing import CliRunner, Result
 
+from lmshealth._private.tables import TABLES
 from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
 from lmshealth.prognosis.remaining_life import prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
-from lmshealth.report.tables import COLUMNS
 from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -97,7 +97,7 @@ def test_estimates_become_remaining_lives(table: Path, toml: Path, tmp_path: Pat
     result = call(table, "--stage", toml, "--out", out, "--posterior", draws, "--by", "2026-05-01")
     assert result.exit_code == 0, result.output
     found = pd.read_csv(out)
-    assert list(found.columns[: len(COLUMNS["prognosis"].split())]) == COLUMNS["prognosis"].split()
+    assert tuple(found.columns[: len(TABLES["prognosis"].names)]) == TABLES["prognosis"].names
     worn, sound = (found[found["stage"] == stage].iloc[1] for stage in ("AX-1", "AX-2"))
     assert worn["rul_km_q05"] < LIMIT_KM < worn["rul_km_q95"]
     assert worn["probability_beyond_horizon"] < 0.01 < 0.5 < sound["probability_beyond_horizon"]

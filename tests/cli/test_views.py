@@ -22,7 +22,6 @@ from lmshealth.cli.views import (
     print_stage,
     print_summaries,
     print_track,
-    service_text,
 )
 from lmshealth.modal.naming import Difference
 from lmshealth.prognosis.maintenance_decision import decide, probability_before
@@ -30,6 +29,7 @@ from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report.assessment import Assessment, summarise, summarise_life
 from lmshealth.report.fleet_page import by_urgency
 from lmshealth.report.tables import prognosis_rows, stage_rows
+from lmshealth.report.text import service_text
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.description import Decision, Stage, load_stage
 from lmshealth.tracking.track import track

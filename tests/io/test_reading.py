@@ -18,7 +18,7 @@ from lmshealth.cli.main import main
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.parquet import PARQUET
+from lmshealth.io.formats.native import PARQUET
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import Unusable
 

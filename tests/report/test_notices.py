@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 from msgspec import structs
 
+from lmshealth._private.tables import TABLES
 from lmshealth.health.verdict import judge
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices
-from lmshealth.report.tables import COLUMNS, machine_tables
+from lmshealth.report.tables import machine_tables
 from tests.assessments import PARAMETERS as PARTS
 from tests.assessments import Assessment, Maker, make, nothing
 
@@ -57,7 +58,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
     (row, *_) = [row for row in machine_tables(bad)["warnings"] if row["code"] == code]
-    assert list(row) == COLUMNS["warnings"].split()
+    assert tuple(row) == TABLES["warnings"].names
     assert row["what"].endswith(".")
 
 

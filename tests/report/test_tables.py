@@ -11,6 +11,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from lmshealth._private.tables import RUN_TABLES, TABLES, Row
 from lmshealth.health.verdict import Verdict
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
@@ -19,8 +20,7 @@ from lmshealth.prognosis.maintenance_decision import decide, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.tables import (
-    COLUMNS,
-    frame,
+    csv_text,
     join_csv,
     lines_rows,
     log_tables,
@@ -129,9 +129,15 @@ def tables(stage: Stage, remaining: np.ndarray) -> dict[str, pd.DataFrame]:
     return frames([], assessment(stage, prognosis(remaining)))
 
 
+def frame(table: str, rows: Sequence[Row]) -> pd.DataFrame:
+    """Make a frame of rows of a table; further columns follow as they appear."""
+    columns = dict.fromkeys([*TABLES[table].names, *(name for row in rows for name in row)])
+    return pd.DataFrame(list(rows), columns=list(columns))
+
+
 def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
-    found = {name: frame(COLUMNS[name], own) for name, own in machine_tables(made).items()}
+    found = {name: frame(name, own) for name, own in machine_tables(made).items()}
     of_logs = [log_tables(reading) for reading in readings]
     for name in of_logs[0] if of_logs else ():
         text = "".join(join_csv([own[name] for own in of_logs]))
@@ -141,11 +147,8 @@ def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.D
 
 def test_empty_tables_have_their_columns() -> None:
     """Nothing at all still makes every table with its header."""
-    for name in COLUMNS:
-        table = frame(COLUMNS[name], [])
-        assert table.empty
-        assert list(table.columns) == COLUMNS[name].split()
-        assert table.to_csv(index=False) == ",".join(COLUMNS[name].split()) + "\n"
+    for name in RUN_TABLES:
+        assert csv_text(name, []) == ",".join(TABLES[name].names) + "\n"
 
 
 def test_modes_leave_with_units_in_their_names() -> None:
@@ -153,7 +156,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
     covariates = {"temperature_c": 21.5, "payload_kg": 4.0, "position_mm": -20.0}
     metadata = Metadata("test-A", WHEN, 123_400.0, covariates, servo_id="stiff")
     reading = LogEstimates("a.h5", "d", metadata, two_modes(), 1.5e-6, sample_rate=2e4)
-    table = frame(COLUMNS["modes"], modes_rows(reading))
+    table = frame("modes", modes_rows(reading))
     row = table.iloc[0]
     assert (row["mode"], row["source"], row["channel"]) == ("roll", "acc", "acc_x")
     assert row["recorded_at"] == "2026-03-01T08:00:00+00:00"
@@ -169,7 +172,7 @@ def test_modes_leave_with_units_in_their_names() -> None:
 def test_unknown_metadata_are_empty_cells() -> None:
     """A log without metadata leaves empty cells, never the text nan."""
     reading = LogEstimates("a.h5", "d", Metadata(), two_modes())
-    text = frame(COLUMNS["modes"], modes_rows(reading)).to_csv(index=False)
+    text = csv_text("modes", modes_rows(reading))
     assert text.splitlines()[1].startswith("a.h5,,,,,,,,,roll,acc,")
     assert "nan" not in text.lower()
 
@@ -181,7 +184,7 @@ def test_shapes_have_a_column_per_channel_after_all_others(stage: Stage) -> None
     readings = [LogEstimates(log, "d", Metadata(), modes) for log, modes in both.items()]
     table = frames(readings, assessment(stage, None))["modes"]
     own = ["shape_acc_x", "shape_acc_y", "shape_delta_e"]
-    assert list(table.columns) == [*COLUMNS["modes"].split(), *own]
+    assert list(table.columns) == [*TABLES["modes"].names, *own]
     nan = np.nan
     expected = [[1.0, nan, nan], [-0.6, 0.8, nan], [nan, nan, 1.0], [nan, nan, 1.0]]
     np.testing.assert_array_equal(table[own], expected)
@@ -275,7 +278,7 @@ def test_a_requested_day_has_columns_of_its_own() -> None:
     day = date(2046, 1, 1)
     before = day, probability_before(life, day)
     table = frame(
-        COLUMNS["prognosis"],
+        "prognosis",
         prognosis_rows(summarise_life(life, load_stage("lms-y")), decide(life, Decision()), before),
     )
     assert list(table.columns[-3:]) == ["before", "probability_at_least", "probability_at_most"]
@@ -285,7 +288,7 @@ def test_a_requested_day_has_columns_of_its_own() -> None:
 def test_refusals_are_rows() -> None:
     """Log, channel, mode, source, reason and detail are written unchanged."""
     refusal = Refusal("a.h5", "flat", 'all "0", really', channel="acc_x")
-    table = frame(COLUMNS["refused"], refused_rows([refusal]))
+    table = frame("refused", refused_rows([refusal]))
     assert table.iloc[0].tolist() == ["a.h5", "acc_x", "", "", "flat", 'all "0", really']
 
 
@@ -301,7 +304,7 @@ def test_the_columns_are_those_of_the_contract() -> None:
         "refused": "log channel mode source reason detail",
     }
     for name, columns in wanted.items():
-        assert set(columns.split()) <= set(COLUMNS[name].split())
+        assert set(columns.split()) <= set(TABLES[name].names)
 
 
 def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> None:
@@ -324,9 +327,10 @@ def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> Non
 
 
 def test_lines_have_the_keys_of_the_contract() -> None:
-    """A line has frequency, amplitude with unit, kind and channel."""
-    (row,) = lines_rows([Line(50.0, 0.1, "m/s²", "mains", "acc_x")])
+    """A line has its log, frequency, amplitude with unit, kind and channel."""
+    (row,) = lines_rows("a.h5", [Line(50.0, 0.1, "m/s²", "mains", "acc_x")])
     assert row == {
+        "log": "a.h5",
         "frequency_hz": 50.0,
         "amplitude": 0.1,
         "unit": "m/s²",

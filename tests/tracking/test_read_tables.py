@@ -14,7 +14,7 @@ from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import BadTable
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.tables import COLUMNS, frame, track_cov_rows, track_rows
+from lmshealth.report.tables import csv_text, track_tables
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import build_history
 from lmshealth.tracking.read_tables import read_drifts, read_estimates, read_machines
@@ -241,8 +241,8 @@ def test_what_a_track_writes_is_read_again(tmp_path: Path) -> None:
     drift[0], cov[0] = 0.0, 0.0
     drift[3, 2], cov[3, 2], cov[3, :, 2] = np.nan, np.nan, np.nan
     known = make_track(drift, cov)
-    for name, rows in (("track", track_rows(known)), ("track_cov", track_cov_rows(known))):
-        frame(COLUMNS[name], rows).to_csv(tmp_path / f"{name}.csv", index=False)
+    for name, rows in track_tables(known).items():
+        (tmp_path / f"{name}.csv").write_text(csv_text(name, rows), encoding="utf-8")
     (found,), notes = read_drifts(tmp_path / "track.csv", cross_terms=tmp_path / "track_cov.csv")
     assert notes == []
     assert (found.stage, found.modes) == (known.stage, known.modes)

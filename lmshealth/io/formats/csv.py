@@ -20,42 +20,57 @@ import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
-from lmshealth.io.column_map import ColumnMap, role_of
-from lmshealth.io.formats.content import GZIP, Content, Format, check_size, not_numeric
+from lmshealth.io.column_map import ColumnMap, Segments, role_of
+from lmshealth.io.formats.channels import SinceFirst, choose, parse_moments
+from lmshealth.io.formats.content import GZIP, Content, Format, check_size, describe, not_numeric
 from lmshealth.io.formats.dialect import (
     Dialect,
-    encoding_of,
     fields_of,
     find_dialect,
     is_number_or_moment,
+    stated_dialect,
 )
-from lmshealth.io.formats.foreign import describe
-from lmshealth.io.formats.moments import SinceFirst, parse_moments
-from lmshealth.io.formats.text_layouts import LAYOUTS
-from lmshealth.io.formats.unit_channels import choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 # The filters of warnings belong to the process, which threads share.
 _WARNINGS = threading.Lock()
 _BOM = b"\xef\xbb\xbf"
-_LABVIEW = b"LabVIEW Measurement"
 # First bytes and lines from which the dialect is found.
 _HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
 # Rows per block, fewer of wide tables: a block stays in the processor's cache.
 _ROWS = 1 << 16
 _FIELDS = 1 << 18
 _NO_ROWS = "a header line and no rows; needed rows"
-# Lines of a LabVIEW measurement that are no rows, and those of them that all segments share.
+# Lines of further headers, which are no rows.
 _MAY_BE_MIXED = re.compile(rb"\n[A-Za-z*\r\n]")
 _NO_ROW = re.compile(rb"^(?:[A-Za-z*][^\n]*|[ \t\r]*)\n", re.MULTILINE)
-_SEGMENT = re.compile(
-    rb"^(X_Value|Channels|Y_Unit_Label|Delta_X)(?:[\t,]([^\n]*)|\r?$)", re.MULTILINE
-)
 # Message of pandas for a row with too many fields.
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # Most bytes of text behind the rows: rates, counts and ends that exporters write there.
 _TRAILER = 1 << 12
 _WORD = re.compile(r"[^\W\d_]{3}")
+
+
+def encoding_of(head: bytes) -> str:
+    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
+    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
+    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
+    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
+        return marked
+    # Without a mark: Latin letters in two bytes each, of which one is zero.
+    for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
+        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
+            return name
+    try:
+        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
+        return "utf-8"
+    except UnicodeDecodeError:
+        from charset_normalizer import from_bytes
+
+        found = from_bytes(head).best()
+    # µ, ° and ² are these bytes in the Windows code page of Western Europe.
+    western = found is None or any(mark in head for mark in b"\xb5\xb0\xb2")
+    return "cp1252" if western or found is None else found.encoding
 
 
 class Text:
@@ -173,18 +188,14 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     start = stream.read(_HEAD_BYTES)
     encoding = columns.csv.encoding or encoding_of(start)
     guessed = [f"{encoding} text"] if encoding != "utf-8" else []
-    if start.startswith(_LABVIEW):
-        stream = _Measurement(stream, start)
     if encoding.startswith(("utf-16", "utf-32")):
         stream, stored = codecs.EncodedFile(stream, "utf-8", encoding), 4 * stored
         encoding = "utf-8"
     text = Text(stream, stored)
     lines = _head(text, encoding)
-    if lines and lines[0].startswith("DIAEXTENDED"):
-        detail = "the header of a DIAdem file, whose numbers are in others"
-        raise Unusable("format", f"{detail}; export the data as TDMS or CSV")
-    stated = next((d for layout in LAYOUTS if (d := layout(lines)) is not None), None)
-    dialect = stated or find_dialect(lines, columns)
+    dialect = stated_dialect(lines, columns) or find_dialect(lines, columns)
+    if dialect.segments:
+        text = Text(_SegmentStream(stream, dialect, dialect.segments), stored)
     guessed += dialect.guessed
     chosen, content = choose(dialect.channels, columns)
     metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
@@ -196,35 +207,38 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     elif not (dialect.has_rows or columns.csv.delimiter) and len(lines) > dialect.start:
         detail = "text without rows of numbers; needed a line of names and rows of samples"
         raise Unusable("format", detail)
-    elif isinstance(stream, _Measurement):  # segments that cannot be read are named before names
+    elif dialect.segments:  # segments that cannot be read are named before names
         text.begin(dialect.start)
-        while stream.read(_HEAD_BYTES):
+        while text.read(_HEAD_BYTES):
             pass
     return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
-class _Measurement:
-    """A LabVIEW measurement, of which `read` leaves out the headers of later segments.
+class _SegmentStream:
+    """A text of several segments, of which `read` leaves out the headers of later ones.
 
-    `Unusable` (``format``) for segments without X values, which place them in time, with or without
-    headers of their own, and for segments of other channels.
+    `Unusable` (``format``) for segments without one column of times, which places them in time,
+    with or without headers of their own, and for segments of other columns.
     """
 
-    def __init__(self, stream: IO[bytes], start: bytes) -> None:
-        self._stream = stream
-        header = start[: start.find(b"\nX_Value") + 1]
-        names = start[len(header) :].split(b"\n", 1)[0]
-        separator = b"," if b"\nSeparator," in header else b"\t"
-        pairs = (line.rstrip().partition(separator) for line in (*header.splitlines(), names))
-        self._keys = {key: value for key, _, value in pairs}
-        self._is_timed = self._keys.get(b"X_Columns") == b"One"
+    def __init__(self, stream: IO[bytes], dialect: Dialect, segments: Segments) -> None:
+        self._stream, self._segments = stream, segments
         self.readline = stream.readline
+        stream.seek(0)
+        header = [stream.readline(constants.LONGEST_LINE).rstrip() for _ in range(dialect.start)]
+        delimiter = dialect.delimiter.encode()
+        pairs = (line.removeprefix(_BOM).partition(delimiter) for line in header)
+        self._keys = {key: value for key, _, value in pairs}
+        same = b"|".join(re.escape(key.encode()) for key in segments.same)
+        value = rb"(?:" + re.escape(delimiter) + rb"([^\n]*)|\r?$)"
+        self._shared = re.compile(rb"^(" + same + rb")" + value, re.MULTILINE)
+        self._is_timed = [channel.name for channel in dialect.channels].count("time") == 1
         self.seek(0)
 
     def seek(self, position: int) -> None:
         """Go to the beginning."""
         self._stream.seek(position)
-        sizes = re.findall(rb"\d+", self._keys.get(b"Samples", b""))
+        sizes = re.findall(rb"\d+", self._keys.get(self._segments.rows.encode(), b""))
         self._n_left = math.inf if self._is_timed or not sizes else max(map(int, sizes))
 
     def read(self, size: int) -> bytes:
@@ -235,15 +249,16 @@ class _Measurement:
             rows = block
             if _MAY_BE_MIXED.search(b"\n" + block):  # it is quick; most blocks are rows alone
                 rows = _NO_ROW.sub(b"", block)
-                for found in _SEGMENT.finditer(block):
-                    key, value = found[1], found[2].rstrip()
+                for match in self._shared.finditer(block):
+                    key, value = match[1], (match[2] or b"").rstrip()
                     if self._keys.get(key) != value or not self._is_timed:
                         text = f"{key.decode()} {value.decode('cp1252')}"
-                        raise self._refusal(-block.count(b"\n", found.start()), text)
+                        raise self._refusal(-block.count(b"\n", match.start()), text)
             if self._n_left < math.inf:
                 self._n_left -= rows.count(b"\n")
             if self._n_left < 0:
-                raise self._refusal(int(self._n_left), "more rows than Samples states")
+                found = f"more rows than {self._segments.rows} states"
+                raise self._refusal(int(self._n_left), found)
         return rows
 
     def _refusal(self, n_more: int, found: str) -> Unusable:
@@ -251,7 +266,7 @@ class _Measurement:
         end = self._stream.tell()
         self._stream.seek(0)
         line = self._stream.read(end).count(b"\n") + n_more + 1
-        needed = "needed X_Columns One, and the same channels in all segments"
+        needed = f"needed {self._segments.needed}, and the same channels in all segments"
         return Unusable("format", f"line {line}: a further segment, {found}; {needed}")
 
 

@@ -1,20 +1,34 @@
 """Dialect of delimited text: encoding, delimiter, decimal mark, names and units of the columns.
 
-All of it is found from the first lines of the file, unless the column map states it. A layout of a
-vendor (`text_layouts`) states it in a header of its own.
+All of it is found from the first lines of the file, unless the column map states it, or a layout
+(`layouts/*.toml`, and those of the user) recognises a header of a program.
 """
 
-import codecs
 import csv
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from functools import cache, partial
+from pathlib import Path
 from statistics import median
 from typing import NamedTuple
 
-from lmshealth.io.column_map import ColumnMap, CsvLayout, unit_key
-from lmshealth.io.formats.unit_channels import Described
-from lmshealth.io.refusal import Unusable, corrupt
+from lmshealth.io import constants
+from lmshealth.io.column_map import (
+    DELIMITER,
+    SI_TIMES,
+    ColumnMap,
+    CsvLayout,
+    Layout,
+    Segments,
+    StartMoment,
+    load_layouts,
+    unit_key,
+)
+from lmshealth.io.formats.channels import Described, rate_of
+from lmshealth.io.metadata import moment_after
+from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Delimiters in the order in which equal candidates are preferred; a blank is any run of them.
 _DELIMITERS = ",;\t| :"
@@ -44,6 +58,9 @@ _MICRO = str.maketrans("µμ", "uu")
 _OTHER_UNITS = frozenset(
     "min h V mV Volt Volts N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
 )
+# Key of a moment without a time zone, which is no metadatum of a log.
+LOCAL_TIME = "local_time"
+_FILETIME_EPOCH = datetime(1601, 1, 1, tzinfo=UTC)
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,6 +78,7 @@ class Dialect:
     metadata: dict[str, str] = field(default_factory=dict)
     guessed: tuple[str, ...] = ()
     has_rows: bool = True
+    segments: Segments | None = None
 
 
 class _Rows(NamedTuple):
@@ -73,28 +91,6 @@ class _Rows(NamedTuple):
     n_fields: int
     delimiter: str
     decimal: str
-
-
-def encoding_of(head: bytes) -> str:
-    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
-    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
-    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
-    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
-        return marked
-    # Without a mark: Latin letters in two bytes each, of which one is zero.
-    for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
-        if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
-            return name
-    try:
-        codecs.getincrementaldecoder("utf-8-sig")().decode(head)
-        return "utf-8"
-    except UnicodeDecodeError:
-        from charset_normalizer import from_bytes
-
-        found = from_bytes(head).best()
-    # µ, ° and ² are these bytes in the Windows code page of Western Europe.
-    western = found is None or any(mark in head for mark in b"\xb5\xb0\xb2")
-    return "cp1252" if western or found is None else found.encoding
 
 
 def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
@@ -131,6 +127,44 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
     marks, has_rows = (found.delimiter, found.decimal), found.share > 0
     return Dialect(*marks, channels, found.first, metadata, guessed, has_rows)
+
+
+def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
+    """Read the dialect from the header of a text by its layout; None where none recognises it.
+
+    `Unusable`: ``format`` where several recognise it, ``corrupt`` for a header without what its
+    layout needs, ``metadata`` for a moment of another format.
+    """
+    text = "\n".join(line.rstrip("\r\n") for line in lines)
+    layouts = {one.name: one for one in (*_shipped(), *columns.layouts)}
+    fitting = [one for one in layouts.values() if one.recognises(text)]
+    if not fitting:
+        return None
+    layout = fitting[0]
+    if len(fitting) > 1:
+        step = "give recognise of one of them a further line"
+        raise Unusable("format", f"{listed(x.name for x in fitting)} are its layouts; {step}")
+    end = re.search(layout.rows_after, text, re.MULTILINE)
+    if end is None:
+        raise corrupt(f"is a {layout.name} without a line {layout.rows_after!r} before its rows")
+    start = text.count("\n", 0, end.end()) + (not end[0].endswith("\n"))
+    header, rows = "\n".join(text.split("\n")[:start]), text.split("\n")[start:]
+    if absent := [key for key in layout.required if f"\n{key}" not in f"\n{header}"]:
+        raise corrupt(f"is a {layout.name} without a line {listed(absent)} before its rows")
+    delimiter = _value(layout.delimiter, header) or " "
+    delimiter = chr(int(delimiter)) if re.fullmatch(r"\d{1,3}", delimiter) else delimiter
+    # The numbers of the first row may be whole.
+    has_commas = delimiter != "," and any("," in row for row in rows)
+    decimal = _value(layout.decimal, header) or ("," if has_commas else ".")
+    if len(delimiter) != 1 or decimal not in (".", ","):
+        marks = f"the delimiter {delimiter[:9]!r}, the decimal mark {decimal[:9]!r}"
+        raise corrupt(f"its header has {marks}")
+    row = fields_of(rows[0], delimiter) if rows else []
+    channels = _channels(layout, header, delimiter, row, columns)
+    found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}
+    metadata = {key: value.strip() for key, value in found.items() if value.strip()}
+    metadata |= _start(layout.start, header) if layout.start else {}
+    return Dialect(delimiter, decimal, channels, start, metadata, segments=layout.segments)
 
 
 def fields_of(line: str, delimiter: str) -> list[str]:
@@ -313,3 +347,99 @@ def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> 
         (where is None and layout.header is None, _UNNAMED),
     ]
     return tuple(text for differs, text in listed if differs)
+
+
+@cache
+def _shipped() -> tuple[Layout, ...]:
+    return load_layouts(Path(__file__).parent / "layouts")
+
+
+def _value(pattern: str | None, header: str) -> str:
+    """Return what the last match of a pattern finds, or a text as it is; empty where nothing."""
+    if pattern is None or not re.compile(pattern).groups:
+        return pattern or ""
+    found = [*re.finditer(pattern, header, re.MULTILINE)][-1:]
+    return "".join(match[match.re.groups] or "" for match in found)
+
+
+def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str]:
+    """Return what a pattern finds for each of ``n`` columns, or in a longer row for each field."""
+    if pattern and "column" in re.compile(pattern).groupindex:
+        found = {int(m["column"]): m[m.re.groups].strip()
+                 for m in re.finditer(pattern, header, re.MULTILINE)}  # fmt: skip
+        first = int(n in found)  # columns are counted from 1 where there is an n-th
+        return [found.get(k + first, "") for k in range(n)]
+    row = [one.strip() for one in fields_of(_value(pattern, header), delimiter)]
+    if len(row) == 1 < n:
+        return row * n
+    while row and not row[-1]:
+        row.pop()
+    return [*row, *[""] * (n - len(row))]
+
+
+def _channels(
+    layout: Layout, header: str, delimiter: str, row: Sequence[str], columns: ColumnMap
+) -> tuple[Described, ...]:
+    """Describe the columns of a first row: times, and channels with unit, rate and start."""
+    mark = re.escape(delimiter)
+    patterns = layout.names, layout.units, layout.interval, layout.offset
+    named, *others = (pattern and pattern.replace(DELIMITER, mark) for pattern in patterns)
+    rows = partial(_cells, header=header, delimiter=delimiter)
+    # A row of names may be longer than the rows; other names are as many as the fields.
+    names = rows(named, n=0)
+    if named and not names and "(?P<column>" not in named:
+        raise corrupt(f"its header has no row of names, {layout.names!r}")
+    names = names or rows(named, n=len(row))
+    units, intervals, offsets = (rows(pattern, n=len(names)) for pattern in others)
+    time, channels = layout.time, list[Described]()
+    timed = [k for k, name in enumerate(names)
+             if time and name == time.name and all(row[k : k + 1])]  # fmt: skip
+    for k in reversed(range(len(names))):
+        if time and k in timed:
+            # One of several has the rate and the start of the channel behind it.
+            own = channels[-1] if len(timed) > 1 and channels else Described("", "")
+            if len(timed) > 1 and own.rate is None:
+                raise corrupt(f"its header has no interval of samples for the column {own.name!r}")
+            channels.append(Described("time", time.unit, own.rate, start=own.start))
+            continue
+        interval = _number(intervals[k])
+        rate = rate_of(interval and interval * SI_TIMES[layout.interval_unit])
+        # One column of times places the samples of all channels.
+        start = 0.0 if len(timed) == 1 else _number(offsets[k]) or 0.0
+        one = _described(names[k] or str(k), "", columns)
+        if layout.units:  # "[g]", "g (Acceleration)"
+            unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]
+            one = Described(names[k] or str(k), unit.strip())
+        channels.append(replace(one, rate=rate, start=start))
+    return tuple(reversed(channels))
+
+
+def _start(start: StartMoment, header: str) -> dict[str, str]:
+    """Return the moment of the first sample as metadata; local time where there is no time zone."""
+    parts = [_value(pattern, header).strip() for pattern in start.find]
+    text = " ".join(parts)
+    if not all(parts):
+        return {}
+    try:
+        if start.format == "filetime":
+            ticks = int(text) // 10
+            moment = moment_after(_FILETIME_EPOCH, ticks, timedelta(microseconds=1))
+            return {"recorded_at": moment} if ticks else {}
+        if start.format == "unix":
+            return {"recorded_at": moment_after(constants.FIRST_MOMENT, float(text))}
+        if start.format != "iso":
+            found = datetime.strptime(text, start.format)
+        else:
+            found = datetime.fromisoformat(text.replace("/", "-").replace(",", "."))
+    except ValueError as error:
+        step = "correct the format of its layout"
+        raise Unusable("metadata", f"starts at {text!r}, no {start.format}; {step}") from error
+    return {"recorded_at" if found.tzinfo else LOCAL_TIME: found.isoformat()}
+
+
+def _number(text: str) -> float | None:
+    """Read a number with a decimal point or comma; None for any other text."""
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return None

@@ -15,17 +15,14 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Format, gzipped, load_by
+from lmshealth.io.formats.channels import without_epoch
+from lmshealth.io.formats.content import Content, Format, describe, gzipped, load_by
 from lmshealth.io.formats.csv import CSV
-from lmshealth.io.formats.foreign import describe
-from lmshealth.io.formats.hdf5 import HDF5
+from lmshealth.io.formats.instruments import RTX, TRACE
 from lmshealth.io.formats.isolation import read_isolated
-from lmshealth.io.formats.mat import MAT
-from lmshealth.io.formats.moments import without_epoch
-from lmshealth.io.formats.parquet import PARQUET
+from lmshealth.io.formats.native import HDF5, MAT, PARQUET
 from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
-from lmshealth.io.formats.vendor_files import RTX, TRACE
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Exporters use them for delimited text, and people for notes: such files are read where they are

@@ -18,6 +18,7 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, role_of
+from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
     Content,
     Format,
@@ -26,8 +27,6 @@ from lmshealth.io.formats.content import (
     library,
     not_numeric,
 )
-from lmshealth.io.formats.moments import SinceFirst
-from lmshealth.io.formats.unit_channels import Described, choose, rate_of
 from lmshealth.io.metadata import KEYS, as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed
 

@@ -234,7 +234,12 @@ def _fit_bands(
         reach = _reach(duration, group[-1])
         ends = max(group[0] - reach, 1.5 / duration), min(group[-1] + reach, 0.49 * log.sample_rate)
         inside = max(low, limits[0]), min(high, limits[1])
-        bands += _fit_band(cut, log.sample_rate, ends, channels, inside)
+        try:
+            bands += _fit_band(cut, log.sample_rate, ends, channels, inside)
+        except np.linalg.LinAlgError as error:
+            found = f"noise from {ends[0]:.4g} to {ends[1]:.4g} Hz is below rounding beside decays"
+            needed = "needed are samples as measured, with their noise"
+            raise BadLog(log.name, "not-identified", f"{found}; {needed}") from error
     return bands
 
 

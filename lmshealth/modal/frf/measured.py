@@ -3,10 +3,12 @@
 The README of the folder lists the columns of a table.
 """
 
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
+from xml.etree.ElementTree import Element, ParseError, parse
 
 import numpy as np
 
@@ -16,13 +18,13 @@ from lmshealth.io import constants as limits
 from lmshealth.io.column_map import RESPONSE_COLUMN, ColumnMap, parse_column, role_of
 from lmshealth.io.formats.content import Content, unpacked
 from lmshealth.io.formats.csv import CSV
+from lmshealth.io.formats.instruments import TRACE
 from lmshealth.io.formats.registry import confirm, format_name, load
 from lmshealth.io.formats.uff import UFF, Function, load_functions
-from lmshealth.io.formats.vendor_files import TRACE, response_functions
 from lmshealth.io.log import SI_UNITS, Metadata
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
-from lmshealth.io.refusal import Unusable, listed, shown, visible
+from lmshealth.io.refusal import Unusable, corrupt, listed, shown, visible
 from lmshealth.modal import constants
 from lmshealth.modal.frf.rational import Ordinates
 from lmshealth.modal.frf.responses import Frf, average_noise
@@ -32,6 +34,9 @@ _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}
 _PER = {"n": 1.0, "kn": 1e3, "a": 1.0, "ma": 1e-3, "v": 1.0, "mv": 1e-3}
 _PARTS = "needed real and imag, or magnitude (or db) and phase_deg (or phase_rad)"
 _ROUNDING = 1e-9
+# Digits of base 85 that the control writes, and its name of spectra of one signal.
+_DIGITS = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ!#$`()*+-/:;=?@[]^_{|}~"
+_AUTO = "m_autospectrumInfo"
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -80,9 +85,9 @@ def read_responses(
             confirm(path)
             with unpacked(path) as file:
                 functions = (load_functions(file, max_memory) if form == UFF.name
-                             else response_functions(file))  # fmt: skip
+                             else _of_sinumerik(file))  # fmt: skip
         else:
-            own = _ResponseColumns(columns=given.columns, csv=given.csv)
+            own = _ResponseColumns(columns=given.columns, csv=given.csv, layouts=given.layouts)
             content = load(path, own, max_memory)
             functions, stated = _tabulated(content, own), content.metadata
         metadata, _ = parse_metadata(stated | given.constants() | dict(overrides or {}), latest)
@@ -102,6 +107,76 @@ def read_responses(
         # As for logs, whatever a library raises on a damaged file ends only this file.
         detail = f"cannot be read ({type(error).__name__}: {error}); copy the file again"
         raise BadLog(label, "corrupt", visible(detail)) from error
+
+
+def _of_sinumerik(path: Path) -> list[Function]:
+    """Read the responses of a SINUMERIK servo tuning, or of a response test from its spectra (H1).
+
+    The convention of the cross spectrum is that of a public sample with its time series. A trace
+    has none. `Unusable` (``corrupt``) for numbers that are cut off or do not fit together.
+    """
+    try:
+        root = parse(path).getroot()  # noqa: S314
+        named = {what: [e for e in root.iter("FrequencyResponseFunction") if e.get("name") == what]
+                 for what in ("m_pPlant", "m_pMeasCoherence")}  # fmt: skip
+        plants, coherences = named.values()
+        functions = []
+        for k, plant in enumerate(plants):
+            name = "plant" if len(plants) == 1 else f"plant_{k + 1}"
+            functions.append(Function(name, "setpoint", *_spectrum(plant), False, ""))
+            if len(coherences) == len(plants):
+                functions.append(Function(name, "setpoint", *_spectrum(coherences[k]), True, ""))
+        nodes = {
+            _field(node, "m_iUniqueInstanceId"): node for node in root.iter("PlatformSignalNode")
+        }
+        for pair in root.iter("PrimaryFreqRespSigNodeData"):
+            used = [
+                nodes[_field(pair, f"m_i{w}SigNodeUniqueInstanceID")] for w in ("Input", "Output")
+            ]
+            ids = [_field(node, "m_uNodeId") for node in used]
+            crosses = (
+                e for e in used[1].iter("SigNodeCrossSpectrumInfo") if e.get("name") != _AUTO
+            )
+            cross = next(e for e in crosses if _field(e, "m_uSignodeId") == ids[0])
+            auto = [next(e for e in node.iter() if e.get("name") == _AUTO) for node in used]
+            frequency, values = _spectrum(cross)
+            powers = [_spectrum(e)[1].real for e in auto]
+            coherence = np.abs(values) ** 2 / (powers[0] * powers[1])
+            place = f"node_{ids[1]}", f"node_{ids[0]}", frequency
+            functions.append(Function(*place, values.conj() / powers[0], False, ""))
+            functions.append(Function(*place, coherence.astype(np.complex128), True, ""))
+        return functions
+    except (ParseError, ValueError, KeyError, StopIteration) as error:
+        raise corrupt(f"the responses cannot be read: {error!r}") from error
+
+
+def _field(element: Element, name: str) -> str:
+    """Return the text of a child by its name, empty where there is none."""
+    return next((child.text or "" for child in element if child.get("name") == name), "").strip()
+
+
+def _spectrum(element: Element) -> tuple[FloatArray, ComplexArray]:
+    """Read frequencies in Hz and complex values, ``(n_lines,)`` each."""
+    arrays = {
+        e.get("name"): _doubles(e.findtext("raw") or "") for e in element.iter("NumericArray")
+    }
+    frequency, values = arrays["m_FrequencyVector"], arrays["m_ValueVector"]
+    if values.size != 2 * frequency.size:
+        raise ValueError(f"{values.size} values at {frequency.size} frequencies")
+    return frequency, values.view(np.complex128)
+
+
+def _doubles(text: str) -> FloatArray:
+    """Decode float64 values of two words each: five digits of base 85, or a point for zero."""
+    text = "".join(text.split())
+    words = re.findall(r"\.|[^.]{5}", text)
+    if sum(map(len, words)) != len(text) or len(words) % 2:
+        raise ValueError("numbers are cut off")
+    numbers = [0 if word == "." else sum(85**k * _DIGITS.index(c) for k, c in enumerate(word[::-1]))
+               for word in words]  # fmt: skip
+    if max(numbers, default=0) >= 1 << 32:
+        raise ValueError("a word is no number of 32 bits")
+    return np.array(numbers, dtype=">u4").view(">f8").astype(np.float64)
 
 
 def _tabulated(content: Content, columns: _ResponseColumns) -> list[Function]:

@@ -12,7 +12,7 @@ import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats import hdf5
+from lmshealth.io.formats import native
 from lmshealth.io.formats.registry import load
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
@@ -223,8 +223,8 @@ def test_a_block_that_is_read_as_zeros_is_refused(tmp_path):
     values[100:200] = 0
     with h5py.File(tmp_path / "log.h5", "w") as file:
         item = file.create_dataset("acc_x_g", data=values, chunks=(100,), compression="gzip")
-        hdf5._check_blocks(item, values, 0)
+        native._check_blocks(item, values, 0)
         lost = values.copy()
         lost[300:] = 0
         with pytest.raises(Unusable, match="from 300 on are read as zeros"):
-            hdf5._check_blocks(item, lost, 0)
+            native._check_blocks(item, lost, 0)

@@ -18,13 +18,13 @@ from lmshealth.io.buffers import as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats import registry
 from lmshealth.io.formats.content import Content, Format, wanted
+from lmshealth.io.formats.instruments import RTX, TRACE
 from lmshealth.io.formats.uff import UFF
-from lmshealth.io.formats.vendor_files import RTX, TRACE
 from lmshealth.io.manifest import find_logs
 from lmshealth.io.reading import read_log
 from lmshealth.testing import check_format
 from tests.io.conftest import META, signals, write, write_uff
-from tests.io.formats.test_vendor_files import rtx, trace
+from tests.io.formats.test_instruments import rtx, trace
 
 X = np.random.default_rng(2).normal(0, 1, 64)
 

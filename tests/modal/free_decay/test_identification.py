@@ -66,6 +66,26 @@ def test_the_unit_of_the_signal_does_not_matter() -> None:
     np.testing.assert_allclose(two.cov, one.cov, rtol=1e-3, atol=1e-12)
 
 
+def test_decays_without_noise_are_refused() -> None:
+    """Calculated decays of two channels have no noise for a likelihood; the control has."""
+    n, f = 200, 60.0
+    time, rng = np.arange(n) / RATE, np.random.default_rng(0)
+    decay = np.exp(-2 * np.pi * f * 0.01 * time)
+    channels = {
+        f"acc_{k}": np.concatenate(
+            [a * decay * np.cos(2 * np.pi * f * time + p) for a, p in rng.random((2, 2))]
+        )
+        for k in range(2)
+    }
+    pieces = [(0, n), (n, 2 * n)]
+    with pytest.raises(BadLog) as caught:
+        of_pieces(make_log(channels, RATE, pieces=pieces))
+    assert caught.value.reason == "not-identified"
+    noisy = {name: x + 1e-3 * rng.standard_normal(x.size) for name, x in channels.items()}
+    modes = of_pieces(make_log(noisy, RATE, pieces=pieces))
+    np.testing.assert_allclose(modes.frequency, [f], rtol=1e-3)
+
+
 def test_decays_are_those_after_the_moves_of_the_set_point() -> None:
     """A log that moves and stops twice is cut by its set point; motion is ignored."""
     rng = np.random.default_rng(4)

@@ -15,7 +15,7 @@ import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.foreign import describe, frequency_column
+from lmshealth.io.formats.content import describe, frequency_column
 from lmshealth.io.reading import read_log
 from lmshealth.stage.proposal import propose
 from studies.inputs.outside_faults.no_logs import LINES, NO_LOGS, NODES, sound, zipped
