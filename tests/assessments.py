@@ -158,7 +158,7 @@ def make_prognosis(
         ),
         np.column_stack([rng.normal(floor, 0.03, n), 1.5e6 * np.exp(rng.normal(0, 0.15, n))]),
     )
-    passed = [law.passage(t, x) for law, t, x in zip(laws, theta, limits, strict=True)]
+    passed = [law.passage(t, np.array(x)) for law, t, x in zip(laws, theta, limits, strict=True)]
     remaining = np.column_stack(passed) - now
     horizon = 20e6
     grid = np.linspace(0, now + horizon, 240)
@@ -357,7 +357,12 @@ def watch(browser: Any, path: Path, scheme: str = "light", width: int = 1280) ->
     seen: list[str] = []
     page.on("console", lambda message: seen.append(message.text))
     page.on("pageerror", lambda error: seen.append(str(error)))
-    page.on("dialog", lambda dialog: (seen.append(dialog.message), dialog.dismiss()))
+
+    def dismiss(dialog: Any) -> None:
+        seen.append(dialog.message)
+        dialog.dismiss()
+
+    page.on("dialog", dismiss)
     outside = ("data:", path.as_uri())
     page.on(
         "request",

@@ -153,7 +153,7 @@ class _Judgement:
     """Gathers the claims of all tests, from wherever they ran."""
 
     def __init__(self) -> None:
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[Any] = []
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Take the claims of a test."""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
+from numpy.typing import NDArray
 from scipy import stats
 from scipy.linalg import cho_factor, cho_solve
 
@@ -145,7 +146,7 @@ def _reference(history: History, mode: str) -> Series:
 
 def _data(
     history: History, known: Known, wander: Wander, k: int
-) -> tuple[FloatArray, FloatArray, FloatArray]:
+) -> tuple[FloatArray, FloatArray, NDArray[np.intp]]:
     """Values of one log that exist, their covariance, and their rows in [ln f, ln ζ]."""
     r = len(history.series)
     values = np.r_[history.ln_frequency[k], history.ln_damping[k]]
@@ -192,16 +193,16 @@ class Textbook:
                 p[self.at[name, i]] = std**2
                 if curvature:
                     p[self.at[name + "^2", i]] = curvature**2
-        for name in self.names:
-            if name[0] == "bias f":
-                p[self.at[name]] = BIAS[0] ** 2
-            if name[0] == "bias z":
-                p[self.at[name]] = BIAS[1] ** 2
+        for key in self.names:
+            if key[0] == "bias f":
+                p[self.at[key]] = BIAS[0] ** 2
+            if key[0] == "bias z":
+                p[self.at[key]] = BIAS[1] ** 2
         cov, m = np.diag(p), len(history.modes)
         rates, wanders = self.all("rate"), self.all("wander")
         cov[np.ix_(rates, rates)] = self.wander.rate**2 * _alike(COMMON_RATE, m)
-        std = self.wander.stds(history)
-        cov[np.ix_(wanders, wanders)] = np.outer(std, std) * _alike(COMMON_WANDER, m)
+        stds = self.wander.stds(history)
+        cov[np.ix_(wanders, wanders)] = np.outer(stds, stds) * _alike(COMMON_WANDER, m)
         return x, cov
 
     def all(self, part: str) -> list[int]:
@@ -305,7 +306,7 @@ def kalman(history: History, wander: Wander, known: Known) -> Followed:
             gain = np.linalg.solve(s, h @ p).T
             innovation = y - h @ x
             nis = float(innovation @ np.linalg.solve(s, innovation))
-            evidence += stats.multivariate_normal.logpdf(innovation, cov=s)
+            evidence += float(stats.multivariate_normal.logpdf(innovation, cov=s))
             x, p = x + gain @ innovation, p - gain @ h @ p
         out.append((told @ x, np.einsum("pia,ab,qjb->piqj", told, p, told), evidence, nis))
     return Followed(*(np.array(part) for part in zip(*out, strict=True)))
@@ -399,10 +400,11 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
     """
     n, m, r = len(history.logs), len(history.modes), len(history.series)
     # Data in the order (log, [ln f, ln ζ] of all series); truth in the order (log, part, mode).
-    total = np.zeros((n, 2, r, n, 2, r), dtype=np.longdouble)
-    cross = np.zeros((n, 2, m, n, 2, r), dtype=np.longdouble)
-    own = np.zeros((n, 2, m, n, 2, m), dtype=np.longdouble)
-    centre, prior = np.zeros((n, 2, r)), np.zeros((n, 2, m))
+    total: np.ndarray = np.zeros((n, 2, r, n, 2, r), dtype=np.longdouble)
+    cross: np.ndarray = np.zeros((n, 2, m, n, 2, r), dtype=np.longdouble)
+    own: np.ndarray = np.zeros((n, 2, m, n, 2, m), dtype=np.longdouble)
+    centre: np.ndarray = np.zeros((n, 2, r))
+    prior: np.ndarray = np.zeros((n, 2, m))
     values = np.stack([history.ln_frequency, history.ln_damping], axis=1)
     *truths, shared = _levels(history, wander, known)
     _between(history, wander, shared, (total, cross, own))
@@ -666,7 +668,7 @@ def complex_normal_log_density(
         # Real and imaginary parts as one real normal vector of twice the size.
         real = np.block([[matrix.real, -matrix.imag], [matrix.imag, matrix.real]]) / 2
         parts = np.concatenate([vector.real, vector.imag])
-        total += stats.multivariate_normal.logpdf(parts, cov=real)
+        total += float(stats.multivariate_normal.logpdf(parts, cov=real))
     return float(total)
 
 

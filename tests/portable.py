@@ -51,7 +51,8 @@ def hide(root: Path, hidden: set[str]) -> None:
                 return reduced[name]
         return original(name, space, *rest, **named)
 
-    builtins.__import__ = imported
+    # Typeshed has no place for further arguments.
+    builtins.__import__ = imported  # type: ignore[assignment]
 
 
 def main(root: Path) -> int:

@@ -42,7 +42,7 @@ def test_the_family_fails_as_seldom_as_stated(common: float) -> None:
     z = np.sqrt(common) * shared + np.sqrt(1 - common) * rng.standard_normal((n, m))
     p = stats.norm.sf(z)
     p[:, :false] = 1e-9
-    wrong = sum(holm(own, 0.05, m)[1][false:].any() for own in p)
+    wrong = sum(bool(holm(own, 0.05, m)[1][false:].any()) for own in p)
     assert evidence.at_most(wrong, n, 0.05) > 1e-6
     if common == 0:
         assert evidence.as_often(wrong, n, 1 - (1 - 0.05 / 40) ** 40) > 1e-6

@@ -47,12 +47,16 @@ def needed(name: str, extras: frozenset[str], found: dict[str, Distribution]) ->
         needed(requirement.name, frozenset(requirement.extras), found)
 
 
+def _first(one: Distribution, field: str) -> str:
+    return (one.metadata.get_all(field) or [""])[0]
+
+
 def licence(one: Distribution) -> str:
     """Return the licence that a distribution states: as expression, classifiers or first line."""
-    stated = one.metadata.get("License-Expression") or ""
+    stated = _first(one, "License-Expression")
     classifiers = one.metadata.get_all("Classifier") or ()
     stated = stated or " ".join(c for c in classifiers if c.startswith("License ::"))
-    return stated or (one.metadata.get("License") or "").strip().partition("\n")[0]
+    return stated or _first(one, "License").strip().partition("\n")[0]
 
 
 def refused(licences: dict[str, str]) -> dict[str, str]:

@@ -29,7 +29,8 @@ def unsafe(source: str) -> list[str]:
         if isinstance(node, ast.Import):
             found += [a.name for a in node.names if a.name.split(".")[0] in _UNSAFE]
         elif isinstance(node, ast.ImportFrom):
-            found += [node.module] if (node.module or "").split(".")[0] in _UNSAFE else []
+            module = node.module or ""
+            found += [module] if module.split(".")[0] in _UNSAFE else []
         elif isinstance(node, ast.keyword):
             value = isinstance(node.value, ast.Constant) and node.value.value
             found += [node.arg] if node.arg in ("allow_pickle", "shell") and value else []

@@ -180,7 +180,7 @@ def test_columns_of_results_are_those_of_their_tables() -> None:
         table, found = TABLES[name], list(result.to_frame())
         own = [column for column in found if column in table.names]
         further = {one.names.partition("<")[0] for one in table.further} - {""}
-        assert all(c.startswith(tuple(further)) for c in found if c not in own)
+        assert all(str(c).startswith(tuple(further)) for c in found if c not in own)
         if name != "prognosis":  # its frame has the probabilities in another order
             assert own == [column for column in table.names if column in own]
 

@@ -107,10 +107,10 @@ def test_the_machine_that_loses_stiffness_is_found(followed: Followed) -> None:
     assert events.loc[events["kind"] == "alarm", "stage"].tolist() == ["bench-B"]
     prognosis = pd.read_csv(followed.folder / "prognosis.csv")
     left = prognosis[prognosis["parameter"] == "coupling_stiffness"].set_index("stage")
-    assert left.loc["bench-A", "probability_beyond_horizon"] > 0.9
+    assert left["probability_beyond_horizon"]["bench-A"] > 0.9
     last = float(pd.read_csv(followed.folder / "modes.csv")["travel_km"].max())
     end = (1 - float(np.sqrt(LIMIT))) / SLOWER * APART_H - last
-    assert left.loc["bench-B", "rul_km_q05"] <= end <= left.loc["bench-B", "rul_km_q95"]
+    assert left["rul_km_q05"]["bench-B"] <= end <= left["rul_km_q95"]["bench-B"]
 
 
 @pytest.mark.study

@@ -137,7 +137,7 @@ def recording(channels: int, rate: float, seconds: float) -> Columns:
         responses.append(own / own.std())
     shapes = rng.standard_normal((channels, len(MODES)))
     return {
-        f"acc_{k:03d}_m_s2": np.float32(shape @ responses + NOISE * rng.standard_normal(n))
+        f"acc_{k:03d}_m_s2": (shape @ responses + NOISE * rng.standard_normal(n)).astype(np.float32)
         for k, shape in enumerate(shapes)
     }
 

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[2]
 def checkout(revision: str, folder: Path) -> Iterator[Path]:
     """Make a worktree of a revision while a block runs, unless the folder has it already."""
 
-    def git(*words: object) -> None:
+    def git(*words: str | Path) -> None:
         subprocess.run(["git", "worktree", *words], cwd=ROOT, check=True, capture_output=True)
 
     if folder.exists():

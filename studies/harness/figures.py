@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from textwrap import shorten
+from typing import Any
 
 import matplotlib
 from matplotlib.figure import Figure
@@ -17,7 +18,7 @@ FEWEST = 3
 _MET, _NOT_MET, _CONTROL = "#0072b2", "#d55e00", "#999999"
 _WIDTH, _LINE, _AXIS = 9.0, 0.24, 0.7  # inches
 _LETTERS = 78
-_SETTINGS = {"svg.hashsalt": "shares", "svg.fonttype": "none", "font.size": 8}
+_SETTINGS: dict[Any, object] = {"svg.hashsalt": "shares", "svg.fonttype": "none", "font.size": 8}
 
 
 def shown(claims: Sequence[Claim]) -> list[Claim]:

@@ -49,9 +49,10 @@ ASKED = (("lms-y", "guide_preload"), ("lms-y", "mount_stiffness"), ("lms-x", "gu
 # What no log shows: the mount that the housing of X is bolted to over its full surface.
 UNSEEN = ("lms-x", "mount_stiffness")
 DURATIONS = (10.0, 15.0, 20.0, 30.0, 45.0, 60.0, 90.0, 120.0, 180.0, 300.0, 450.0, 600.0)
-COUNTS = (1, 2, 3, 5, 8, 12, 20, 30, 50, 100)
+COUNTS: tuple[int, ...] = (1, 2, 3, 5, 8, 12, 20, 30, 50, 100)
 CHECKED = ((20.0, 1), (60.0, 5), (300.0, 20))
-RAW_DURATIONS, RAW_LOGS = (10.0, 20.0, 60.0, 120.0), 16
+RAW_DURATIONS: tuple[float, ...] = (10.0, 20.0, 60.0, 120.0)
+RAW_LOGS = 16
 SEED = 31
 
 
@@ -104,12 +105,12 @@ def smallest_losses(name: str, parameter: str, counts: tuple[int, ...]) -> Row:
 
 def refused(name: str, parameter: str) -> Row:
     """Return the answer of planning to a parameter that the modes do not constrain."""
-    said = None
+    message = None
     try:
         plan(load_stage(name), parameter, 0.05)
     except BadQuestion as error:
-        said = str(error)
-    return {"stage": name, "parameter": parameter, "message": said}
+        message = str(error)
+    return {"stage": name, "parameter": parameter, "message": message}
 
 
 def checks(name: str, parameter: str, trials: int) -> list[Row]:

@@ -67,14 +67,14 @@ def one_pair(seed: int, apart: bool) -> Row:
         (drifts_of(y_stage, other if apart else preload, mount_y, rng), y_stage),
     ]
     both = infer_together(machines, [SHARED], (SEED, seed))
-    row = {"together": told(both, (preload, mount_x, mount_y))}
+    row = {"together": judged_health(both, (preload, mount_x, mount_y))}
     if not apart:
-        row["X alone"] = told(infer(*machines[0], (SEED, seed)), (preload, mount_x))
-        row["Y alone"] = told(infer(*machines[1], (SEED, seed)), (preload, mount_y))
+        row["X alone"] = judged_health(infer(*machines[0], (SEED, seed)), (preload, mount_x))
+        row["Y alone"] = judged_health(infer(*machines[1], (SEED, seed)), (preload, mount_y))
     return row
 
 
-def told(health: Health, truth: tuple[float, ...]) -> Row:
+def judged_health(health: Health, truth: tuple[float, ...]) -> Row:
     """Return for each parameter the level of the truth, the width of ln, and whether it is claimed.
 
     ``half_level`` is the level in the posterior shrunk to half its width about its median.
@@ -100,11 +100,11 @@ def judged(rows: list[Row], level_name: str = "level") -> list[Row]:
 
 def summary(rows: list[Row]) -> Row:
     """Summarise one parameter over all trials."""
-    width, told = (
-        np.median([row["width"] for row in rows]),
-        np.mean([row["published"] for row in rows]),
-    )
-    return {"coverage": judged(rows), "median_width": float(width), "published": float(told)}
+    return {
+        "coverage": judged(rows),
+        "median_width": float(np.median([row["width"] for row in rows])),
+        "published": float(np.mean([row["published"] for row in rows])),
+    }
 
 
 def main() -> None:
@@ -144,7 +144,7 @@ def verdicts(answer: Row, *, quick: bool) -> dict[str, bool]:
     checks = {
         "all intervals cover": all(row["holds"] for row in rows),
         "the mount of X is never claimed": all(own["published"] == 0 for own in mounts),
-        "preload and the mount of Y are told": all(own["published"] == 1 for own in known),
+        "preload and the mount of Y are claimed": all(own["published"] == 1 for own in known),
         "together the preload is known better than from Y": gain > 1,
     }
     if not quick:
@@ -176,8 +176,8 @@ def claims(answer: Row) -> Iterator[Claim]:
             + percents(row["share"] for row in controls),
         )
     mounts = [ways["X alone"]["mount_stiffness"], ways["together"]["lms-x:mount_stiffness"]]
-    told = [own["published"] for own in mounts]
-    yield Claim("how often the mount of X is claimed", percents(told), "", "", not any(told))
+    shares = [own["published"] for own in mounts]
+    yield Claim("how often the mount of X is claimed", percents(shares), "", "", not any(shares))
 
 
 if __name__ == "__main__":

@@ -148,8 +148,10 @@ def record(rng: np.random.Generator, frequency: Array, damping: Array) -> Log:
 def oscillate(omega: float, zeta: float, force: Array) -> Array:
     """Return displacement and acceleration under a force constant between samples, ``(2, n)``."""
     back = [-(omega**2), -2 * zeta * omega]
-    system = [[0.0, 1.0], back], [[0.0], [1.0]], [[1.0, 0.0], back], [[0.0], [1.0]]
-    numerators, denominator = ss2tf(*cont2discrete(tuple(map(np.array, system)), 1 / RATE)[:4])
+    force_in = np.array([[0.0], [1.0]])
+    a, c = np.array([[0.0, 1.0], back]), np.array([[1.0, 0.0], back])
+    *system, _ = cont2discrete((a, force_in, c, force_in), 1 / RATE)
+    numerators, denominator = ss2tf(*system)
     return np.stack([lfilter(numerator, denominator, force) for numerator in numerators])
 
 

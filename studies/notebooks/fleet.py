@@ -22,7 +22,7 @@ folder = Path(tempfile.mkdtemp())
 lives = {"LMS-1-Y": "healthy", "LMS-2-Y": "preload-wear", "LMS-3-Y": "sudden-loosening"}
 for seed, life in enumerate(lives.values(), start=1):
     options = f"lms-y --life {life} --logs 9 --seconds 10 --seed {seed} --workers 1".split()
-    out = ["--out", folder / "logs" / life]
+    out = ["--out", str(folder / "logs" / life)]
     subprocess.run(
         [sys.executable, "-m", "models", "simulate", *options, *out],
         check=True,
@@ -52,8 +52,8 @@ verdicts = pd.read_csv(folder / "result" / "verdict.csv").set_index("stage")
 verdicts[["recorded_at", "verdict", "probability"]]
 
 # %%
-life = pd.read_csv(folder / "result" / "prognosis.csv")
-first = life[life["parameter"] == "any"].set_index("stage")
+left = pd.read_csv(folder / "result" / "prognosis.csv")
+first = left[left["parameter"] == "any"].set_index("stage")
 first[["rul_km_q05", "rul_km_q50", "rul_km_q95", "service_by"]]
 
 # %% [markdown]
@@ -70,7 +70,7 @@ for ax, (parameter, own) in zip(axes, health.groupby("parameter"), strict=True):
         ax.fill_between(
             one["travel_km"], 100 * one["q05"], 100 * one["q95"], alpha=0.2, color=line.get_color()
         )
-    ax.set(title=parameter.replace("_", " "), xlabel="travel in km")
+    ax.set(title=str(parameter).replace("_", " "), xlabel="travel in km")
 axes[0].set_ylabel("% of baseline")
 _ = axes[0].legend()
 

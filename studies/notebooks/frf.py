@@ -15,6 +15,7 @@ import tempfile
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pandas as pd
 
 import lmshealth as lh
@@ -68,14 +69,14 @@ _ = axes[0].legend()
 # %%
 rows = []
 for name, preload in {"new": 1.0, "worn": 0.9}.items():
-    told = subprocess.run(
+    answer = subprocess.run(
         [*models, "modes", "lms-y", "--preload", str(preload), "--format", "json"],
         check=True, capture_output=True, text=True,
     )  # fmt: skip
-    true = [mode["frequency_hz"] for mode in json.loads(told.stdout)["modes"]]
+    true = np.array([mode["frequency_hz"] for mode in json.loads(answer.stdout)["modes"]])
     modes = readings[name].modes
     for f, std in zip(modes.frequency, modes.frequency_std, strict=True):
-        rows.append((name, f, std, min(true, key=lambda t, f=f: abs(t - f))))
+        rows.append((name, f, std, true[np.abs(true - f).argmin()]))
 table = pd.DataFrame(rows, columns=["stage", "frequency_hz", "frequency_std_hz", "truth_hz"])
 table["off_in_stds"] = (table["frequency_hz"] - table["truth_hz"]) / table["frequency_std_hz"]
 assert (table["off_in_stds"].abs() < 4).all() and set(table["stage"]) == {"new", "worn"}

@@ -96,7 +96,7 @@ for effort in lh.plan(stage, "coupling_stiffness", 0.05, durations=(2, 10, 60)).
 # %%
 cut.write_logs(recording, folder / "logs")
 manifest = read_manifest(folder / "logs")
-machines = {"bench-A": [], "bench-B": []}
+machines: dict[str | None, list[lh.LogEstimates]] = {"bench-A": [], "bench-B": []}
 for path in sorted((folder / "logs").glob("[AB]*.csv")):
     one = lh.read_log(path, columns=columns, overrides=manifest.overrides(path))
     found = lh.read_frf(one, "current", "delta_e_load", band=(60, 95)).modes

@@ -21,7 +21,7 @@ import pytest
 from lmshealth.batch import alerts as alerting
 from lmshealth.batch import constants, ingest, outputs
 from lmshealth.batch import run as running
-from lmshealth.batch.alerts import Alerts, run_command
+from lmshealth.batch.alerts import Alerts, announce, run_command
 from lmshealth.batch.run import RunResult, Settings, run
 from lmshealth.batch.store import Identified, Store
 from lmshealth.errors import NothingUsable
@@ -328,7 +328,6 @@ def test_a_run_of_older_logs_that_ends_later_changes_nothing(
 ) -> None:
     """A long run beside a short one of later logs takes back neither alarm nor status."""
     nights.run(N_BEFORE)
-    whole = running.announce
     for day in range(N_BEFORE, 12):
         nights.add("B", day, -0.03)
     found = nights.run(12)
@@ -337,9 +336,13 @@ def test_a_run_of_older_logs_that_ends_later_changes_nothing(
     for path in nights.logs.glob("B-*.csv"):
         if int(path.stem[2:]) >= N_BEFORE:
             path.unlink()
-    monkeypatch.setattr(
-        running, "announce", lambda *given: whole(*given[:-1], given[-1]._replace(began=0))
-    )
+
+    def late(*given: Any) -> object:
+        *others, scope = given
+        arguments = [*others, scope._replace(began=0)]
+        return announce(*arguments)
+
+    monkeypatch.setattr(running, "announce", late)
     found = nights.run(12)
     assert (found.changes, nights.statuses()) == ((), before)
 

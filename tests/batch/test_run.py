@@ -33,14 +33,15 @@ from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
 from lmshealth.batch.run import RunResult, Settings, report, run
-from lmshealth.batch.store import Store, default_url, unpack_or_none
+from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NotConverged, NothingUsable
 from lmshealth.health.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
-from lmshealth.modal.identification import AmbientReading
+from lmshealth.io.reading import content_digest
+from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.prognosis import life_posterior
 from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior, LawPrior
@@ -48,7 +49,8 @@ from lmshealth.prognosis.life_likelihood import scatter_prior
 from lmshealth.prognosis.life_posterior import fit_life
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment, Summary
-from lmshealth.report.tables import machine_tables
+from lmshealth.report.machine_page import make_page
+from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.track import accepted_estimates, track
@@ -219,11 +221,10 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     """A second run writes the same page and tables without drawing; after a new log it is drawn."""
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     drawn: list[str] = []
-    whole = outputs.make_page
 
     def counted(found: Assessment, summary: Summary, **options: Any) -> Any:
         drawn.append(summary.file)
-        return whole(found, summary, **options)
+        return make_page(found, summary, **options)
 
     monkeypatch.setattr(outputs, "make_page", counted)
     run(logs, [modes_only], out)
@@ -262,11 +263,10 @@ def test_rows_of_known_logs_are_not_made_again(
     later = (logs / "log-02.h5").rename(tmp_path / "log-02.h5")
     run(logs, [modes_only], out)
     made: list[str] = []
-    whole = assessing.log_tables
 
     def counted(reading: LogEstimates) -> dict[str, str]:
         made.append(reading.log)
-        return whole(reading)
+        return log_tables(reading)
 
     monkeypatch.setattr(assessing, "log_tables", counted)
     later.rename(logs / "log-02.h5")
@@ -462,11 +462,10 @@ def test_unchanged_files_are_not_hashed_again(
     """A file is hashed after a change, also one that keeps size and time, or came just now."""
     logs = write_archive(tmp_path / "logs", 3)
     hashed = list[str]()
-    original = ingesting.content_digest
 
     def digest(path: Path) -> str:
         hashed.append(path.name)
-        return original(path)
+        return content_digest(path)
 
     monkeypatch.setattr(ingesting, "content_digest", digest)
 
@@ -574,12 +573,11 @@ def test_what_the_computer_failed_at_is_tried_again(
 ) -> None:
     """A full disk or memory is no fault of a log: it is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 3)
-    whole = ingesting.read_ambient
 
     def fail(log: Log, stage: Stage) -> AmbientReading:
         if log.name == "log-01.h5":
             raise error
-        return whole(log, stage)
+        return read_ambient(log, stage)
 
     with monkeypatch.context() as patch:
         patch.setattr(ingesting, "read_ambient", fail)
@@ -727,7 +725,7 @@ def test_only_what_is_stale_is_assessed_again(
     logs, out = write_archive(tmp_path / "logs", 2), tmp_path / "out"
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
 
-    def again(**options: int) -> list[str]:
+    def again(**options: Any) -> list[str]:
         assessed.clear()
         run(logs, [modes_only], out, Settings(**options))
         return list(assessed)
@@ -949,7 +947,7 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     monkeypatch.setattr(life_posterior, "sample", chains)
     job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(start), prior, ())
     made = assessing._update(job)
-    assert isinstance(made, assessing.PackedAssessment)
+    assert isinstance(made, PackedAssessment)
     found = unpack(made.content, Assessment).prognosis
     assert apart(found, fresh) < 4 < apart(found, alone)
     assert not chains.called
@@ -963,7 +961,7 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert own.prognosis is not None
     lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
     made = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives))
-    assert isinstance(made, assessing.PackedAssessment)
+    assert isinstance(made, PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
     tables = machine_tables(found)
     row = tables["prognosis"][-1]
@@ -973,5 +971,5 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
     assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
     few = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives[:8]))
-    assert isinstance(few, assessing.PackedAssessment)
+    assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

@@ -233,7 +233,7 @@ def test_a_frozen_server_is_not_waited_for(
         put_in(store, "before", reading())
         with pytest.raises(StoreError, match="has not answered for 1 s; its results are kept"):
             _ask(store, "SELECT pg_sleep(20)")
-        [frozen] = [row[0] for row in _ask(store, "SELECT pg_backend_pid()")]
+        [frozen] = [int(str(row[0])) for row in _ask(store, "SELECT pg_backend_pid()")]
         begun = time.monotonic()
         try:
             os.kill(frozen, signal.SIGSTOP)
@@ -333,7 +333,7 @@ def test_columns_that_a_damaged_file_lacks_are_damage(file_url: str, tmp_path: P
     with closing(Store(file_url)) as store, pytest.raises(StoreError, match="delete"):
         store.digests(["k"])
     full = sqlite3.OperationalError("database or disk is full")
-    full.sqlite_errorname = "SQLITE_FULL"  # type: ignore[misc]
+    full.sqlite_errorname = "SQLITE_FULL"
     store = Store(file_url)
     with closing(store), pytest.raises(StoreError) as refusal, store._begin():
         raise OperationalError("", {}, full)
@@ -523,7 +523,7 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
             judgement = replace(one.judgement, verdict=words[key])
             keep(store, "A", key, replace(one, judgement=judgement))
             before = store.previous_summary("A", key)
-            return before and before.verdict
+            return before.verdict if before else None
 
         assert [publish(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
             *(None, None, "healthy", "healthy", "preload", "healthy")

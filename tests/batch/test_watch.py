@@ -54,7 +54,7 @@ def runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Sequence[
                 raise NothingUsable("no log")
             return RunResult(out / "index.html", (), {})
 
-        monkeypatch.setattr(watching.time, "sleep", sleep)
+        monkeypatch.setattr(time, "sleep", sleep)
         monkeypatch.setattr(watching, "run", run)
         with pytest.raises(Ended):
             for _ in watch(logs, [], logs / "out", Settings(), interval=1.0):

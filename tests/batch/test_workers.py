@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -102,7 +103,7 @@ def test_a_killed_process_loses_nothing() -> None:
 def test_a_mistake_is_raised_here() -> None:
     """What a function raises ends the batch with its own error."""
     with processes(2) as pool, pytest.raises(TypeError):
-        list(pool.map_unordered(double, [None], lost))  # type: ignore[list-item]
+        list(pool.map_unordered(double, [None], lost))  # type: ignore[misc]
 
 
 def test_processes_end_with_a_parent_that_is_killed(root: Path) -> None:
@@ -215,7 +216,7 @@ def test_a_worker_of_a_cluster_may_be_killed(cluster: servers.Cluster) -> None:
     """What it was about is done by another, and a worker that comes later works as all do."""
     with workers.cluster(cluster.address) as pool:
         tasks = pool.map_unordered(slowly, range(12), lost)
-        found = dict([next(tasks)])
+        found: dict[int, Any] = dict([next(tasks)])
         cluster.workers[0].kill()
         cluster.add_worker()
         found |= dict(tasks)
@@ -230,7 +231,7 @@ def test_a_result_may_arrive_as_its_worker_dies(
     """What was fetched counts, though the scheduler holds it for lost by now."""
     from distributed import Future
 
-    status = Future.status.fget
+    status = vars(Future)["status"].fget
     monkeypatch.setattr(
         Future, "status", property(lambda self: status(self).replace("finished", "lost"))
     )

@@ -21,6 +21,7 @@ from lmshealth import identify, infer, load_stage, prognose, run
 from lmshealth.batch.run import Settings
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
+from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
 from studies.cost.archive import make_archive
 from studies.cost.workers import SPEEDUP, bare, identified
@@ -133,10 +134,10 @@ def test_tracking(race: Race) -> None:
     2 s were asked for, 3.9 times; 4.2 times is what the study claims.
     """
     life = long_life(10_000, 5)
-    span = float(np.ptp(life.travel))
+    ticks = StateSpace(life, None).ticks
     race(
         lambda: track(life) and None,
-        lambda: filterpy_loop(life, one_setting(), span) and None,
+        lambda: filterpy_loop(life, one_setting(), ticks) and None,
         name="tracking 10,000 epochs of five modes",
         beside="a loop over filterpy, one setting",
         at_most=4.5,

@@ -69,6 +69,7 @@ class Race:
         assert benchmark._timer is time.process_time, "run `make bench`"
         peer(), ours()  # what is put off until the first call
         benchmark.pedantic(then_ours, setup=first_the_peer, rounds=turns)
+        assert benchmark.stats is not None
         own = benchmark.stats.stats.data
         times = zip(own, amounts, theirs, strict=True)
         self.told([t / n / other for t, n, other in times], name=name, beside=beside,

@@ -50,7 +50,7 @@ def parquet_log() -> Iterator[tuple[Callable[[], None], Callable[[], None]]]:
             log = read_log(path)
             for channel in log.channels:
                 if channel.name in SIGNALS:
-                    fft.rfft(channel.values)
+                    fft.rfft(channel.values[:])
 
         def all_of_it() -> None:
             identify(read_log(path), stage)

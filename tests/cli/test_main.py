@@ -14,6 +14,7 @@ import tomllib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -43,7 +44,7 @@ def call(*arguments: object) -> Result:
     return CliRunner().invoke(main, [str(argument) for argument in arguments])
 
 
-def strict(text: str) -> dict[str, list[dict[str, object]]]:
+def strict(text: str) -> dict[str, Any]:
     """Parse JSON and refuse NaN and infinity, which JSON does not have."""
 
     def refuse(name: str) -> None:
@@ -396,8 +397,8 @@ def test_error_as_json_lists_every_harmonic(strokes: list[Path]) -> None:
         own = [h for h in content["harmonics"] if h["log"] == row["log"]]
         assert len(own) == 20
         assert own[0]["amplitude_um"] == row["max_magnitude_um"]
-        power = sum(h["amplitude_um"] ** 2 / 2 for h in own)  # type: ignore[operator]
-        assert power / row["std_um"] ** 2 == pytest.approx(row["share_explained"], rel=1e-6)  # type: ignore[operator]
+        power = sum(h["amplitude_um"] ** 2 / 2 for h in own)
+        assert power / row["std_um"] ** 2 == pytest.approx(row["share_explained"], rel=1e-6)
 
 
 def test_error_as_csv_and_table(strokes: list[Path]) -> None:
@@ -435,7 +436,7 @@ def test_spectrum_as_json_contains_growth(strokes: list[Path]) -> None:
     assert [row["grows"] for row in pitch] == [True, True]
     assert {line["kind"] for line in content["lines"]} >= {"mains"}
     mains = [line["frequency_hz"] for line in content["lines"] if line["kind"] == "mains"]
-    assert min(mains) == pytest.approx(50.0, abs=0.05)  # type: ignore[type-var]
+    assert min(mains) == pytest.approx(50.0, abs=0.05)
 
 
 def test_spectrum_without_a_stage_reads_the_papers_grid(strokes: list[Path]) -> None:
@@ -685,7 +686,7 @@ def test_plan_as_a_table_follows_power_and_false_alarms() -> None:
         strict(text)["detect"][0]["seconds_for_one_log"]
         for text in (call(*asked).stdout, easy.stdout)
     ]
-    assert needed[1] < needed[0]  # type: ignore[operator]
+    assert needed[1] < needed[0]
 
 
 @pytest.mark.parametrize(

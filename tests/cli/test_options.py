@@ -33,7 +33,9 @@ CONTEXT = click.Context(main)
 NUMBERS = [
     (name, option)
     for name in main.list_commands(CONTEXT)
-    for option in main.get_command(CONTEXT, name).params
+    for command in [main.get_command(CONTEXT, name)]
+    if command is not None
+    for option in command.params
     if isinstance(option.type, click.types.IntParamType | click.types.FloatParamType)
     and option.name != "band"  # two numbers, which are compared
 ]
@@ -44,6 +46,7 @@ NUMBERS = [
 )
 def test_every_number_has_a_range(name: str, option: click.Option) -> None:
     """Huge, infinite and undefined numbers are wrong usage, whatever the option."""
+    assert isinstance(option.type, click.IntRange | click.FloatRange)
     assert option.type.min is not None and option.type.max is not None
     whole = isinstance(option.type, click.IntRange)
     for value in (str(10**400), "-1", *(() if whole else ("1e300", "nan", "inf", "-inf"))):

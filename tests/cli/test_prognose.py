@@ -13,6 +13,7 @@ from click.testing import CliRunner, Result
 from lmshealth._private.tables import TABLES
 from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
+from lmshealth.prognosis.remaining_life import prognose_with_posterior
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage
@@ -70,11 +71,10 @@ def table(tmp_path: Path) -> Path:
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put a life with a known end in the place of the inference."""
-    fit = machine_commands.prognose_with_posterior
 
     def prognose(history: History, stage: Stage, seed: int) -> tuple[Prognosis, object]:
         if not history.has_odometer:
-            return fit(history, stage, seed)
+            return prognose_with_posterior(history, stage, seed)
         made = make_prognosis(np.linspace(1e5, 1e6, 1000), np.full(1000, 1e4))
         object.__setattr__(made, "stage", history.stage)
         return made, None

@@ -24,6 +24,13 @@ def text_stream(encoding: str) -> streams._Stream:
     return streams._Stream(io.TextIOWrapper(io.BytesIO(), encoding))
 
 
+def written(stream: streams._Stream) -> bytes:
+    """Return the bytes that a stream of `text_stream` wrote."""
+    buffer = stream.buffer
+    assert isinstance(buffer, io.BytesIO)
+    return buffer.getvalue()
+
+
 @pytest.mark.parametrize(
     ("encoding", "text", "shown"),
     [
@@ -42,14 +49,15 @@ def test_characters_that_a_stream_lacks_are_spelled(
     monkeypatch.setattr(sys, "stdout", stream)
     assert streams.readable(text) == shown
     print(text, end="", flush=True)
-    assert stream.buffer.getvalue().decode(encoding) == shown
+    assert written(stream).decode(encoding) == shown
 
 
 def test_json_keeps_all_characters_in_ascii(monkeypatch: pytest.MonkeyPatch) -> None:
     """As escapes, which every reader of JSON decodes; a name is the same for a program."""
-    monkeypatch.setattr(sys, "stdout", text_stream("ascii"))
+    stream = text_stream("ascii")
+    monkeypatch.setattr(sys, "stdout", stream)
     terminal.print_json({"a": "µ 😀"}, indent=-1)
-    assert sys.stdout.buffer.getvalue() == b'{"a":"\\u00b5 \\ud83d\\ude00"}\n'
+    assert written(stream) == b'{"a":"\\u00b5 \\ud83d\\ude00"}\n'
 
 
 def test_a_stream_that_fails_is_noted_and_goes_on(tmp_path: Path) -> None:

@@ -173,8 +173,8 @@ def test_a_log_file_has_events_notes_and_errors_and_ends_with_its_command(
 def test_a_closed_pipe_ends_without_a_word() -> None:
     """As `| head` closes it."""
     words = [sys.executable, "-m", "lmshealth", "stage", "lms-y", "--format", "json"]
-    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE}
-    with subprocess.Popen(words, **pipes) as started:
+    pipe = subprocess.PIPE
+    with subprocess.Popen(words, stdout=pipe, stderr=pipe) as started:
         assert started.stdout is not None and started.stderr is not None
         started.stdout.close()
         assert started.stderr.read() == b""

@@ -165,14 +165,14 @@ def test_what_stays_too_little_is_refused_with_its_points() -> None:
     """After four times less than 400 effective draws are an error with their number."""
     with pytest.raises(NotConverged, match=r"of 270 by importance.*needed are 400") as caught:
         importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 10)
-    assert np.shape(caught.value.chains) == (270, 2)
+    assert np.asarray(caught.value.chains).shape == (270, 2)
 
 
 def test_a_start_outside_of_the_support_is_refused() -> None:
     """Where no point has a density the error names what to widen, with the points."""
     with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
         importance_sample(half, -np.abs(start(2)), np.random.default_rng(11), 500)
-    assert np.shape(caught.value.chains) == (600, 2)
+    assert np.asarray(caught.value.chains).shape == (600, 2)
 
 
 @pytest.mark.parametrize("inside", [1, 2, 4])

@@ -18,7 +18,8 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import inference
 from lmshealth.health.ensemble_sampling import Sample
-from lmshealth.health.inference import EpochPosterior, epochs_to_infer, infer, infer_together
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.health.inference import epochs_to_infer, infer, infer_together
 from lmshealth.health.results import Health
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Uniform

@@ -6,6 +6,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -56,7 +57,7 @@ def mat_file(path: Path, *variables: bytes, order: str = "<") -> Path:
 def tdms_segment(
     channels: Mapping[str, np.ndarray],
     *,
-    order: str = "<",
+    order: Literal["<", ">"] = "<",
     interleaved: bool = False,
     n_chunks: int = 1,
     extra: bytes = b"",

@@ -39,7 +39,9 @@ def bare(path: Path) -> object:
 def peak() -> int:
     """Give the most memory that this process ever had; `resource` would count its parent's too."""
     status = Path("/proc/self/status").read_text()
-    return int(re.search(r"VmHWM:\s*(\d+) kB", status)[1]) << 10
+    found = re.search(r"VmHWM:\s*(\d+) kB", status)
+    assert found is not None
+    return int(found[1]) << 10
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ def test_map_reads_an_export(tmp_path):
     (tmp_path / "log.csv").write_text("Vendor 3.1\nPE(0);Ch 1;current_limit\n" + rows)
     log = read_log(tmp_path / "log.csv", columns=load_columns(tmp_path / "map.toml"))
     assert log.sample_rate == 2000 and log.metadata.stage == "demo-X" and log.metadata.baseline
-    values = {c.name: c.values for c in log.channels}
+    values = {c.name: c.values[:] for c in log.channels}
     assert values["delta_e"].max() == pytest.approx(6 * 4.88e-9)
     assert values["acc_feed"].max() == pytest.approx(0.4 * 9.80665)
 
@@ -45,7 +45,7 @@ def test_map_keeps_columns_of_the_contract(make, tmp_path):
     (tmp_path / "map.toml").write_text('[columns]\ndelta_e_um = "PE"\n')
     path = make(columns={"PE": np.sin(np.arange(400.0))})
     log = read_log(path, columns=load_columns(tmp_path / "map.toml"))
-    values = {c.name: c.values for c in log.channels}
+    values = {c.name: c.values[:] for c in log.channels}
     assert set(values) == {"delta_e", "acc_feed"} and values["delta_e"].max() > 9e-7
 
 

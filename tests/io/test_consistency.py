@@ -265,10 +265,10 @@ def test_stored_samples_are_compared_alike(monkeypatch):
     start = buffers.BLOCK - 100
     signal[start : start + 300] = signal[start - 300 : start]
     columns = [without(position, gone), without(velocity, gone), signal]
-    whole = compare(Motion(*columns[:2], None), [signal], RATE, NO_BREAKS)
+    whole = compare(Motion(columns[0], columns[1], None), [signal], RATE, NO_BREAKS)
     monkeypatch.setattr(buffers, "MINUTE", 1000)
     stored = [as_samples(one) for one in columns]
-    parts = compare(Motion(*stored[:2], None), stored[2:], RATE, NO_BREAKS)
+    parts = compare(Motion(stored[0], stored[1], None), stored[2:], RATE, NO_BREAKS)
     for one in (whole, parts):
         assert one.dropped.tolist() == [1000, buffers.BLOCK, 2 * buffers.BLOCK + 298]
         assert one.repeated.tolist() == [[start, start + 300]]

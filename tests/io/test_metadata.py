@@ -123,11 +123,12 @@ def test_scalars_of_pandas_and_numpy_become_plain_or_are_refused():
     plain = Metadata("A", MOMENT, 5e3, {"temperature_c": 21.0}, baseline=True)
     same = Metadata(
         np.str_("A"), pd.Timestamp(MOMENT), np.float64(5e3), {"temperature_c": np.float64(21)},
-        baseline=np.bool_(True),
+        baseline=np.bool_(True),  # type: ignore[arg-type]
     )  # fmt: skip
     assert type(same.recorded_at) is datetime and same.recorded_at == MOMENT
     assert fingerprint(same) == fingerprint(plain)
     zoned = Metadata(recorded_at=pd.Timestamp(MOMENT).tz_convert("Europe/Berlin"))
+    assert zoned.recorded_at is not None
     assert zoned.recorded_at.isoformat() == "2026-03-01T09:30:00+01:00"
 
 

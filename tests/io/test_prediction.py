@@ -33,6 +33,7 @@ def test_the_expectation_is_that_of_the_joint_normal_distribution():
     """Of an autoregressive process it equals the conditional mean by its covariance matrix."""
     x = resonance(300_000)
     model = fit_prediction(x, NONE)
+    assert model is not None
     unknown = np.array([ORDER, ORDER + 1, ORDER + 5])
     part = x[: 3 * ORDER]
     found = model.expected(part.copy(), unknown)
@@ -52,7 +53,7 @@ def test_short_gaps_are_filled_within_the_noise(size):
     x = resonance()
     damaged, gaps = cut(x, size)
     values, left = filled(damaged, gaps, NO_BREAK)
-    assert left.shape == (0, 2) and np.isfinite(values).all()
+    assert left.shape == (0, 2) and np.isfinite(values[:]).all()
     inside = np.isnan(damaged)
     assert (values[inside] - x[inside]).std() < 0.15
     np.testing.assert_array_equal(values[~inside], x[~inside])

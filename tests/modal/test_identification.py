@@ -388,7 +388,7 @@ def test_a_long_record_does_not_fill_the_memory() -> None:
             )
             (moved + generator.normal(size=MINUTE)).tofile(file)
         file.flush()
-        channels.append(Channel(name, "acceleration", Stored(file, n)))  # type: ignore[arg-type]
+        channels.append(Channel(name, "acceleration", Stored(file, n)))
     log = replace(make_log({"acc": np.zeros(n)}, rate), channels=tuple(channels))
     tracemalloc.start()
     try:
@@ -677,7 +677,7 @@ def test_the_order_of_channels_does_not_matter() -> None:
 def test_the_unit_of_the_signal_does_not_matter(factor: float) -> None:
     """Scaled signals give the same f, ζ and SNR, and covariances within 10⁻³."""
     log = acceleration_log(rng(21), lms_y_modes(), 20, RATE, 0.5)
-    signals = {channel.name: factor * channel.values for channel in log.channels}
+    signals = {channel.name: factor * channel.values[:] for channel in log.channels}
     one, other = (identify(item, make_stage(LMS_Y)) for item in (log, make_log(signals, RATE)))
     assert one.names == other.names
     np.testing.assert_allclose(one.ln_frequency, other.ln_frequency, rtol=0, atol=1e-7)

@@ -77,11 +77,11 @@ def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() 
     found, damping = [126.5, 136.4, 155.1], [0.015, 0.015, 0.017]
     assert assign(found, described, damping=damping, undescribed=True)[0] == ("roll", "pitch", "")
     # A regular row of modes shifted by its spacing is never certain.
-    described = tuple(
+    regular = tuple(
         Target(name, f, 0.015, 0.15) for name, f in zip("abc", (126, 137, 148), strict=True)
     )
     row = [117.0, 126.0, 137.0, 148.0]
-    sure = assign(row, described, damping=[0.015] * 4, undescribed=True, clear=0.95)
+    sure = assign(row, regular, damping=[0.015] * 4, undescribed=True, clear=0.95)
     assert set(sure[0]) == {""}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.stats.distributions import rv_frozen
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.prognosis.remaining_life import first_passage
@@ -44,7 +45,7 @@ def draw(
     )
 
 
-def follows(found: FloatArray, book: stats.rv_continuous) -> bool:
+def follows(found: FloatArray, book: rv_frozen) -> bool:
     """Whether passages up to the horizon, and how many there are, are those of a distribution."""
     reached, share = found[np.isfinite(found)], float(book.cdf(HORIZON))
     low, high = binomial_band(reached.size, found.size)
@@ -52,7 +53,7 @@ def follows(found: FloatArray, book: stats.rv_continuous) -> bool:
     return bool(low <= share <= high and stats.kstest(level, "uniform").pvalue > 1e-3)
 
 
-def inverse_gaussian(above: float, rate: float, life: float = LIFE) -> stats.rv_continuous:
+def inverse_gaussian(above: float, rate: float, life: float = LIFE) -> rv_frozen:
     """Return the first passage of a Wiener process with the drift 1 / life."""
     mean, shape = above * life, above**2 / rate
     return stats.invgauss(mean / shape, scale=shape)

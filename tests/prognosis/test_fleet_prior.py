@@ -116,7 +116,7 @@ def test_likelihood_of_a_fleet_is_that_of_the_textbook(z: float, error: float) -
     """With Gaussian measurements data have the density N(z; m, v + e²) over N(z; 0, 1 + e²)."""
     found = pace_likelihood(gaussian(z, error), np.full(N, 1 / N))
     mean, variance = constants.FLEET_MEAN, constants.FLEET_VARIANCE
-    expected = stats.norm(mean, np.sqrt(variance + error**2)).logpdf(z)
+    expected = np.asarray(stats.norm(mean, np.sqrt(variance + error**2)).logpdf(z))
     expected -= stats.norm(0, np.sqrt(1 + error**2)).logpdf(z)
     # Where the fleet is where the draws are; beyond them it is improbable, and only has to be so.
     near = np.abs(mean - z) < 3 * np.sqrt(variance + error**2)

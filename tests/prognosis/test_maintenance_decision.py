@@ -54,7 +54,7 @@ def midnight(day: date) -> float:
 
 def test_the_service_day_is_the_last_with_the_risk_allowed() -> None:
     """With one draw in ten failing per day, a risk of 0.35 lasts to the day of the fourth."""
-    remaining = np.arange(1, 11) * 1e4
+    remaining = np.arange(1.0, 11.0) * 1e4
     prognosis = make_prognosis(remaining, np.full(10, 1e4))
     for risk, days in ((0.05, 1), (0.35, 4), (0.95, 10)):
         day = decide(prognosis, Decision(max_risk=risk)).by
@@ -225,7 +225,7 @@ def test_costs_choose_a_day_at_the_median_usage() -> None:
 
 def test_the_probability_before_a_day_is_the_share_of_draws() -> None:
     """Per limit and for any: draws whose travel is used up when the day begins."""
-    one, other = np.arange(1, 11) * 1e4, np.arange(10, 0, -1) * 2e4
+    one, other = np.arange(1.0, 11.0) * 1e4, np.arange(10.0, 0.0, -1.0) * 2e4
     made = make_prognosis(one, np.full(10, 1e4))
     both = replace(
         made,

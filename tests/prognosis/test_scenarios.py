@@ -221,7 +221,7 @@ def test_draws_follow_the_prior() -> None:
     books = [stats.norm(0.0, 2e-7), *[stats.lognorm(constants.STEP_PRIOR.std)] * 4]
     for column, book in zip(theta.T, books, strict=True):
         assert stats.kstest(column, book.cdf).pvalue > 1e-4
-    correlation = np.corrcoef(y.T)[np.triu_indices(5, 1)]
+    correlation = np.asarray(np.corrcoef(y.T))[np.triu_indices(5, 1)]
     assert np.abs(correlation).max() < 4.5 / np.sqrt(5000)
     assert stats.kstest(1.1 * theta[:, 0], books[0].cdf).pvalue < 1e-3  # negative control
 

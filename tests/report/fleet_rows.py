@@ -68,11 +68,11 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
 
 
 def _parameter(name: str, level: float, std: float) -> ParameterHealth:
-    quantiles = {"low": level - 1.6 * std, "median": level, "high": level + 1.6 * std}
-    limit = {"limit": LIMITS[name], "below_limit": 0.0}
     return ParameterHealth(
-        name=name, determined=True, converged=True, informed=0.96, **quantiles, **limit
-    )
+        name=name, determined=True, converged=True, informed=0.96,
+        low=level - 1.6 * std, median=level, high=level + 1.6 * std,
+        limit=LIMITS[name], below_limit=0.0,
+    )  # fmt: skip
 
 
 def _life(identity: str, days: float) -> Life:

@@ -57,8 +57,8 @@ def summary(state: dict[str, Any]) -> Summary:
     own = dict(state)
     by, remaining = own.pop("service_by"), own.pop("remaining")
     health = [
-        ParameterHealth(name, True, True, 1.0, *values, None, np.nan)
-        for name, values in own.pop("health").items()
+        ParameterHealth(name, True, True, 1.0, low, median, high, None, np.nan)
+        for name, (low, median, high) in own.pop("health").items()
     ]
     life = None
     if remaining is not None:
@@ -67,8 +67,8 @@ def summary(state: dict[str, Any]) -> Summary:
         limit = LimitLife("any", np.nan, 1.0, travel, travel, (None,) * 7, 0.0, 0.0)
         life = Life("M7-Y", own["recorded_at"], own["travel"], 2e7, (limit,), (), ())
     service = Service("by", by, 1.0, 0.05, None, (np.nan, np.nan), 0.05, None)
-    more = {"health": tuple(health), "life": life, "service": service}
-    page = {"file": "a.html", "identity": "M7-Y", "urgency": (0, 0.0, 0.0, "M7-Y")}
+    more: dict[str, Any] = {"health": tuple(health), "life": life, "service": service}
+    page: dict[str, Any] = {"file": "a.html", "identity": "M7-Y", "urgency": (0, 0.0, 0.0, "M7-Y")}
     return Summary(**own, **more, **page, state="good", headline="", why="")
 
 

@@ -6,6 +6,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -102,7 +103,11 @@ def test_settings_of_the_process_do_not_reach_a_page() -> None:
         ax.legend()
 
     expected = plots.svg(draw, salt="one")
-    others = {"axes.linewidth": 5.0, "legend.fontsize": 30, "figure.constrained_layout.w_pad": 1.0}
+    others: Any = {
+        "axes.linewidth": 5.0,
+        "legend.fontsize": 30,
+        "figure.constrained_layout.w_pad": 1.0,
+    }
     with matplotlib.rc_context(others):
         assert plots.svg(draw, salt="one") == expected
         assert matplotlib.rcParams["axes.linewidth"] == others["axes.linewidth"]
@@ -250,9 +255,11 @@ def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, tra
     waterfall = make_waterfall(history)
     assert plots.plot_waterfall(ax, waterfall, history, track) is ax
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
-    shown = np.ma.filled(mesh.get_array(), np.nan)[:, ::2].T
+    levels = mesh.get_array()
+    assert levels is not None
+    shown = np.ma.filled(levels, np.nan)[:, ::2].T
     np.testing.assert_array_equal(shown, waterfall.level)
-    x = mesh.get_coordinates()[0, :, 0].reshape(-1, 2)
+    x = np.asarray(mesh.get_coordinates())[0, :, 0].reshape(-1, 2)
     km = history.travel / 1000
     assert (x[:, 0] < km).all() and (km < x[:, 1]).all()
     assert mesh.get_clim() == (-10.0, 15.0)
@@ -281,7 +288,7 @@ def test_waterfall_leaves_a_gap_where_logs_are_missing(ax: Axes, history: Histor
     apart = replace(history, travel=travel)
     plots.plot_waterfall(ax, make_waterfall(apart), apart)
     mesh = next(c for c in ax.collections if isinstance(c, QuadMesh))
-    left, right = mesh.get_coordinates()[0, :, 0].reshape(-1, 2).T
+    left, right = np.asarray(mesh.get_coordinates())[0, :, 0].reshape(-1, 2).T
     gaps = left[1:] - right[:-1]
     usual = (travel[1] - travel[0]) / 1000
     assert gaps[19] > 9 * usual
@@ -338,7 +345,7 @@ def test_influence_shows_before_and_after(ax: Axes, history: History) -> None:
     np.testing.assert_allclose(y, -0.12 * (x - 21))
     band = next(c for c in ax.collections if c.get_alpha() == 0.18).get_paths()[0].vertices
     np.testing.assert_allclose(
-        band[:, 1].max(), max(-0.12 * (x - 21) + 1.96e-2 * np.abs(x - 21)), rtol=1e-9
+        np.asarray(band)[:, 1].max(), max(-0.12 * (x - 21) + 1.96e-2 * np.abs(x - 21)), rtol=1e-9
     )
     assert ax.get_xlabel() == "temperature in °C"
     bent = replace(one, effects=(effect, replace(effect, covariate="temperature_c^2")))

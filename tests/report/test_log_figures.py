@@ -77,7 +77,7 @@ def test_spectra_modes_lines_and_refusals_stand_at_their_places(log: Log) -> Non
     """The level of white noise, the interval of a mode, a line in its channel, a candidate."""
     whole = draw(modes_figure(log, read(log, some_modes(0.01, 62.0)), band=(40.0, 90.0)))
     first, second, _ = whole.axes  # then the singular values
-    curves: dict[str, Any] = {line.get_label(): line for line in first.lines}
+    curves: dict[str, Any] = {str(line.get_label()): line for line in first.lines}
     x, y = np.asarray(first.lines[0].get_data(), dtype=float)
     away = np.abs(x - 50) > 2
     assert y[away].mean() == pytest.approx(1.0, abs=5 / np.sqrt(away.sum() * 4))
@@ -209,9 +209,13 @@ def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -
     other = replace(reading, fitted=tuple(fitted), sought=sought)
     again = draw(modes_figure(log, other, band=(40.0, 90.0)))
     (first,), (second,) = (
-        [one.get_ydata() for one in figure.axes[0].lines if one.get_label() == "fit"]
+        [
+            np.asarray(one.get_ydata(), dtype=float)
+            for one in figure.axes[0].lines
+            if one.get_label() == "fit"
+        ]
         for figure in (whole, again)
-    )
-    assert np.isfinite(np.asarray(first, dtype=float)).any()
+    )  # fmt: skip
+    assert np.isfinite(first).any()
     np.testing.assert_allclose(first, second, rtol=0.05)
     assert any("wanders" in str(patch.get_label()) for patch in again.axes[0].patches)

@@ -23,7 +23,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
 from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
-from lmshealth.prognosis.maintenance_decision import probability_before
+from lmshealth.prognosis.maintenance_decision import Service, probability_before
 from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.assessment import Assessment
@@ -85,8 +85,8 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
     plan = f"Order and plan a preload adjustment before {by.isoformat()}; until then a log"
     assert plan in first.replace("\u2011", "-")
     assert "Guide preload over 1 600 km: 1" in plain(first) and "limit of 60 %" in plain(first)
-    late = [probability_before(assessment.prognosis, by + timedelta(7 * k)) for k in (1, 8)]
     assert assessment.prognosis is not None
+    late = [probability_before(assessment.prognosis, by + timedelta(7 * k)) for k in (1, 8)]
     for weeks, risk in zip(("1 week", "8 weeks"), late, strict=True):
         day = (by + timedelta(7 * int(weeks[0]))).isoformat()
         shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]
@@ -349,10 +349,15 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first screen, what is new, the pictures and the row of the index share one decision."""
-    assessment, asked = make(), []
+    assessment, asked = make(), list[Assessment]()
     decided = assessment.service()
     summary = summarise_machine(assessment, decided)
-    monkeypatch.setattr(Assessment, "service", lambda self: asked.append(self) or decided)
+
+    def decide(self: Assessment) -> Service:
+        asked.append(self)
+        return decided
+
+    monkeypatch.setattr(Assessment, "service", decide)
     make_page(assessment, summary, before=summary)
     assert asked == []
 

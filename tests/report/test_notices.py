@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -42,7 +43,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     assert health is not None and prognosis is not None and track is not None
     last = np.arange(len(health.recorded_at)) == len(health.recorded_at) - 1
     low = replace(health, chains=health.chains * 0.5)
-    wrong = {
+    wrong: dict[str, dict[str, Any]] = {
         "names-in-doubt": {"doubt": "The names of the modes are in doubt."},
         "filter-inconsistent": {"track": replace(track, nis=track.nis * 9)},
         "not-converged": {"health": replace(health, converged=health.converged & ~last)},
@@ -68,8 +69,9 @@ def test_gauges_verdict_and_service_agree_where_methods_disagree(make: Maker, po
     assert good.health is not None and good.prognosis is not None
     by_laws = np.quantile(good.prognosis.health[:, 0], (0.05, 0.95))
     chains = 0.5 * (good.health.chains / np.median(good.health.chains[-1, ..., 0])) ** power
-    low = replace(good, health=replace(good.health, chains=np.clip(chains, 0.05, 0.6)))
-    own = np.quantile(low.health.samples[-1, :, 0], (0.05, 0.95))
+    health = replace(good.health, chains=np.clip(chains, 0.05, 0.6))
+    low = replace(good, health=health)
+    own = np.quantile(health.samples[-1, :, 0], (0.05, 0.95))
     assert own[1] < by_laws[0] and codes(low) >= {"methods-disagree"}
     assert good.service().kind != "now"  # by the laws alone
     gauge, service = summarise(low, low.service()).health[0], low.service()
@@ -99,7 +101,7 @@ def test_methods_that_overlap_but_differ_about_the_verdict_are_pooled(make: Make
     good = make()
     assert good.health is not None and good.prognosis is not None
     rng = np.random.default_rng(1)
-    chains = [0.91, 0.99] * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
+    chains = np.array([0.91, 0.99]) * np.exp(0.01 * rng.standard_normal(good.health.chains.shape))
     draws = good.prognosis.health * 0 + 0.885 * np.exp(0.01 * rng.standard_normal((4000, 1)))
     draws[:, 1] = 0.99
     edge = replace(good, health=replace(good.health, chains=chains),
@@ -115,6 +117,7 @@ def test_a_parameter_in_newton_is_compared_with_its_own_baseline(make: Maker) ->
     good = make()
     assert good.health is not None and good.prognosis is not None
     preload, mount = good.stage.description.parameter
+    assert preload.limit is not None
     limit = structs.replace(preload.limit, below=5e3 * preload.limit.below)
     in_newton = structs.replace(preload, baseline=5e3, unit="N", limit=limit)
     described = structs.replace(good.stage.description, parameter=(in_newton, mount))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Callable
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib
@@ -89,7 +90,8 @@ def test_a_picture_looks_as_before(
     """A browser draws the lean page like what matplotlib writes, but for the edges of lines."""
     needs("chromium")
     folder, target = tmp_path_factory.mktemp("svg"), io.StringIO()
-    with matplotlib.rc_context(plots._STYLE):
+    style: Any = plots._STYLE
+    with matplotlib.rc_context(style):
         figure = Figure(figsize=plots.SIZE, layout="constrained", facecolor="none")
         curve(figure.add_subplot())
         figure.savefig(target, format="svg")

@@ -64,7 +64,16 @@ def attack(folder: Path, url: str, password: str, *, every: int) -> dict[str, li
     links = _links(folder, out)
     guards.plant(url)
     before = guards.snapshot(folder, [out])
-    words = ["--stage", folder / "stage.toml", "--store", url, "--workers", "1", "--epochs", "1"]
+    words = [
+        "--stage",
+        str(folder / "stage.toml"),
+        "--store",
+        url,
+        "--workers",
+        "1",
+        "--epochs",
+        "1",
+    ]
     done = [lmshealth("run", logs, *words, "--out", out, cwd=folder)]
     if every == 1:
         words = ["--store", url, "--workers", "1"]
@@ -267,6 +276,7 @@ def test_what_acts_is_noticed(tmp_path: Path) -> None:
     guards.plant(url)
     engine = create_engine(url)
     raw = engine.raw_connection()
+    assert raw.driver_connection is not None
     raw.driver_connection.executescript(
         f"CREATE TABLE t_1 (name TEXT); INSERT INTO t_1 VALUES ('{hostile.MACHINES[0]}');"
     )

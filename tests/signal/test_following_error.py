@@ -21,14 +21,16 @@ from tests.signals import make_log, sine
 RATE = 2000.0
 N = 8000
 # Hz, m, rad: three above 30 nm, two below.
-SINES = ((12.5, 2e-6, 0.3), (50.0, 4e-8, -1.0), (137.0, 3e-7, 2.0), (400.0, 2e-8, 0.0))
-SINES += ((610.0, 1e-8, 1.0),)
+SINES = (
+    (12.5, 2e-6, 0.3), (50.0, 4e-8, -1.0), (137.0, 3e-7, 2.0), (400.0, 2e-8, 0.0),
+    (610.0, 1e-8, 1.0),
+)  # fmt: skip
 
 
 def known(n: int = N) -> np.ndarray:
     """Sum the sines, whole periods each, about a mean of 0.1 µm."""
     t = np.arange(n) / RATE
-    return 1e-7 + sum(a * np.cos(2 * np.pi * f * t + p) for f, a, p in SINES)
+    return np.asarray(1e-7 + sum(a * np.cos(2 * np.pi * f * t + p) for f, a, p in SINES))
 
 
 def test_known_sines_are_read_to_a_billionth() -> None:

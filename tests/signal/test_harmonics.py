@@ -15,7 +15,7 @@ SINES = ((3, 2.5e-6, 0.4), (117, 4e-8, -2.9), (250, 1e-6, 1.5))
 def sines(n: int, mean: float = -1.2e-7) -> np.ndarray:
     """Sum cosines of known amplitude and phase with whole periods in the record."""
     t = np.arange(n)
-    return mean + sum(a * np.cos(2 * np.pi * k * t / n + p) for k, a, p in SINES)
+    return np.asarray(mean + sum(a * np.cos(2 * np.pi * k * t / n + p) for k, a, p in SINES))
 
 
 @pytest.mark.parametrize("n", [4000, 4001])
@@ -33,7 +33,7 @@ def test_sums_of_sines_read_their_amplitudes_and_phases(n: int) -> None:
 
 def test_half_the_sample_rate_reads_its_amplitude() -> None:
     """A cosine at every second sample counts fully: amplitude 3, mean square 9."""
-    found = decompose(3.0 * (-1.0) ** np.arange(100), RATE)
+    found = decompose(3.0 * (-1.0) ** np.arange(100.0), RATE)
     assert found.amplitude[-1] == pytest.approx(3.0, rel=1e-12)
     assert found.power[-1] == pytest.approx(9.0, rel=1e-12)
 

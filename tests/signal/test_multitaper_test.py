@@ -152,7 +152,7 @@ def test_segments_much_shorter_than_the_longest_are_left_out() -> None:
 def test_what_is_found_does_not_depend_on_the_band() -> None:
     """Cut at other frequencies, the band shows the same line to the last digit."""
     values = sine(4000, RATE, 100.3, 1.0) + white(np.random.default_rng(8), 1e-3, 4000, RATE)
-    rows = [detect_sinusoids([4000], lambda _: values, RATE, band, 1e-4) for band in
+    one, other = [detect_sinusoids([4000], lambda _: values, RATE, band, 1e-4) for band in
             ((20.0, 450.0), (93.0, 130.0))]  # fmt: skip
-    np.testing.assert_array_equal(*rows)
+    np.testing.assert_array_equal(one, other)
     assert len(detect_sinusoids([4000], lambda _: values, RATE, (101.5, 130.0), 1e-4)) == 0

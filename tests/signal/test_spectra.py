@@ -303,7 +303,9 @@ def test_a_line_in_one_part_of_a_mean_is_masked_in_the_mean() -> None:
 def test_cross_spectrum_refuses_arrays_that_differ_in_length() -> None:
     """Frequencies without matrices are no spectrum."""
     with pytest.raises(ValueError, match="has shape"):
-        CrossSpectrum(np.arange(3.0), np.zeros((4, 1, 1)) + 0j, 1.0, 0.0, np.ones(3, dtype=bool))
+        CrossSpectrum(
+            np.arange(3.0), np.zeros((4, 1, 1), dtype=complex), 1.0, 0.0, np.ones(3, dtype=bool)
+        )
 
 
 # Means over segments
@@ -317,7 +319,7 @@ def parts(*lengths: int, velocity: float = 0.1) -> list[Segment]:
 
 def averaged(values: np.ndarray | Stored, segments: list[Segment]) -> tuple[Spectrum, ...]:
     """Transform an acceleration."""
-    channel = Channel("x", "acceleration", values)  # type: ignore[arg-type]
+    channel = Channel("x", "acceleration", values)
     return tuple(of_channel(s) for s in cross_spectra([channel], segments, RATE, 500.0))
 
 

@@ -166,7 +166,8 @@ def test_noise_has_no_tones() -> None:
     f = np.arange(1, N // 2) / SECONDS
     for seed in range(20):
         white_noise = transform(noise(seed))
-        for raw in (white_noise, white_noise * f[:, None] ** 2):
+        rising: np.ndarray = white_noise * f[:, None] ** 2
+        for raw in (white_noise, rising):
             rest, free, sinusoids = remove_sinusoids(raw, SECONDS, PROTECTED)
             assert not sinusoids
             assert free.all()

@@ -210,7 +210,7 @@ def test_a_simple_estimator_of_decays_reaches_its_bound() -> None:
     f0, zeta, rate, n, noise = 60.0, 0.01, 400.0, 400, 0.05
     one = Vibration(np.array([f0]), np.array([zeta]), np.eye(1))
     recording = Recording(np.array([noise**2 * 2 / rate]), 1.0, (1.0, 199.0))
-    bound = stds(decay_bound(one, np.ones((1, 1)), np.zeros(1), recording))
+    bound = stds(decay_bound(one, np.ones((1, 1), complex), np.zeros(1), recording))
     t = np.arange(n) / rate
     found = []
     for _ in range(300):
@@ -233,7 +233,9 @@ def test_an_ambient_response_raises_the_bound_of_a_decay() -> None:
     def std(ambient: float, n_decays: int, n_channels: int) -> np.ndarray:
         one = Vibration(np.array([60.0]), np.array([0.01]), np.ones((n_channels, 1)))
         recording = Recording(np.full(n_channels, 1e-5), 1.0, (30, 90))
-        return stds(decay_bound(one, np.ones((n_decays, 1)), np.array([ambient]), recording))
+        return stds(
+            decay_bound(one, np.ones((n_decays, 1), complex), np.array([ambient]), recording)
+        )
 
     quiet, shaken = std(1e-9, 1, 1), std(1e-5, 1, 1)
     assert (shaken > 1.5 * quiet).all()
@@ -250,7 +252,7 @@ def test_decays_of_close_modes_cost_information() -> None:
 
     def cov(modes: Vibration) -> np.ndarray:
         m = modes.frequency.size
-        return decay_bound(modes, np.ones((2, m)), np.full(m, 1e-8), recording)
+        return decay_bound(modes, np.ones((2, m), complex), np.full(m, 1e-8), recording)
 
     far, near = cov(two_modes(20.0, shapes)), cov(two_modes(1.0, shapes))
     alone = cov(Vibration(np.array([100.0]), np.array([0.01]), shapes[:, :1]))

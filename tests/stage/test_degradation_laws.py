@@ -79,7 +79,7 @@ def test_draws_follow_the_prior(law: AnyLaw) -> None:
     for name, values in zip(law.names, theta.T, strict=True):
         prior, unit = natural_prior(law, name)
         for level in (0.1, 0.5, 0.9):
-            share = np.mean(values * unit < prior.quantile(level))
+            share = np.mean(values * unit < prior.quantile(np.array(level)))
             assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
 
 
@@ -109,7 +109,7 @@ def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
     """Where a limit is reached, root finding on health gives the same travel."""
     theta = law.natural(law.draw(np.random.default_rng(4), 60, NOW), NOW)
     for limit in (0.35, 0.6, 0.95):
-        passage = law.passage(theta, limit)
+        passage = law.passage(theta, np.array(limit))
         assert passage.shape == (theta.shape[0],)
         for row, travel in zip(theta[:, None], passage, strict=True):
 
@@ -129,7 +129,7 @@ def test_each_draw_may_have_its_own_limit(law: AnyLaw) -> None:
     theta = law.natural(law.draw(np.random.default_rng(7), 40, NOW), NOW)
     limit = np.linspace(0.1, 1.0, 40)
     together = law.passage(theta, limit)
-    alone = [law.passage(row[None], float(one))[0] for row, one in zip(theta, limit, strict=True)]
+    alone = [law.passage(row[None], one)[0] for row, one in zip(theta, limit, strict=True)]
     np.testing.assert_array_equal(together, alone)
     assert together[-1] == 0
 
@@ -192,9 +192,9 @@ def test_wear_is_hertz_and_power_is_not() -> None:
 
 def test_a_limit_that_is_never_reached_is_infinite() -> None:
     """Floors above the limit, gains and unchanging parameters never fail."""
-    assert np.isinf(LOOSE.passage(np.array([[0.8, 1e6]]), 0.7)).all()
-    assert np.isinf(LINEAR.passage(np.array([[-1e-9], [0.0]]), 0.7)).all()
-    assert np.isinf(Unchanging().passage(np.empty((3, 0)), 0.7)).all()
+    assert np.isinf(LOOSE.passage(np.array([[0.8, 1e6]]), np.array(0.7))).all()
+    assert np.isinf(LINEAR.passage(np.array([[-1e-9], [0.0]]), np.array(0.7))).all()
+    assert np.isinf(Unchanging().passage(np.empty((3, 0)), np.array(0.7))).all()
     assert (Unchanging().health(np.empty((3, 0)), np.zeros(4)) == 1).all()
 
 
@@ -202,7 +202,7 @@ def test_lower_limits_are_reached_later() -> None:
     """First passage grows as the limit falls."""
     for law in LAWS:
         theta = law.natural(law.draw(np.random.default_rng(6), 50, NOW), NOW)
-        passages = [law.passage(theta, limit) for limit in (0.99, 0.8, 0.5, 0.31)]
+        passages = [law.passage(theta, np.array(limit)) for limit in (0.99, 0.8, 0.5, 0.31)]
         for early, late in pairwise(passages):
             keep = np.isfinite(early)
             assert (early[keep] <= late[keep]).all()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from scipy import stats
@@ -10,7 +12,7 @@ from scipy.integrate import trapezoid
 from lmshealth.errors import BadStage
 from lmshealth.stage.priors import JointPrior, Lognormal, Normal, Prior, Uniform, combine_priors
 
-PAIRS = [
+PAIRS: list[tuple[Prior, Any]] = [
     (Lognormal(2.0, 0.4), stats.lognorm(0.4, scale=2.0)),
     (Normal(-1.0, 3.0), stats.norm(-1.0, 3.0)),
     (Uniform(0.5, 2.5), stats.uniform(0.5, 2.0)),
@@ -18,14 +20,14 @@ PAIRS = [
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_density_is_that_of_scipy(prior: Prior, book: object) -> None:
+def test_density_is_that_of_scipy(prior: Prior, book: Any) -> None:
     """Log densities are those of the textbook distribution, whose integral is 1."""
     x = np.array([0.6, 1.1, 1.9, 2.4])
     np.testing.assert_allclose(prior.log_density(x), book.logpdf(x), atol=1e-12)
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_densities_are_the_slope_of_probabilities(prior: Prior, book: object) -> None:
+def test_densities_are_the_slope_of_probabilities(prior: Prior, book: Any) -> None:
     """What a density integrates to between two values is the probability between them."""
     x = np.linspace(0.6, 2.4, 20_001)
     mass = trapezoid(np.exp(prior.log_density(x)), x)
@@ -37,7 +39,7 @@ def test_densities_are_the_slope_of_probabilities(prior: Prior, book: object) ->
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_quantiles_are_those_of_scipy(prior: Prior, book: object) -> None:
+def test_quantiles_are_those_of_scipy(prior: Prior, book: Any) -> None:
     """Quantiles, far tails included, are those of the textbook distribution."""
     level = np.array([1e-9, 0.05, 0.5, 0.95, 1 - 1e-9])
     np.testing.assert_allclose(prior.quantile(level), book.ppf(level), rtol=1e-7)
@@ -68,14 +70,14 @@ def test_an_impossible_prior_is_refused(kind: type, arguments: tuple[float, floa
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_probabilities_are_those_of_scipy(prior: Prior, book: object) -> None:
+def test_probabilities_are_those_of_scipy(prior: Prior, book: Any) -> None:
     """Distribution functions are those of the textbook, far tails and impossible values too."""
     x = np.array([-1.0, 0.0, 1e-3, 0.6, 1.9, 2.4, 40.0])
     np.testing.assert_allclose(prior.probability(x), book.cdf(x), atol=1e-14)
 
 
 @pytest.mark.parametrize(("prior", "book"), PAIRS)
-def test_a_widened_prior_keeps_its_middle(prior: Prior, book: object) -> None:
+def test_a_widened_prior_keeps_its_middle(prior: Prior, book: Any) -> None:
     """Twice as wide means twice the distance of quantiles, in the logarithm of a lognormal."""
     level = np.array([0.05, 0.5, 0.95])
     one, two = prior.quantile(level), prior.widened(2.0).quantile(level)
@@ -98,9 +100,7 @@ def test_a_joint_prior_is_cut_to_its_box(joint: JointPrior) -> None:
     for j, (_, book) in enumerate(PAIRS):
         below, upto = book.cdf(np.exp([joint.low[j], joint.high[j]]))
 
-        def cut(
-            values: np.ndarray, book: object = book, a: float = below, b: float = upto
-        ) -> object:
+        def cut(values: Any, book: Any = book, a: float = below, b: float = upto) -> Any:
             return np.clip((book.cdf(values) - a) / (b - a), 0, 1)
 
         assert stats.kstest(x[:, j], cut).pvalue > 1e-4
@@ -140,7 +140,9 @@ def test_a_joint_density_is_that_of_the_logarithms(joint: JointPrior) -> None:
 
 def test_shared_parameters_stand_once(joint: JointPrior) -> None:
     """What two machines share has the box that both allow; their own parameters stay apart."""
-    other = JointPrior(("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), *np.log([[1, 0.5], [9, 2]]))
+    other = JointPrior(
+        ("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), np.log([1, 0.5]), np.log([9, 2])
+    )
     both = combine_priors([joint, other], [(0, 1, 2), (1, 3)])
     assert both.names == ("a", "b", "c", "d")
     np.testing.assert_allclose(np.exp(both.low), [1.0, 1.0, 0.4, 0.5])

@@ -90,7 +90,7 @@ def test_chains_are_as_calibrated_as_grids(
         level = np.array(marginals(posterior, x))
         spread = np.sqrt(level * (1 - level) / found.ess_bulk) + 1e-3
         errors.append([(np.mean(y < x, axis=0) - level) / spread for y in (found.flat, closer)])
-    right, wrong = (np.abs(own).ravel() for own in np.moveaxis(errors, 1, 0))
+    right, wrong = (np.abs(own).ravel() for own in np.moveaxis(np.array(errors), 1, 0))
     claims.claim("chains", all_of(2 * stats.norm.sf(right)))
     claims.control("chains", all_of(2 * stats.norm.sf(wrong)))
 

@@ -11,6 +11,7 @@ from scipy import stats
 from lmshealth.signal.acceleration_levels import (
     FrequencyBand,
     Growth,
+    Magnitude,
     choose_bands,
     find_growth,
     read_magnitudes,
@@ -30,7 +31,7 @@ def fit(
     rng: np.random.Generator, exponent: float, bands: tuple[FrequencyBand, ...]
 ) -> tuple[Growth, ...]:
     """Read the growth of one series of logs at the paper's velocities."""
-    readings = []
+    readings: list[Magnitude] = []
     for velocity in VELOCITIES:
         values = rng.standard_normal(N) * (0.1 * velocity**exponent)
         readings += read_magnitudes(make_log({"acc_feed": values}, RATE, velocity=velocity), bands)

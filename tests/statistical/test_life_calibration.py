@@ -187,7 +187,7 @@ def test_young_machines_are_told_right_by_their_fleet(
     """
     limit = described().parameters[0].limit
     assert limit is not None
-    places, wrong = [], []
+    places, wrong = list[float](), list[float]()
     while len(places) < claims.trials:
         fleet = draw_fleet(rng, described())
         number = int(rng.integers(1 << 32))
@@ -221,7 +221,7 @@ def test_usage_covers_what_comes(rng: np.random.Generator, claims: Claims, tmp_p
     """
     stage = make_stage(tmp_path, (FADING,))
     for name, n, weeks in (("twenty weeks", 20, 20), ("three weeks", 5, 3)):
-        levels, wrong = [], []
+        levels, wrong = list[float](), list[float]()
         for _ in range(claims.trials):
             steps = 1.4e5 * (1 + 0.1 * rng.standard_normal(n))
             still = np.tile(np.log(FREQUENCY[:2]), (n + 1, 1))

@@ -162,5 +162,5 @@ def test_drifts_of_damaged_lives_cover(
             errors_in_std.append(abs(error) / np.sqrt(var) if var > 0 else 0.0)
     off = np.array(errors_in_std)
     reach = stats.norm.ppf(0.95)
-    claims.claim("drift, damaged lives", as_often(np.sum(off < reach), off.size, 0.9))
-    claims.control("drift, damaged lives", as_often(np.sum(2 * off < reach), off.size, 0.9))
+    claims.claim("drift, damaged lives", as_often(int(np.sum(off < reach)), off.size, 0.9))
+    claims.control("drift, damaged lives", as_often(int(np.sum(2 * off < reach)), off.size, 0.9))

@@ -48,8 +48,8 @@ def analysed(folder: Path, name: str) -> Path:
     life, seed = LIVES[name]
     logs, out = folder / name, folder / f"{name}-result"
     call("models", "simulate", "lms-y", "--life", life, "--logs", 40, "--seconds", 20,
-         "--seed", seed, "--out", logs)  # fmt: skip
-    call("lmshealth", "run", logs, "--stage", "lms-y", "--out", out)
+         "--seed", seed, "--out", logs, quick=False)  # fmt: skip
+    call("lmshealth", "run", logs, "--stage", "lms-y", "--out", out, quick=False)
     return out
 
 
@@ -57,7 +57,9 @@ def assessment_in(result: Path) -> Assessment:
     """Return the assessment of the only machine in a folder of results."""
     with closing(Store(default_url(result), create=False)) as store:
         (machine,) = store.published()
-        found: Assessment = unpack(store.assessment(machine.machine, machine.key), Assessment)
+        content = store.assessment(machine.machine, machine.key)
+        assert content is not None
+        found: Assessment = unpack(content, Assessment)
     return found
 
 
@@ -66,6 +68,8 @@ def pictures(made: Assessment) -> dict[str, tuple[Draw, tuple[float, float]]]:
     track, history, health, prognosis = made.track, made.history, made.latest_health, made.prognosis
     latest, before = made.latest, made.at_baseline
     assert track and health and prognosis and latest and before
+    spectra = one_channel(latest).spectra
+    assert made.waterfall and spectra and latest.shapes and before.shapes
     limit = next(limit_of(spec) for spec in made.stage.parameters if spec.name == PARAMETER)
     effects = find_covariate_effects(history, track, made.stage)
     effect = next(one for one in effects if (one.covariate, one.mode) == (COVARIATE, MODE))
@@ -91,7 +95,7 @@ def pictures(made: Assessment) -> dict[str, tuple[Draw, tuple[float, float]]]:
         "nis": partial(figures.plot_nis, track=track),
     }  # fmt: skip
     spectrum = partial(
-        log_figures.plot_spectra, summary=one_channel(latest).spectra, modes=latest.modes,
+        log_figures.plot_spectra, summary=spectra, modes=latest.modes,
         stage=made.stage, before=one_channel(before),
     )  # fmt: skip
     shapes = partial(

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import pytest
@@ -71,7 +72,7 @@ def told(found: Track) -> set[tuple[str, int, str]]:
     return {(e.kind, e.epoch, e.source) for e in found.events if e.kind != "alarm"}
 
 
-HAPPENINGS = {
+HAPPENINGS: dict[str, dict[str, Any]] = {
     "step": {"jump": (-0.03, 0.0)},
     "regreasing": {"jump": (0.0, -0.5)},
     "servo": {"jump": (-0.012, 0.3), "loop": 1.4},
@@ -321,7 +322,7 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
     opened = np.zeros_like(old.cov)
     rate = np.arange(model.space.rate.start, model.space.rate.stop)
     alike = constants.RATE_COMMON + (1 - constants.RATE_COMMON) * np.eye(rate.size)
-    opened[np.ix_([0], rate, rate)] = SETTINGS[0].rate ** 2 * alike
+    opened[np.ix_(np.array([0]), rate, rate)] = SETTINGS[0].rate ** 2 * alike
     np.testing.assert_allclose(new.cov, old.cov + opened, atol=1e-16)
     assert new.log_evidence == pytest.approx(0.0, abs=1e-12)
 

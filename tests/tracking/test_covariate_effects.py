@@ -66,11 +66,11 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
     assert [(one.covariate, one.mode) for one in found] == [
         (covariate, mode) for covariate in ("temperature_c", "payload_kg") for mode in history.modes
     ]
-    for one in found:
-        at = history.columns(one.mode)
-        there = np.isfinite(left[:, at]) & np.isfinite(history.covariates[one.covariate])[:, None]
-        np.testing.assert_allclose(one.corrected, left[:, at][there], atol=1e-12)
-        np.testing.assert_array_equal(one.epochs, np.nonzero(there)[0])
+    for effect in found:
+        at, covariate = history.columns(effect.mode), history.covariates[effect.covariate]
+        there = np.isfinite(left[:, at]) & np.isfinite(covariate)[:, None]
+        np.testing.assert_allclose(effect.corrected, left[:, at][there], atol=1e-12)
+        np.testing.assert_array_equal(effect.epochs, np.nonzero(there)[0])
 
 
 def test_a_known_slope_is_found_and_taken_out(straight: Stage) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.special import softmax
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import BoolArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import (
@@ -103,7 +103,7 @@ def told(history: History, stage: Stage, wander: Wander) -> Followed:
     )
 
 
-def furthest(found: Followed, book: Followed, judged: FloatArray) -> float:
+def furthest(found: Followed, book: Followed, judged: BoolArray) -> float:
     """Return the largest deviation of means and covariances in the oracle's std."""
     variance = np.einsum("kpipi->kpi", book.cov)
     # A drift has no variance at its baseline: what differs there differs in units of ln f.

@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import timedelta
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -393,7 +394,8 @@ def test_histories_that_contradict_themselves_are_refused(
 ) -> None:
     """The error names wrong shapes, baselines that are no logs, and series of unknown modes."""
     with pytest.raises(ValueError, match=message):
-        replace(history, **{field: value})
+        changed: dict[str, Any] = {field: value}
+        replace(history, **changed)
 
 
 @pytest.mark.parametrize("variance", [np.nan, 0.0, -1e-6])

@@ -71,7 +71,7 @@ def test_ticks_are_in_mean_distances_of_the_logs_so_far(history: History, stage:
 
     No tick depends on the horizon of the stage or on a later log.
     """
-    empty = ~np.isfinite(history.ln_frequency).any(axis=1)
+    empty = np.asarray(~np.isfinite(history.ln_frequency).any(axis=1))
     empty[0] = False
     assert empty.any()
     there = np.flatnonzero(~empty)
@@ -86,7 +86,8 @@ def test_ticks_are_in_mean_distances_of_the_logs_so_far(history: History, stage:
 def test_without_odometer_ticks_are_of_time(history: History, stage: Stage) -> None:
     """The clock is the time of recording where there is no odometer: here a log a day."""
     timed = replace(history, travel=np.full(len(history.logs), np.nan))
-    ticks, seen = StateSpace(timed, stage).ticks, np.isfinite(history.ln_frequency).any(axis=1)
+    ticks = StateSpace(timed, stage).ticks
+    seen = np.asarray(np.isfinite(history.ln_frequency).any(axis=1))
     assert (ticks[~seen] == 0).all()
     steady = seen & np.r_[False, seen[:-1]] & (np.cumsum(~seen) == 0)
     assert steady.sum() > 1
@@ -164,7 +165,7 @@ def test_steps_are_read_where_they_are_there(history: History, stage: Stage) -> 
     for k in range(len(history.logs)):
         matrix = space.matrix(k)
         for j, step in enumerate(history.steps):
-            expected = np.zeros((8, 4))
+            expected: np.ndarray = np.zeros((8, 4))
             if step.kind == "servo" and step.there[k]:
                 expected = np.kron(np.eye(2), np.tile(np.eye(2), (2, 1)))
             if step.kind == "sensor" and step.there[k]:

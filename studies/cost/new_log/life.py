@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -84,10 +85,11 @@ def main() -> None:
         out = Path(folder)
         with closing(Store(f"sqlite:///{out / 'store.sqlite'}")) as store:
             parts = {"first": (logs[:-1], 0), "new": (logs, n - 1), "unchanged": (logs, n)}
-            cost = {
-                name: cpu_s(lambda part=part: kept.append(run_with(*part, stage, store, out)))
-                for name, part in parts.items()
-            }
+
+            def update(own: list[LogEstimates], stored: int) -> None:
+                kept.append(run_with(own, stored, stage, store, out))
+
+            cost = {name: cpu_s(partial(update, *part)) for name, part in parts.items()}
     peak = memory_bytes() / 2**20
     fresh = assess(logs, stage, epochs=EPOCHS, seed=SEED)
     short = assess(logs[: 2 * n // 3], stage, epochs=EPOCHS, seed=SEED)

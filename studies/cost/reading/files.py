@@ -63,7 +63,7 @@ def _tdms(path: Path, columns: Columns) -> None:
 
 
 def _mat(path: Path, columns: Columns) -> None:
-    scipy.io.savemat(path, columns | META, do_compression=path.stem == "packed")
+    scipy.io.savemat(path, {**columns, **META}, do_compression=path.stem == "packed")
 
 
 def _csv(path: Path, columns: Columns) -> None:

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.registry import load
-from studies.cost.reading.files import BARE
+from studies.cost.reading.files import BARE, Call
 from studies.harness.cost import cpu_s, memory_bytes
 
 _MAX_MEMORY = 4 * 2**30
@@ -26,7 +26,7 @@ def main() -> None:
     path, short = Path(sys.argv[1]), Path(sys.argv[2])
     # An ASCII UFF58 of ten minutes is above the limit of memory.
     reader = partial(load, columns=ColumnMap(), max_memory=_MAX_MEMORY)
-    ways = {"reader": reader, "library": BARE[path.name][0]}
+    ways: dict[str, Call] = {"reader": reader, "library": BARE[path.name][0]}
     for read in ways.values():
         read(short)
     before, found = memory_bytes(), {}

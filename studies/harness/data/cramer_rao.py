@@ -139,7 +139,7 @@ def decay_bound(
     # So fast that nothing aliases; the band alone counts.
     n_samples = int(np.ceil(20 * recording.band[1] * duration))
     fourier = fourier_frequencies(duration, recording.band)
-    nothing = np.empty((fourier.size, 0))
+    nothing = np.empty((fourier.size, 0), dtype=complex)
     block = DecaySpectra(fourier, nothing, duration, n_samples / duration, nothing)
     columns, _ = pole_columns(block, f, zeta)
     exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))

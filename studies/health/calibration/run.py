@@ -79,15 +79,15 @@ def one(kind: str, life: int) -> Row:
     part = (SHARED, X).index(kind) + 1 if kind in (SHARED, X) else 0
     rng = np.random.default_rng([SEED, part, life])
     drawn = draw(rng, stage, len(EPOCHS) if kind == SHARED else 1)
-    told = drawn.track
+    track = drawn.track
     if kind in (DRIFTS, HALVED):
-        told = replace(told, drift_cov=told.drift_cov / 2)
+        track = replace(track, drift_cov=track.drift_cov / 2)
     believed = believing(stage, _LESS[kind]) if kind in _LESS else stage
     if kind == CHAINS:
-        found = infer(told, believed, [SEED, life], epochs=drawn.epochs)
+        found = infer(track, believed, [SEED, life], epochs=drawn.epochs)
         draws = [np.log(thinned(own)) for own in found.samples]
         return {"rank": ranks(drawn.truth, draws, rng), "converged": bool(found.converged.all())}
-    place, chains = ranks_of(replace(drawn, track=told), believed, rng, [SEED, life])
+    place, chains = ranks_of(replace(drawn, track=track), believed, rng, [SEED, life])
     return {"rank": place, "chains": chains}
 
 
@@ -95,12 +95,12 @@ def ranks_of(
     drawn: Life, believed: Stage, rng: np.random.Generator, key: list[int]
 ) -> tuple[list[list[float]], int]:
     """Rank the truth of each epoch; also return whether chains replaced importance sampling."""
-    told, names = drawn.track, believed.informative
-    columns = [told.modes.index(name) for name in names]
+    track, names = drawn.track, believed.informative
+    columns = [track.modes.index(name) for name in names]
     draws, chains = [], 0
     for k in drawn.epochs:
-        cov = told.drift_cov[k][np.ix_(columns, columns)]
-        posterior = EpochPosterior.of(believed, names, told.drift[k][columns], cov)
+        cov = track.drift_cov[k][np.ix_(columns, columns)]
+        posterior = EpochPosterior.of(believed, names, track.drift[k][columns], cov)
         start = posterior.prior.draw(rng, N_PRIOR)
         try:
             found = importance_sample_to_ess(posterior.log_probability, start, rng, N_POINTS)

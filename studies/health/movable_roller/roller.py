@@ -159,7 +159,7 @@ def write_stage(found: Calibration | None, folder: Path, *, model_std: float | N
 
 def places(read: pd.DataFrame) -> pd.Series[int]:
     """Count the moves between each dwell and the turning point: up and down have them in common."""
-    turn = int(read.loc[read["roller_v"].idxmax(), "dwell"])
+    turn = int(read["dwell"].iloc[read["roller_v"].argmax()])
     return (read["dwell"] - turn).abs()
 
 

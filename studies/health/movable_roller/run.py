@@ -26,6 +26,7 @@ import json
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import numpy as np
 import pandas as pd
@@ -119,10 +120,10 @@ def read_modes(dwells: pd.DataFrame, stage: Path, *, quick: bool) -> pd.DataFram
     ``modes.csv`` is written with the logs of the dwells.
     """
     command = ("modes", *dwells["log"], "--stage", stage, "--part", "settling", "--format", "json")
-    told = json.loads(call("lmshealth", *command, quick=quick, some_refused=True))
-    modes = pd.DataFrame(told["modes"])
+    answer = json.loads(call("lmshealth", *command, quick=quick, some_refused=True))
+    modes = pd.DataFrame(answer["modes"])
     modes.to_csv(Path(dwells["log"].iloc[0]).with_name("modes.csv"), index=False)
-    reasons = {row["log"]: row["reason"] for row in told["refused"]}
+    reasons = {row["log"]: row["reason"] for row in answer["refused"]}
     read = dwells.merge(modes[["log", "frequency_hz", "frequency_std_hz"]], on="log", how="left")
     return read.assign(refused=[reasons.get(log, "") for log in read["log"]])
 
@@ -156,7 +157,7 @@ def compare(read: pd.DataFrame, track: Path, health: pd.DataFrame) -> list[Row]:
     both["inside"] = (both["q05"] <= both["roller_v"]) & (both["roller_v"] <= both["q95"])
     both = both.drop(columns=["log", "recorded_at", "refused"])
     both = both.astype(object).where(both.notna(), None)
-    return both.to_dict("records")
+    return cast(list[Row], both.to_dict("records"))
 
 
 def count(rows: list[Row]) -> Row:
@@ -186,7 +187,7 @@ def up_and_down(rows: list[Row]) -> list[Row]:
         halves = [((row["q95"] or 0.0) - (row["q05"] or 0.0)) / 2 for row in pair]
         up, down = (row["median"] or row["roller_v"] for row in pair)
         measured = pair[1]["roller_v"] - pair[0]["roller_v"]
-        half = float(np.hypot(*halves))
+        half = float(np.hypot(halves[0], halves[1]))
         found.append({"up": pair[0]["dwell"], "down": pair[1]["dwell"], "difference_v": down - up,
                       "measured_difference_v": measured, "half_interval_v": half})  # fmt: skip
     return found

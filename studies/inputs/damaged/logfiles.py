@@ -17,14 +17,13 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pyuff
 from nptdms import ChannelObject, RootObject, TdmsWriter
-from numpy.typing import NDArray
 from scipy.io import savemat
 from scipy.signal import decimate
 
 from models.dynamics.stages import STAGES
 from models.recordings.recording import SAMPLE_RATE_HZ, record
 
-Columns = dict[str, NDArray[np.float32]]
+Columns = dict[str, np.ndarray]
 MACHINES = tuple(f"damaged-{letter}-Y" for letter in "ABCDEF")
 SECONDS, VELOCITY = 6.0, 0.010
 _EVERY_TENTH = 10
@@ -164,9 +163,9 @@ def _uff(path: Path, log: LogFile) -> None:
             file.write_sets([record_58], mode="add")
 
 
-WRITERS: Mapping[str, Callable[[Path, LogFile], None]] = {
-    ".csv": lambda path, log: path.write_bytes(text_of(log)) and None,
-    ".csv.gz": lambda path, log: path.write_bytes(gzip.compress(text_of(log), 1)) and None,
+WRITERS: Mapping[str, Callable[[Path, LogFile], object]] = {
+    ".csv": lambda path, log: path.write_bytes(text_of(log)),
+    ".csv.gz": lambda path, log: path.write_bytes(gzip.compress(text_of(log), 1)),
     ".parquet": _parquet,
     ".h5": _hdf5,
     ".tdms": _tdms,

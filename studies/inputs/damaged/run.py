@@ -129,12 +129,13 @@ def read_found(out: Path) -> Found:
     refused = pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)
     modes = pd.read_csv(out / "modes.csv", dtype=str, keep_default_na=False)
     found = Found(defaultdict(set), defaultdict(set), set(modes["log"]))
-    for row in refused.itertuples():
+    columns = refused[["log", "detail", "mode", "channel", "reason"]]
+    for log, detail, mode, channel, reason in columns.to_numpy().tolist():
         # Rows of a table have no name of their own but their line.
-        in_table = row.log in ("manifest.csv", "maintenance.csv")
-        name = f"{row.log}, {row.detail.split(':')[0]}" if in_table else row.log
-        if not row.mode:
-            (found.partly if row.channel else found.whole)[name].add(row.reason)
+        in_table = log in ("manifest.csv", "maintenance.csv")
+        name = f"{log}, {detail.split(':')[0]}" if in_table else log
+        if not mode:
+            (found.partly if channel else found.whole)[name].add(reason)
     return found
 
 

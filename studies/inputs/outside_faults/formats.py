@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
-import struct
-import wave
-import zipfile
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -16,6 +12,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from studies.inputs.outside_faults.case import Case, Program, Seen, last_line
+from studies.inputs.outside_faults.no_logs import NO_LOGS
 
 RATE, SECONDS_OF_LOG = 2000.0, 6.0
 ANY = (0.0, 9.0)  # damping in %
@@ -48,7 +45,7 @@ def record(seed: int = 0, rate: float = RATE, seconds: float = SECONDS_OF_LOG) -
 
 def table(path: Path, names: str, *columns: object, end: str = "", sep: str = ",") -> Path:
     """Write columns of numbers or text, with a line of names where there is one."""
-    rows = (sep.join(map(str, row)) for row in zip(*columns, strict=True))  # type: ignore[call-overload]
+    rows = (sep.join(map(str, row)) for row in zip(*columns, strict=True))
     path.write_text("\n".join([*([names] if names else []), *rows, end]), encoding="utf-8")
     return path
 
@@ -183,30 +180,10 @@ def many(folder: Path, n: int, rate: float = RATE) -> Path:
                  times, *values)  # fmt: skip
 
 
-def written(name: str, content: Callable[[], bytes], folder: Path) -> Path:
+def written(name: str, content: bytes, folder: Path) -> Path:
     """Write a file of bytes."""
-    (folder / name).write_bytes(content())
+    (folder / name).write_bytes(content)
     return folder / name
-
-
-def sound() -> bytes:
-    """Write a WAV file."""
-    file = io.BytesIO()
-    with wave.open(file, "wb") as out:
-        out.setnchannels(1)
-        out.setsampwidth(2)
-        out.setframerate(8000)
-        out.writeframes((3000 * record()[:, 0]).astype("<i2").tobytes())
-    return file.getvalue()
-
-
-def zipped(*names: str) -> bytes:
-    """Write a zip archive of files."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as out:
-        for name in names:
-            out.writestr(name, "x")
-    return file.getvalue()
 
 
 def spectrum(folder: Path, names: str = "Frequency [Hz],PSD [g²/Hz]") -> Path:
@@ -214,24 +191,6 @@ def spectrum(folder: Path, names: str = "Frequency [Hz],PSD [g²/Hz]") -> Path:
     f = np.arange(2000) / 2
     return table(folder / "psd.csv", names, f.tolist(), (1e-6 / ((f - 126) ** 2 + 4)).tolist())
 
-
-GEOMETRY = (
-    b"    -1\n    15\n         1         0         0         8  1.00000e+00\n    -1\n"
-    b"    -1\n    82\n         1         2         0\nline\n         1         2\n    -1\n"
-)
-NO_LOGS = {
-    "a.wav": (sound, "a sound file (WAV)"),
-    "wav.csv": (sound, "a sound file (WAV)"),
-    "a.flac": (lambda: b"fLaC" + bytes(99), "a sound file (FLAC)"),
-    "a.mp3": (lambda: b"ID3\x04" + bytes(99), "a sound file (MP3)"),
-    "a.xlsx": (lambda: zipped("[Content_Types].xml", "xl/workbook.xml"), "a workbook (.xlsx)"),
-    "a.zip": (lambda: zipped("a.csv", "b.csv"), "a zip archive"),
-    "pdf.csv": (lambda: b"%PDF-1.7\n1 0 obj\n", "a printed document"),
-    "json.txt": (lambda: json.dumps(record()[:99].tolist()).encode(), "JSON"),
-    "a.png": (lambda: b"\x89PNG\r\n\x1a\n" + bytes(99), "a picture (PNG)"),
-    "geometry.uff": (lambda: GEOMETRY, "15 (nodes)"),
-    "mesh.stl": (lambda: bytes(80) + struct.pack("<I", 9) + bytes(450), "a geometry (STL)"),
-}
 
 EXACT: dict[bool, Ask] = {b: partial(read, partial(uff, binary=b), 126.0) for b in (False, True)}
 ALIGNED = (1.5, 1.8)

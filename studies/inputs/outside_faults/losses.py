@@ -305,8 +305,8 @@ def read_only(
     same = done.returncode == 0 and all(
         (pages / name).read_bytes() == (out / name).read_bytes() for name in ("AX-3-Y.html",)
     )
-    told = done.returncode == 1 and "copy" in done.stderr and "-wal" in done.stderr
-    return Seen(same or (wal and told), last_line(done.stderr) or "pages written")
+    refused = done.returncode == 1 and "copy" in done.stderr and "-wal" in done.stderr
+    return Seen(same or (wal and refused), last_line(done.stderr) or "pages written")
 
 
 # Files that a manifest names or omits
@@ -334,11 +334,11 @@ def counted(
         (logs / "README.txt").write_text("Logs of axis 3.\n1 2 3\n" * 50)
         (logs / "limits.dat").write_text("1.0 2.0\n" * 10)
     done = analyse(program, folder)
-    said = done.stdout.split("\n")[0] if done.returncode != 1 else last_line(done.stderr)
+    summary = done.stdout.split("\n")[0] if done.returncode != 1 else last_line(done.stderr)
     table = folder / "out" / "refused.csv"
     named = not reason or reason in (table.read_text() if table.exists() else "")
-    answer = f"exit {done.returncode}: {said[:80]}{'' if named else f', no {reason}'}"
-    return Seen(used in said and done.returncode == status and named, answer)
+    answer = f"exit {done.returncode}: {summary[:80]}{'' if named else f', no {reason}'}"
+    return Seen(used in summary and done.returncode == status and named, answer)
 
 
 def case(name: str, right: str, fault: Callable[..., Seen], control: Callable[..., Seen]) -> Case:

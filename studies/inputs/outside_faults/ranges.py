@@ -47,7 +47,7 @@ def estimates(folder: Path, n: int, change: Change = lambda table: None) -> Path
     return path
 
 
-def put(column: str, value: object, log: int = 3) -> Change:
+def put(column: str, value: float | str, log: int = 3) -> Change:
     """Put a value into the rows of one log of a table."""
 
     def change(table: pd.DataFrame) -> None:
@@ -124,7 +124,7 @@ def run(program: Program, folder: Path, *, given: dict[str, object], where: str)
     if where == "manifest":
         row = ",".join(map(str, given.values()))
         (logs / "manifest.csv").write_text(f"file,{','.join(given)}\nother.csv,{row}\n")
-    done = program("run", logs, "--stage", "lms-y", "--out", out, "--workers", 1)
+    done = program("run", logs, "--stage", "lms-y", "--out", out, "--workers", "1")
     refused = pd.read_csv(out / "refused.csv", keep_default_na=False)
     whole = refused[(refused["mode"] == "") & (refused["channel"] == "")]
     reasons = dict(zip(whole["log"], whole["reason"], strict=True))
@@ -199,7 +199,7 @@ def _tables() -> list[Case]:
 
 
 def _logs() -> list[Case]:
-    usual = {"temperature_c": 21}
+    usual: dict[str, object] = {"temperature_c": 21}
     values: list[tuple[dict[str, object], str]] = [
         ({"recorded_at": "0001-01-01T00:00:00Z", "travel_km": 5}, "file"),
         ({"recorded_at": "9999-12-31T00:00:00Z"}, "manifest"),

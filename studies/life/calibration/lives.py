@@ -116,8 +116,10 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     both[:, :r, :r], both[:, r:, r:] = cov, 0.05**2 * np.eye(r)
     estimates = values + scale * noise[..., 0], np.full((N_LOGS, r), np.log(0.015)), both
     missing = rng.random((N_LOGS, r)) < 0.05
-    how = {"series": series, "covariates": covariates, "steps": steps, "missing": missing}
-    return Life(make_history(names, travel, estimates, **how), parts)
+    history = make_history(
+        names, travel, estimates, series=series, covariates=covariates, steps=steps, missing=missing
+    )
+    return Life(history, parts)
 
 
 def _travel(rng: np.random.Generator) -> Array:

@@ -81,9 +81,9 @@ def one(kind: str, life: int) -> Row:
         stage = believing(stage, 0.0)
     if kind == LOSING:
         stage = always_losing(stage)
-    how = {"chains": kind == CHAINS, "n_draws": N_POSTERIOR}
+    seed, chains = [SEED, life], kind == CHAINS
     try:
-        found = fit_life(drawn.history, stage, [SEED, life], **how)
+        found = fit_life(drawn.history, stage, seed, chains=chains, n_draws=N_POSTERIOR)
     except NotConverged:
         return {"rank": None}
     draws = quantities(found, drawn.now, np.random.default_rng([SEED, life, 1]))

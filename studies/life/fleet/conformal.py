@@ -29,7 +29,8 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import asdict, replace
-from functools import cache
+from functools import cache, partial
+from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
@@ -116,15 +117,15 @@ def one(kind: str, number_: int, n_ended: int, n_running: int) -> Row:
         # The first log after the replacement opens a new baseline.
         whole = history_of(rng, lost, length, np.append(u, end + 0.01))
         history = replace(whole, baselines=(0, LOGS_ENDED))
-        for way, found in by_way(lambda h=history: ended_lives(h, stage(), [SEED, number_])):
-            row["ended"][way] += [asdict(life) for life in found]
+        for way, ended in by_way(partial(ended_lives, history, stage(), [SEED, number_])):
+            row["ended"][way] += [asdict(life) for life in ended]
     for _ in range(n_running):
         length = _KM * LIFE_KM * np.exp(SCATTER * rng.standard_normal())
         share = rng.uniform(0.3, 0.9)
         history = history_of(rng, lost, length, spread(rng, share, LOGS_RUNNING))
         left = length * (1 - share)
         own: Row = {"left_km": left / _KM}
-        for way, found in by_way(lambda h=history: prognose(h, stage(), SEED, chains=False)):
+        for way, found in by_way(partial(prognose, history, stage(), SEED, chains=False)):
             draws = np.minimum(found.remaining[:, -1], found.horizon)
             cuts = np.quantile(draws, np.linspace(0, 1, 1001), method="inverted_cdf")
             own[way] = {"place": float(np.mean(draws <= left)), "km": (cuts / _KM).tolist()}
@@ -132,11 +133,14 @@ def one(kind: str, number_: int, n_ended: int, n_running: int) -> Row:
     return row
 
 
-def by_way(work: Callable[[], object]) -> Iterator[tuple[str, object]]:
+Found = TypeVar("Found")
+
+
+def by_way(work: Callable[[], Found]) -> Iterator[tuple[str, Found]]:
     """Compute something by each predictor; a life is fitted once for both."""
     kept: dict[int, LifePosterior] = {}
 
-    def fitted(history: History, *args: object, **options: object) -> LifePosterior:
+    def fitted(history: History, *args: Any, **options: Any) -> LifePosterior:
         key = hash((history.ln_frequency.tobytes(), history.baselines))
         if key not in kept:
             kept[key] = fit_life(history, *args, n_draws=2000, **options)

@@ -12,6 +12,7 @@ from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
+from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import make_history, map_std
@@ -66,6 +67,7 @@ def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
     wear, none = preload.laws
     assert isinstance(wear, HertzWear)
     share = rng.uniform()
+    assert isinstance(wear.life_km, Lognormal)
     life_km = wear.life_km.placed(float(mean), float(np.sqrt(between)))
     laws = (
         msgspec.structs.replace(wear, life_km=life_km, weight=share),
@@ -86,6 +88,7 @@ def longer_lived(fleet: Stage, times: float) -> Stage:
     wear, none = preload.laws
     assert isinstance(wear, HertzWear)
     prior = wear.life_km
+    assert isinstance(prior, Lognormal)
     longer = msgspec.structs.replace(prior, median=times * prior.median)
     laws = (msgspec.structs.replace(wear, life_km=longer), none)
     return _with(fleet, (msgspec.structs.replace(preload, law=laws), mount))

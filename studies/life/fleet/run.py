@@ -235,7 +235,7 @@ def judged(rows: list[Row], way: str) -> Row:
 def mean(values: Sequence[float | np.floating]) -> list[float]:
     """Return a mean over fleets and its standard error; 0 for a single fleet."""
     error = sem(values) if len(values) > 1 else 0.0
-    return [round(float(np.mean(values)), 4), round(float(error), 4)]
+    return [round(float(np.mean(np.asarray(values))), 4), round(float(error), 4)]
 
 
 def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:

@@ -61,7 +61,7 @@ def find_dwells(log: Log) -> list[tuple[Segment, float]]:
     moved = ndimage.maximum_filter1d(smooth, size) - ndimage.minimum_filter1d(smooth, size)
     still = moved < _STILL * (smooth.max() - smooth.min())
     # Noise may lift single samples over the threshold.
-    still = ndimage.binary_closing(still, np.ones(size), border_value=1)
+    still = ndimage.binary_closing(still, np.ones(size, dtype=bool), border_value=1)
     labels, n = ndimage.label(still)
     found = []
     for where in ndimage.find_objects(labels, n):

@@ -170,7 +170,8 @@ def least_squares(x: np.ndarray, f: float, zeta: float) -> list[float]:
 
     fit = optimize.least_squares(left, np.log([f, zeta]), x_scale=[1e-4, 1e-1])
     variance = 2 * fit.cost / (x.size - 2 * x.shape[0] - 2)
-    std = np.sqrt(variance * np.diag(np.linalg.inv(fit.jac.T @ fit.jac)))
+    slopes = np.asarray(fit.jac)
+    std = np.sqrt(variance * np.diag(np.linalg.inv(slopes.T @ slopes)))
     return [*fit.x.tolist(), *std.tolist()]
 
 

@@ -75,9 +75,10 @@ def draw(seed: int) -> Hammer:
     """Draw a machine, and how it is struck."""
     rng = np.random.default_rng([seed, 23])
     n_modes, blows = int(rng.integers(1, 4)), int(rng.integers(1, 11))
+    low, high = np.log(DAMPING)
     while True:
         f = np.sort(rng.uniform(*FREQUENCY, n_modes))
-        zeta = np.exp(rng.uniform(*np.log(DAMPING), n_modes))
+        zeta = np.exp(rng.uniform(low, high, n_modes))
         if (np.diff(f) > 3 * (zeta * f)[1:] + 3 * (zeta * f)[:-1]).all():
             break
     part = rng.choice([-1, 1], n_modes) * rng.uniform(0.3, 1, n_modes)

@@ -98,7 +98,7 @@ def with_lines(
     lines = sum(np.sin(2 * np.pi * k * turns + phase[k]) for k in (1, 2, 3))
     ball = 2 * np.pi * VELOCITY / (1e-3 * BALL_PASS_MM) * (1 - 0.02) * time
     lines = lines + np.sin(ball + phase[0])
-    size = np.sqrt(2) * np.std(clean.channels[0].values)
+    size = np.sqrt(2) * np.std(clean.channels[0].values[:])
     named = {c.name: c.values + size * lines for c in clean.channels}
     return make_log(named, RATE, velocity=0.98 * VELOCITY)
 

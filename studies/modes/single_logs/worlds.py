@@ -42,7 +42,7 @@ class Machine:
 def draw_machine(rng: np.random.Generator) -> Machine:
     """Draw one to three modes from 95 Hz, ζ 0.8 to 3 %, in three accelerometers of 20 to 60 s."""
     n = int(rng.integers(1, 4))
-    zeta = np.exp(rng.uniform(*np.log([0.008, 0.03]), n))
+    zeta = np.exp(rng.uniform(np.log(0.008), np.log(0.03), n))
     f = [float(rng.uniform(95.0, 110.0))]
     for k in range(1, n):
         f.append(f[-1] * (1 + rng.uniform(4, 8) * (zeta[k] + zeta[k - 1])))

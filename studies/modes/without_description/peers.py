@@ -14,6 +14,7 @@ import time
 import warnings
 from collections.abc import Callable
 from contextlib import redirect_stdout
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -67,7 +68,7 @@ def pyoma2(world: World) -> Found:
     found: Found = {}
     for name in PRESETS:
         start = time.process_time()
-        f = _found(lambda name=name: clustered(name), world.band)
+        f = _found(partial(clustered, name), world.band)
         found[f"pyOMA2 SSI, {name}"] = f, alone + time.process_time() - start
     return found
 
@@ -132,7 +133,7 @@ def peaks(world: World) -> Array:
     return np.sort(chosen)
 
 
-def _peaks(level: Array, prominence: float) -> tuple[Array, Array]:
+def _peaks(level: Array, prominence: float) -> tuple[NDArray[np.intp], Array]:
     place, properties = find_peaks(level, prominence=prominence)
     return place, properties["prominences"]
 

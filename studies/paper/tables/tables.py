@@ -149,9 +149,8 @@ def velocity_rows(
         found = np.array([[one[key] for one in of_seed] for of_seed in errors])
         name = f"{axis} {key}"
         rows.append(_row("Table 3" if i < 4 else "Table 4", name, cells[f"{axis}_{key}"], found))
-    for line, found in zip(
-        printed(number).to_numpy(), np.moveaxis(accelerations, 2, 0), strict=True
-    ):
+    levels = np.moveaxis(np.array(accelerations), 2, 0)
+    for line, found in zip(printed(number).to_numpy(), levels, strict=True):
         hertz = int(line[1])
         mode = MODE_ROWS[axis].get(hertz)
         rows.append(_row(f"Table {number}", f"{axis} {hertz} Hz", line[2:], found, mode))

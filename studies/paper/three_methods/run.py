@@ -23,6 +23,7 @@ import os
 import tempfile
 import zlib
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import combinations, product
 from pathlib import Path
 from typing import Any
@@ -51,7 +52,7 @@ SWEEPS = {
     "lms-x": Sweep(70.0, 330.0, amplitude=0.4, period=PERIOD),
 }
 # Bands in which modes are read together.
-BANDS = {
+BANDS: dict[str, dict[tuple[str, ...], tuple[float, float]]] = {
     "lms-y": {("roll", "pitch", "yaw"): (95.0, 175.0)},
     "lms-x": {("roll",): (74.0, 106.0), ("yaw",): (130.0, 190.0), ("pitch",): (225.0, 320.0)},
 }
@@ -148,7 +149,7 @@ def one_seed(name: str, seed: int) -> Row:
     with tempfile.TemporaryDirectory() as scratch:
         folder = Path(scratch)
         log = swept(name, seed, folder)
-        error = next(c.values for c in log.channels if c.name == "delta_e")
+        error = next(c.values[:] for c in log.channels if c.name == "delta_e")
         row: Row = {
             "stage": name,
             "seed": seed,
@@ -164,13 +165,18 @@ def one_seed(name: str, seed: int) -> Row:
     return row
 
 
+def estimate(row: Row, method: str, mode: str) -> Any:
+    """Return what a method has of a mode: f and its standard deviation, or why it has none."""
+    return row[method][mode]
+
+
 def scores(rows: list[Row], first: str, second: Callable[[Row], Any], mode: str) -> Row:
     """Test differences of two estimates of a mode over the seeds in which both have it."""
     pairs = [(row[first][mode], second(row)) for row in rows]
     both = [(a, b) for a, b in pairs if not isinstance(a, str) and not isinstance(b, str)]
     if not both:
         return {"n": 0}
-    (f, std), (other, other_std) = np.moveaxis(both, 0, -1)
+    (f, std), (other, other_std) = np.moveaxis(np.array(both), 0, -1)
     z = (f - other) / np.hypot(std, other_std)
     total, n, mean = float(np.sum(z**2)), len(both), float(z.mean() * np.sqrt(len(both)))
     return {
@@ -210,7 +216,7 @@ def compare(rows: list[Row], mode: str, truth: float) -> Row:
             methods[method]["against_truth"] = scores(rows, method, lambda row: (truth, 0.0), mode)
     seen = [m for m in METHODS if methods[m]["n_seen"] >= SEEN_BY_HALF * len(rows)]
     pairs = {
-        f"{a} - {b}": scores(rows, a, lambda row, b=b: row[b][mode], mode)
+        f"{a} - {b}": scores(rows, a, partial(estimate, method=b, mode=mode), mode)
         for a, b in combinations(seen, 2)
     }
     agreed = all(pair["n"] and min(pair["p"], pair["p_of_mean"]) > LEVEL for pair in pairs.values())

@@ -66,7 +66,7 @@ PROGRAMS = ("lmshealth.__main__",)
 LIMITS = tuple(NAMES)
 PARTS = LIMITS[:2]
 # Of a machine that the report does not name.
-SILENT = {"verdict": "not-enough-data", "probability": None, "shown": None, "health": {},
+SILENT: Row = {"verdict": "not-enough-data", "probability": None, "shown": None, "health": {},
           "left": {}, "events": {}, "refused": {}}  # fmt: skip
 OTHERS = "truth of another life"
 

@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import zlib
 from collections import Counter, defaultdict
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from datetime import timedelta
@@ -99,7 +99,7 @@ def mast(names: str, factor: float, seed: int, n_logs: int) -> Mast:
     hours = np.arange(n_logs) + rng.uniform(-0.2, 0.2, n_logs)
     warm = 7 * np.sin(2 * np.pi * (hours / (2.5 * N_LOGS) + rng.uniform()))
     warm += 3 * np.sin(2 * np.pi * hours / 24)
-    logs, truth = [], {}
+    logs, truth = [], dict[tuple[int, float], int]()
     for k in range(n_logs):
         found = np.flatnonzero(rng.random(4) >= MISSING)
         place = ln_f[found] + per_kelvin[found] * warm[k]
@@ -160,13 +160,16 @@ def one(names: str, factor: float, seed: int, n_logs: int) -> Row:
     }
 
 
+def _unscaled(logs: Sequence[object], *_: object) -> list[dict[str, float]]:
+    return [{}] * len(logs)
+
+
 def one_before(names: str, factor: float, seed: int, n_logs: int) -> Row:
     """Associate one life with the errors as they are stated."""
     life = mast(names, factor, seed, n_logs)
     with ExitStack() as stack:
         stack.enter_context(patch.object(constants, "TAKING_PROBABILITY", 1.0))
-        stated = patch.object(associate, "learn_scales", lambda logs, *_: [{}] * len(logs))
-        stack.enter_context(stated)
+        stack.enter_context(patch.object(associate, "learn_scales", _unscaled))
         history, refused = build_history(life.logs, described(life) if "desc" in names else None)
     ambiguous = sum(refusal.reason == "ambiguous" for refusal in refused)
     return {**judge(life, history, names)[0], "names": names, "factor": factor,
@@ -197,7 +200,7 @@ def summed(rows: list[Row]) -> Row:
     """Sum what was counted."""
     counts = ("real", "given", "right", "ambiguous", "slopes", "slopes_held")
     total = {key: sum(row.get(key, 0) for row in rows) for key in counts}
-    lives = {key: share_row(sum(bool(row[key]) for row in rows), len(rows))
+    lives: Row = {key: share_row(sum(bool(row[key]) for row in rows), len(rows))
              for key in ("kept", "alarms") if key in rows[0]}  # fmt: skip
     return {**total, **lives}
 

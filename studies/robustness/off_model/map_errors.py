@@ -83,7 +83,8 @@ def one(world: str, number_: int) -> Row:
     values = np.hstack([LN_F + drift - 5e-4 * (temperature - 21)[:, None],
                         np.tile(LN_ZETA, (N_LOGS, 1))])  # fmt: skip
     values += std * rng.standard_normal(std.shape)
-    estimates = *np.hsplit(values, 2), std[:, :, None] ** 2 * np.eye(std.shape[1])
+    ln_f, ln_zeta = np.hsplit(values, 2)
+    estimates = ln_f, ln_zeta, std[:, :, None] ** 2 * np.eye(std.shape[1])
     history = make_history(
         MODES, LENGTH_M * u, estimates, covariates={"temperature_c": temperature}
     )

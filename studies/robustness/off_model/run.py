@@ -93,7 +93,7 @@ def main() -> None:
     n = QUICK_LIVES if study.quick else LIVES
     rows = study.trials.collect(of_world, [(name, n, False) for name in names])
     before = study.trials.collect(of_world, [(name, n, True) for name in names])
-    answer = {"worlds": rows, "control": before}
+    answer: Row = {"worlds": rows, "control": before}
     answer["passed"] = verdicts(rows, before)
     study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
 

@@ -85,7 +85,7 @@ def draw(rng: np.random.Generator, sources: tuple[str, ...] = ("acc",)) -> Life:
     travel = np.cumsum(np.r_[1e5, HORIZON * rng.uniform(0.002, 0.05, n - 1)])
     missing = rng.random((n, r)) < 0.1
     missing[0] = False
-    seen = ~missing.all(axis=1)
+    seen = np.asarray(~missing.all(axis=1))
     level, damping = _walk(rng, chosen, _ticks(travel, seen))
     temperature, effect = _temperature(rng, n)
     mode = np.tile(np.arange(m), len(sources))

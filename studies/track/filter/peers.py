@@ -65,7 +65,8 @@ def filterpy_loop(
     std = np.sqrt(np.diag(history.cov[0]))[:m] * setting.wander[0] * setting.scales[0, 0]
     wander = np.outer(std, std) * (WANDER_COMMON + (1 - WANDER_COMMON) * eye)
     kalman.P[rate, rate], kalman.P[own, own] = setting.rate_std[0] ** 2 * alike, wander
-    decay, there = float(setting.rate_decay[0]), np.isfinite(history.ln_frequency).any(axis=1)
+    decay = float(setting.rate_decay[0])
+    there = np.asarray(np.isfinite(history.ln_frequency).any(axis=1))
     left = np.exp(-np.cumsum(ticks) * LOGS_PER_LIFE / SETTLING_LOGS)
     settling = setting.settling[0] ** 2 * -np.diff(left, prepend=1.0)
     states, covs = np.empty((n, size)), np.empty((n, size, size))
@@ -134,7 +135,7 @@ def long_life(n: int, m: int) -> History:
     ln_damping = -4 + STD[1] * rng.standard_normal((n, m))
     cov = np.tile(np.diag(np.repeat(STD, m) ** 2), (n, 1, 1))
     modes = [f"mode {i + 1}" for i in range(m)]
-    return make_history(modes, 1e3 * np.arange(n), (ln_frequency, ln_damping, cov))
+    return make_history(modes, 1e3 * np.arange(n, dtype=float), (ln_frequency, ln_damping, cov))
 
 
 def one_setting() -> Hyperparameters:

@@ -27,7 +27,9 @@ Row = dict[str, Any]
 
 SEED = 20261122
 # Shares of the kinds of kills, and their mean number in the time that a run takes.
-HOWS = {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15} if N_KILLS > 1 else {"main": 1}
+HOWS: dict[str, float] = (
+    {"main": 0.5, "worker": 0.2, "SIGINT": 0.15, "SIGTERM": 0.15} if N_KILLS > 1 else {"main": 1.0}
+)
 PER_RUN = 5.0 if N_KILLS > 1 else 10.0
 IMPORTED_S = 2.0  # before, while Python imports, it reports an interrupt in its own way
 MOST_OTHER = 20  # other ends of runs before the test is given up

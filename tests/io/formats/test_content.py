@@ -6,10 +6,7 @@ import gzip
 import io
 import json
 import re
-import struct
 import tarfile
-import wave
-import zipfile
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,31 +18,12 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import describe, frequency_column
 from lmshealth.io.reading import read_log
 from lmshealth.stage.proposal import propose
+from studies.inputs.outside_faults.no_logs import LINES, NO_LOGS, NODES, sound, zipped
+from studies.inputs.outside_faults.no_logs import SAMPLES as X
 from tests.io.handmade import uff_set
 
-X = np.random.default_rng(0).normal(size=2000)
 FREQUENCY = np.arange(X.size) / 2
 PSD = 1e-6 / ((FREQUENCY - 126) ** 2 + 4) + 1e-12 * X**2
-
-
-def sound() -> bytes:
-    """Write a WAV file."""
-    file = io.BytesIO()
-    with wave.open(file, "wb") as out:
-        out.setnchannels(1)
-        out.setsampwidth(2)
-        out.setframerate(8000)
-        out.writeframes((3000 * X).astype("<i2").tobytes())
-    return file.getvalue()
-
-
-def archive(*names: str) -> bytes:
-    """Write a zip archive of files."""
-    file = io.BytesIO()
-    with zipfile.ZipFile(file, "w") as out:
-        for name in names:
-            out.writestr(name, "x")
-    return file.getvalue()
 
 
 def tarred() -> bytes:
@@ -60,8 +38,6 @@ FACET = (
     "facet normal 0 0 1\n outer loop\n  vertex 0 0 0\n  vertex 1 0 0\n  vertex 0 1 0\n endloop\n"
     "endfacet\n"
 )
-NODES = b"    -1\n    15\n         1         0         0         8  1.00000e+00\n    -1\n"
-LINES = b"    -1\n    82\n         1         2         0\nline\n         1         2\n    -1\n"
 MESH = NODES.replace(b"    15", b"  2411") + LINES.replace(b"    82", b"  2412")
 
 
@@ -73,37 +49,28 @@ def function(kind: int) -> bytes:
 
 
 FILES = {
-    "sound.wav": (sound(), "a sound file (WAV)"),
-    "sound.csv": (sound(), "a sound file (WAV)"),
+    **NO_LOGS,
     "sound.tdms": (sound(), "a sound file (WAV)"),
-    "a.flac": (b"fLaC" + bytes(50), "a sound file (FLAC)"),
-    "a.mp3": (b"ID3\x04" + bytes(50), "a sound file (MP3)"),
     "b.mp3": (b"\xff\xfb\x90\x00" + bytes(50), "a sound file (MP3)"),
-    "a.png": (b"\x89PNG\r\n\x1a\n" + bytes(50), "a picture (PNG)"),
     "a.csv": (b"\xff\xd8\xff\xe0" + bytes(50), "a picture (JPEG)"),
     "a.pdf": (b"%PDF-1.7\n1 0 obj\n", "a printed document"),
-    "pdf.csv": (b"%PDF-1.7\n1 0 obj\n", "a printed document"),
-    "a.xlsx": (archive("[Content_Types].xml", "xl/workbook.xml"), "a workbook (.xlsx)"),
-    "xlsx.csv": (archive("[Content_Types].xml", "xl/workbook.xml"), "a workbook (.xlsx)"),
-    "a.ods": (archive("mimetype", "content.xml"), "a workbook or text of OpenDocument"),
-    "a.docx": (archive("[Content_Types].xml", "word/document.xml"), "an office file"),
+    "xlsx.csv": (zipped("[Content_Types].xml", "xl/workbook.xml"), "a workbook (.xlsx)"),
+    "a.ods": (zipped("mimetype", "content.xml"), "a workbook or text of OpenDocument"),
+    "a.docx": (zipped("[Content_Types].xml", "word/document.xml"), "an office file"),
     "a.xls": (b"\xd0\xcf\x11\xe0\xa1\xb1\x1a\xe1" + bytes(50), "an office file of the old kind"),
-    "a.zip": (archive("a.csv", "b.csv"), "a zip archive of 2 files"),
-    "cut.zip": (archive("a.csv")[:40], "a zip archive"),
+    "cut.zip": (zipped("a.csv")[:40], "a zip archive"),
     "a.tar": (tarred(), "an archive (tar)"),
     "a.tar.gz": (gzip.compress(tarred()), "an archive (tar)"),
     "sound.csv.gz": (gzip.compress(sound()), "a sound file (WAV)"),
-    "a.npz": (archive("x.npy"), "arrays of NumPy"),
+    "a.npz": (zipped("x.npy"), "arrays of NumPy"),
     "a.json": (json.dumps({"rate": 2000, "x": X.tolist()}).encode(), "JSON"),
     "list.csv": (json.dumps(X.tolist()).encode(), "JSON"),
     "lines.txt": (json.dumps([{"t": 0, "x": 1}], indent=1).encode(), "JSON"),
     "a.html": (b"<!DOCTYPE html><html></html>", "a page of the web"),
     "xml.csv": (b'<?xml version="1.0"?>\n<m><x>1</x></m>', "an XML file"),
     "a.stl": (b"solid cube\n" + 12 * FACET.encode() + b"endsolid", "a geometry (STL)"),
-    "b.stl": (bytes(80) + struct.pack("<I", 12) + bytes(600), "a geometry (STL)"),
     "stl.csv": (b"solid cube\n" + 12 * FACET.encode() + b"endsolid", "a geometry (STL)"),
     "a.obj": (b"# mesh\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n", "a geometry (OBJ)"),
-    "a.uff": (NODES + LINES, "15 (nodes), 82 (lines of a geometry)"),
     "a.unv": (MESH, "2411 (nodes), 2412 (elements)"),
     "uff.txt": (NODES + LINES, "a universal file (UFF); rename it to .uff"),
     "psd.uff": (function(9), "function type 9 (power spectral density)"),

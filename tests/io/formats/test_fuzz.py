@@ -1,9 +1,7 @@
 """Whatever a file holds: a log that keeps its contract, or an error of lmshealth."""
 
-import importlib.util
 import os
 import signal
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,15 +11,10 @@ from hypothesis import strategies as st
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io.reading import read_log
+from tests.io import conftest as writers
 
 # Windows has no such measure of memory, and no alarm.
 resource = pytest.importorskip("resource")
-
-_SPEC = importlib.util.spec_from_file_location(
-    "_writers", Path(__file__).parents[1] / "conftest.py"
-)
-_WRITERS = importlib.util.module_from_spec(_SPEC)
-_SPEC.loader.exec_module(_WRITERS)
 
 MUTATION = st.tuples(
     st.sampled_from(["flip", "cut", "insert", "zero"]),
@@ -75,15 +68,15 @@ FILES = ["log.csv", "log.csv.gz", "log.parquet", "log.h5", "log.tdms", "log.mat"
 def valid(request, tmp_path_factory):
     """Write a small valid log."""
     path = tmp_path_factory.mktemp("fuzz") / request.param
-    signals = _WRITERS.signals(64)
+    signals = writers.signals(64)
     if path.suffix == ".uff":
         records = {"feed": signals["acc_feed_m_s2"], "pitch": signals["delta_e_um"]}
-        _WRITERS.write_uff(path, records, binary=int(path.stem == "binary"))
+        writers.write_uff(path, records, binary=int(path.stem == "binary"))
     elif path.stem == "plain":
         nested = {"log": {"again": signals, "list": np.array([1.0, "text"], dtype=object)}}
-        scipy.io.savemat(path, {**signals, **_WRITERS.META, **nested})
+        scipy.io.savemat(path, {**signals, **writers.META, **nested})
     else:
-        _WRITERS.write(path, signals, _WRITERS.META)
+        writers.write(path, signals, writers.META)
     # Beside it, not in the fixture: an error of the test prints its arguments.
     (path.parent / "intact").write_bytes(path.read_bytes())
     assert read_log(path).channels

@@ -96,7 +96,8 @@ def folder(tmp_path: Path, example: tuple[str, str]) -> Path:
     (tmp_path / "layouts").mkdir()
     (tmp_path / "layouts" / "acme.toml").write_text(layout, encoding="utf-8")
     w = 2 * np.pi * FREQUENCY
-    mode = scipy.signal.cont2discrete(([1.0, 0, 0], [1, 2 * DAMPING * w, w**2]), 1 / RATE)
+    equation = np.array([1.0, 0.0, 0.0]), np.array([1.0, 2 * DAMPING * w, w**2])
+    mode = scipy.signal.cont2discrete(equation, 1 / RATE)
     noise = np.random.default_rng(3).normal(0, 1, (2, 10 * RATE))
     x = scipy.signal.lfilter(mode[0][0], mode[1], noise[0]) + 0.1 * noise[1]
     rows = [f"{k};{a:.5f};{b:.5f}".replace(".", ",") for k, (a, b) in

@@ -8,6 +8,7 @@ from dataclasses import replace
 from importlib.metadata import EntryPoint, EntryPoints
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from lmshealth.io.buffers import as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats import registry
 from lmshealth.io.formats.content import Content, Format, wanted
+from lmshealth.io.formats.instruments import RTX, TRACE
+from lmshealth.io.formats.uff import UFF
 from lmshealth.io.manifest import find_logs
 from lmshealth.io.reading import read_log
 from lmshealth.testing import check_format
@@ -43,9 +46,15 @@ class Point(EntryPoint):
 
     def load(self):
         """Return what stands for the object of the module."""
-        if isinstance(OBJECTS[self.name], Exception):
-            raise OBJECTS[self.name]
-        return OBJECTS[self.name]
+        found = OBJECTS[self.name]
+        if isinstance(found, Exception):
+            raise found
+        return found
+
+
+def _no_content(path: Path, columns: ColumnMap, max_memory: float) -> Any:
+    """Break the protocol of formats."""
+    return {"acc": 1}
 
 
 OBJECTS: dict[str, object] = {
@@ -54,7 +63,7 @@ OBJECTS: dict[str, object] = {
     "number": 7,
     "taken": replace(RAW, suffixes=(".my.csv",)),
     "again": RAW,
-    "liar": replace(RAW, suffixes=(".liar",), load=lambda path, columns, most: {"acc": 1}),
+    "liar": replace(RAW, suffixes=(".liar",), load=_no_content),
     "texts": replace(
         RAW,
         suffixes=(".texts",),
@@ -85,7 +94,7 @@ def test_a_plug_in_is_a_format(tmp_path, plugged, caplog):
     with caplog.at_level(logging.ERROR):
         logs = [read_log(path) for path in find_logs(tmp_path).logs]
     assert [log.sample_rate for log in logs] == [1000, 2000]
-    np.testing.assert_allclose(logs[0].channels[0].values, 9.80665 * X)
+    np.testing.assert_allclose(logs[0].channels[0].values[:], 9.80665 * X)
     said = [record.getMessage() for record in caplog.records]
     broken = {"missing": "No module", "number": "is a int", "taken": ".my.csv", "again": "taken"}
     assert len(said) == len(broken)
@@ -114,17 +123,19 @@ def test_formats_with_metadata_conform(tmp_path, file):
     columns = {name: values for name, values in signals().items() if name != "time_s"}
     path = write(tmp_path / file, columns, META)
     known = {} if file.endswith(("tdms", "mat")) else META
-    check_format(registry.format_of(path), path, columns, metadata=known)
+    found = registry.format_of(path)
+    assert found is not None
+    check_format(found, path, columns, metadata=known)
 
 
 def test_formats_with_a_map_conform(tmp_path):
     """So do UFF58, the laser and the trace."""
-    check_format(registry.RTX, _bytes(tmp_path / "a.rtx", rtx(X)), {"data": X},
+    check_format(RTX, _bytes(tmp_path / "a.rtx", rtx(X)), {"data": X},
                  columns=ColumnMap(columns={"delta_e_mm": "data"}))  # fmt: skip
-    check_format(registry.TRACE, _bytes(tmp_path / "a.xml", trace(X).encode()), TRACED,
+    check_format(TRACE, _bytes(tmp_path / "a.xml", trace(X).encode()), TRACED,
                  columns=ColumnMap(columns={"delta_e_mm": "lag error"}))  # fmt: skip
     path = write_uff(tmp_path / "a.uff", {"sensor": X}, ordinate_spec_data_type=12, binary=1)
-    check_format(registry.UFF, path, {"acc_sensor_g": X})
+    check_format(UFF, path, {"acc_sensor_g": X})
     check_format(RAW, _bytes(tmp_path / "a.raw", b"RAW1" + X.tobytes()), {"acc_raw_g": X})
 
 
@@ -162,7 +173,7 @@ def _of_nothing(path, columns, max_memory):
     return load_raw(path, columns, max_memory)
 
 
-WRONG = {
+WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "suffix": ({"suffixes": (".RAW", ".raw")}, "lower case"),
     "name": ({"name": ""}, "printable"),
     "sniff": ({"sniff": lambda head: True}, "return False"),
@@ -202,7 +213,7 @@ def test_the_example_of_the_page_conforms(tmp_path, root):
     """The plug-in of the README passes its own test, and fails it with another byte order."""
     page = (root / "lmshealth" / "io" / "README.md").read_text(encoding="utf-8")
     reader, test = re.findall(r"^```python\n(.*?)^```$", page, re.S | re.M)
-    names = {}
+    names: dict[str, Any] = {}
     exec(reader + test, names)
     names["test_format"](tmp_path)
     exec(reader.replace("<f4", ">f4") + test, names)

@@ -2,6 +2,7 @@
 
 import gzip
 import os
+from typing import Any
 
 import h5py
 import numpy as np
@@ -48,7 +49,7 @@ def write(path, n_periods, **options):
         path.write_bytes(parts[0] + parts[1] * n_periods)
 
 
-CASES = {
+CASES: dict[str, dict[str, Any]] = {
     "contiguous.h5": {},
     "chunks.h5": {"chunks": (4096,), "compression": "lzf"},
     "one_group.parquet": {"row_group_size": 10 * MINUTE},

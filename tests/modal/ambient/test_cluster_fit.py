@@ -167,10 +167,10 @@ def test_a_line_is_kept_out_and_listed_with_its_amplitude() -> None:
     line = sine(60_000, RATE, 110.0, 3.0)
     dirty = found(both() + [[0.0], [1.0]] * line)
     assert clean.lines == ()
-    (line,) = dirty.lines
-    assert line.channel == "acc_1"
-    assert line.frequency == pytest.approx(110.0, abs=0.02)
-    assert line.amplitude == pytest.approx(3.0, rel=0.3)
+    (listed,) = dirty.lines
+    assert listed.channel == "acc_1"
+    assert listed.frequency == pytest.approx(110.0, abs=0.02)
+    assert listed.amplitude == pytest.approx(3.0, rel=0.3)
     assert (
         np.abs(
             (dirty.modes.estimate - clean.modes.estimate) / np.sqrt(np.diag(clean.modes.cov))
@@ -440,9 +440,9 @@ def spectrum(
 
 def band_of(*spectra: CrossSpectrum) -> ClusterData:
     """Prepare the band of roll."""
-    spectra = LogSpectra(("acc_a", "acc_b", "acc_c"), ("acc",) * 3, spectra)
-    binned = bin_spectra(spectra, LOW, HIGH, 0.8)
-    return prepare(spectra, binned, (ROLL,), (LOW, HIGH))
+    log = LogSpectra(("acc_a", "acc_b", "acc_c"), ("acc",) * 3, spectra)
+    binned = bin_spectra(log, LOW, HIGH, 0.8)
+    return prepare(log, binned, (ROLL,), (LOW, HIGH))
 
 
 def test_channels_that_see_the_mode_are_kept_in_units_of_their_noise() -> None:

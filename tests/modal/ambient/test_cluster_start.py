@@ -32,7 +32,7 @@ from tests.signals import (
 RATE = 1000.0
 
 
-def spectra(values: np.ndarray) -> tuple:  # type: ignore[type-arg]
+def spectra(values: np.ndarray) -> tuple:
     """Transform a channel."""
     (channel,) = make_log({"acc_a": values}, RATE).channels
     return (periodogram(channel, RATE),)

@@ -76,7 +76,7 @@ def test_without_transforms_a_force_counts_as_steady() -> None:
         replace(s, transforms=None)
         for s in cross_spectra(log.channels, [Segment(0, 24_000, 0.0)], RATE, 150.0)
     ]
-    expected = [np.tile(np.eye(2), (s.frequency.size, 1, 1)) + 0j for s in spectra]
+    expected = [np.tile(np.eye(2, dtype=complex), (s.frequency.size, 1, 1)) for s in spectra]
     found = unsteadiness(spectra, [s.free for s in spectra], expected, 100.0, 0.02, np.ones(2))
     assert found == (1.0, 0)
 
@@ -110,7 +110,7 @@ def test_excitation_is_the_level_of_the_mode() -> None:
     """Root mean square of the noise-free acceleration; four times the force, four times as much."""
     weak, strong = (identify(forced(4, np.full(24_000, i), 1e-3), STAGE) for i in (1.0, 16.0))
     quiet = forced(4, np.ones(24_000), 0.0)
-    rms = np.sqrt(sum(np.mean(c.values**2) for c in quiet.channels))
+    rms = np.sqrt(sum(float(np.mean(c.values[:] ** 2)) for c in quiet.channels))
     # Beyond the resonance a white force moves the channels, too.
     assert 0.9 * rms < weak.excitation[0] < 1.02 * rms
     assert abs(strong.excitation[0] / weak.excitation[0] - 4) < 0.1

@@ -85,7 +85,7 @@ def test_averaging_neighbours_moves_nothing_by_a_thirtieth_of_its_uncertainty(
     size = np.diff(np.append(starts, block.frequency.size))
     wide = MeanOrdinates(
         np.add.reduceat(block.frequency, starts) / size,
-        np.add.reduceat(block.matrix, starts, axis=0) / size[:, None, None],
+        np.asarray(np.add.reduceat(block.matrix, starts, axis=0) / size[:, None, None], complex),
         n_segments * size.astype(float),
         None,
     )

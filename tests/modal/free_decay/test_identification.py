@@ -60,7 +60,7 @@ def test_without_a_description_all_that_rings_is_numbered() -> None:
 def test_the_unit_of_the_signal_does_not_matter() -> None:
     """A signal a million times smaller gives the same estimates and covariance."""
     log = log_of(3)
-    small = make_log({"acc_0": 1e-6 * log.channels[0].values}, RATE, pieces=log.pieces)
+    small = make_log({"acc_0": 1e-6 * log.channels[0].values[:]}, RATE, pieces=log.pieces)
     one, two = (of_pieces(item, make_stage(MODES)) for item in (log, small))
     np.testing.assert_allclose(two.ln_frequency, one.ln_frequency, rtol=1e-7)
     np.testing.assert_allclose(two.cov, one.cov, rtol=1e-3, atol=1e-12)

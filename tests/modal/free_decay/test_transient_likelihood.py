@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from lmshealth._private.arrays import stack
 from lmshealth.modal.free_decay.transient_likelihood import (
     DecaySpectra,
     TransientLikelihood,
     pole_columns,
-    stack,
     transform_decays,
     transient,
     unit_level,
@@ -112,7 +112,7 @@ def test_derivatives_of_a_transient_are_differences_of_it() -> None:
 
 def test_a_linear_trend_lies_in_the_base() -> None:
     """What drifts and what is constant is taken out exactly."""
-    x = (3.0 + 0.01 * np.arange(300))[None, :, None]
+    x = (3.0 + 0.01 * np.arange(300.0))[None, :, None]
     block = transform_decays(x, RATE, 5, 40)
     y = block.ordinates[0, :, 0]
     assert np.abs(y - block.base @ (block.base.conj().T @ y)).max() < 1e-4 * np.abs(y).max()
@@ -141,7 +141,11 @@ def test_what_a_record_cuts_off_an_ambient_response_lies_along_its_transients() 
         + 2 * np.cos(2 * np.pi * np.outer(k / n, np.arange(1, 16000))) @ covariance[1:]
     )
     block = DecaySpectra(
-        k * RATE / n, np.empty((1, k.size, 1)), n / RATE, RATE, np.empty((k.size, 0))
+        k * RATE / n,
+        np.empty((1, k.size, 1), complex),
+        n / RATE,
+        RATE,
+        np.empty((k.size, 0), complex),
     )
     pole = np.exp(omega / RATE * (-zeta + 1j * root))
     back = np.exp(-2j * np.pi * k / n)

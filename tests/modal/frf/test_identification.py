@@ -103,7 +103,7 @@ def test_without_noise_the_modes_are_exact() -> None:
 def test_units_do_not_matter_to_modes() -> None:
     """Volts for amperes, angles for lengths: the same modes with the same uncertainty."""
     log = driven()
-    scaled = make_log({c.name: c.values * 1e4 for c in log.channels}, RATE)
+    scaled = make_log({c.name: c.values[:] * 1e4 for c in log.channels}, RATE)
     scaled = replace(scaled, channels=(log.channels[0], scaled.channels[1]))
     one, other = (read_frf(item, "current", "acc_x", band=BAND).modes for item in (log, scaled))
     np.testing.assert_allclose(other.ln_frequency, one.ln_frequency, rtol=1e-6)

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth._private.arrays import stack
 from lmshealth.modal.frf.rational import (
     ModelOrder,
     Ordinates,
@@ -14,7 +15,6 @@ from lmshealth.modal.frf.rational import (
     refine,
     slopes,
     solve,
-    stack,
     vector_fit,
 )
 

@@ -132,9 +132,9 @@ def test_two_periods_are_enough_and_less_are_not() -> None:
     """Two of 1600 samples, though one was taken to be a little longer; not of 1600.3 in 3201."""
     given, answer = periodic(np.random.default_rng(10), Machine(), SIZE, 2)
     assert from_periods(pair(given, answer), BAND, SIZE + 1e-3)[0].n_averages == 2
-    more = [np.append(x, x[:1]) for x in (given, answer)]
+    more, longer = (np.append(x, x[:1]) for x in (given, answer))
     with pytest.raises(BadLog, match="less than two whole periods"):
-        from_periods(pair(*more), BAND, SIZE + 0.3)
+        from_periods(pair(more, longer), BAND, SIZE + 0.3)
 
 
 def test_too_few_lines_and_too_many_are_refused() -> None:
@@ -170,9 +170,9 @@ def test_a_record_has_the_coherence_of_its_noise() -> None:
 def test_the_difference_is_undone() -> None:
     """Signals that were differenced give the amplitudes of those that were not."""
     given, answer = periodic(np.random.default_rng(7), QUIET, SIZE, 5)
-    differenced = [np.roll(x, 1) - 2 * x + np.roll(x, -1) for x in (given, answer)]
+    changes, moved = (np.roll(x, 1) - 2 * x + np.roll(x, -1) for x in (given, answer))
     _, plain = from_periods(pair(given, answer), BAND, SIZE)
-    _, undone = from_periods(pair(*differenced, lag=1), BAND, SIZE)
+    _, undone = from_periods(pair(changes, moved, lag=1), BAND, SIZE)
     np.testing.assert_allclose(np.abs(undone.answer), np.abs(plain.answer), rtol=1e-6)
 
 

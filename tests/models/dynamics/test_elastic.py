@@ -65,6 +65,7 @@ def number(value, unit="1"):
 def without_parts(stage):
     """Return the rigid stage of a name with what makes it flexible but no elastic part."""
     full = FULL_STAGES[f"{stage}-full"].flexible
+    assert full is not None
     return replace(STAGES[stage], flexible=replace(full, parts=(), bench_offset=number(0.0, "m")))
 
 
@@ -112,9 +113,9 @@ def test_overhang_is_a_chain_of_masses(bends, parity):
     expected = np.zeros(6)
     for at in (np.arange(400) + 0.5) / 400:
         for side in (1, -1):
-            place = (root[0], root[1] + side * at * reach, root[2])
+            point = (root[0], root[1] + side * at * reach, root[2])
             moved = np.eye(3)[bends] * clamped_bending(at) * (parity if side < 0 else 1)
-            expected += np.sqrt(mass) / 800 * (point_motion(place, centre).T @ moved)
+            expected += np.sqrt(mass) / 800 * (point_motion(point, tuple(centre)).T @ moved)
     np.testing.assert_allclose(mode.momentum, expected, atol=1e-4)
     heavier = overhang_mode(part, centre, 1.2)
     assert heavier.omega == pytest.approx(mode.omega / np.sqrt(1.2))
@@ -157,6 +158,7 @@ def test_without_elastic_parts_a_full_stage_is_the_rigid_one(name):
 def test_stiff_parts_are_rigid(name):
     """With parts 1e5 times stiffer modes below 300 Hz are those without; control: as they are."""
     stage = stage_named(name)
+    assert stage.flexible is not None
     bare = replace(stage, flexible=replace(stage.flexible, parts=()))
     rigid = named_modes(build_structure(bare))
     stiff, soft = (named_modes(build_structure(stiffened(stage, f))) for f in (1e5, 1.0))

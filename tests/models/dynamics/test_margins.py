@@ -52,6 +52,13 @@ def of_kind(found, kind):
     return [c for c in found.crossovers if c.kind == kind]
 
 
+def deciding(found, kind):
+    """Return the crossover of a kind that decides, which is there."""
+    crossover = found.deciding(kind)
+    assert crossover is not None
+    return crossover
+
+
 @pytest.mark.parametrize(
     ("name", "crossover", "phase", "gain", "low"),
     [("lms-x", 19.6, 55.8, 24.5, 0.88), ("lms-y", 6.5, 37.0, 31.4, 0.97)],
@@ -80,7 +87,7 @@ def test_erratum_rigid_margins(name, crossover, phase, gain, low):
 def test_flexible_modes_do_not_explain_table_1(name):
     """The flexible structure moves bandwidth by less than 10 % and the phase margin by 2°."""
     rigid, flexible = (margins(loop(name, "corrected")) for loop in (rigid_loop, flexible_loop))
-    stiff, soft = (m.deciding(GAIN_CROSSOVER) for m in (rigid, flexible))
+    stiff, soft = (deciding(m, GAIN_CROSSOVER) for m in (rigid, flexible))
     assert soft.frequency_hz == pytest.approx(stiff.frequency_hz, rel=0.1)
     assert soft.margin == pytest.approx(stiff.margin, abs=2.0)
     assert flexible.verdict == "meets"
@@ -137,7 +144,7 @@ def test_a_sharp_resonance_is_not_missed(monkeypatch):
 def test_gain_margin_is_where_stability_ends(name, make, kind):
     """With 1 % less than the smallest gain margin the loop is stable, with 1 % more it is not."""
     loop = make(name, "corrected")
-    margin = margins(loop).deciding(kind).margin
+    margin = deciding(margins(loop), kind).margin
     for part, stable in ((0.99, True), (1.01, False)):
         assert margins(10 ** (part * margin / 20) * loop).stable is stable
 
@@ -147,7 +154,7 @@ def test_gain_margin_is_where_stability_ends(name, make, kind):
 def test_phase_margin_is_where_stability_ends(name):
     """A delay of 1 % less than the phase margin is borne, of 1 % more is not."""
     loop = rigid_loop(name, "corrected")
-    crossover = margins(loop).deciding(GAIN_CROSSOVER)
+    crossover = deciding(margins(loop), GAIN_CROSSOVER)
     delay = crossover.margin / 360 / crossover.frequency_hz
     for part, stable in ((0.99, True), (1.01, False)):
         lag = control.ss(control.tf(*control.pade(part * delay, 6)))
@@ -352,7 +359,7 @@ def test_margins_of_the_full_stages_are_those_measured(name):
         with patch.dict(SERVOS, commissioning=tunings):
             found = margins(drive_loop(name, "flexible"))
         first = of_kind(found, GAIN_CROSSOVER)[0]
-        limits = first.frequency_hz, found.deciding(UPPER_CROSSOVER).margin, first.margin
+        limits = first.frequency_hz, deciding(found, UPPER_CROSSOVER).margin, first.margin
         return np.abs(np.array(limits) / TABLE_1[name] - 1)
 
     assert off().max() < 0.1

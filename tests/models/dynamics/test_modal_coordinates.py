@@ -66,7 +66,7 @@ def run(system, inputs, rate=RATE, start=None):
     diagonal = diagonalise(system)
     start = np.zeros(system.a.shape[0]) if start is None else start
     modal = np.linalg.solve(diagonal.states, start.astype(complex))
-    return propagate(diagonal, modal, inputs, rate)[0]
+    return propagate(diagonal, modal.astype(complex), inputs, rate)[0]
 
 
 def block_rows(stage):

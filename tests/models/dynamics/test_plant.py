@@ -1,6 +1,7 @@
 """Tests of the closed loop and its named modes."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -140,7 +141,7 @@ def test_retuned_loop_keeps_its_margins(name, rigid):
     s = 2j * np.pi * hertz
     gain = controller(tuning)(s, squeeze=True) * current_loop(tuning)(s, squeeze=True)
     if rigid:
-        plant = 1 / (stage.moving_mass.value * s**2)
+        plant: np.ndarray = 1 / (stage.moving_mass.value * s**2)
     else:
         structure = build_structure(stage)
         point, encoder = stage.motor_point.value, sensor_rows(stage, structure)["delta_e"]
@@ -196,7 +197,8 @@ def test_payload_lowers_every_mode_of_the_platform():
 def test_stiffness_that_the_loop_cannot_hold_is_refused(name, field, factor):
     """Guide or mount so soft that the loop grows are named unstable, with the pole."""
     soft = Number(factor * getattr(STAGES[name], field).value, "N/m", "our choice")
-    stage = replace(STAGES[name], **{field: soft})
+    changed: dict[str, Any] = {field: soft}
+    stage = replace(STAGES[name], **changed)
     with pytest.raises(UnstableLoop, match=f"{name}.*unstable") as caught:
         closed_loop(stage)
     assert caught.value.growth_per_s > 0

@@ -1,6 +1,7 @@
 """Tests of the stages' numbers."""
 
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -21,8 +22,9 @@ from models.errors import BadParameter, UnknownServo, UnknownStage
 
 def test_every_number_has_unit_and_source():
     """No number of a stage or of an elastic part is without unit or source."""
-    owners = [*STAGES.values(), *FULL_STAGES.values()]
+    owners: list[Any] = [*STAGES.values(), *FULL_STAGES.values()]
     for stage in FULL_STAGES.values():
+        assert stage.flexible is not None
         owners += [stage.flexible, *stage.flexible.parts]
     plain = {"name", "identity_suffix", "flexible", "parts"}
     plain |= {"body", "along", "bends", "parity", "moves", "encoder"}
@@ -66,6 +68,7 @@ def test_unknown_source_is_refused():
 def test_impossible_elastic_part_is_refused(bad):
     """An elastic part whose stiffness is not positive raises."""
     flexible = FULL_STAGES["lms-x-full"].flexible
+    assert flexible is not None
     part = replace(flexible.parts[0], stiffness=Number(bad, "N m²", "our choice"))
     with pytest.raises(BadParameter, match=r"stiffness is .* a positive number"):
         replace(flexible, parts=(part,))
@@ -85,7 +88,8 @@ def test_impossible_mass_or_stiffness_is_refused(field, bad):
     with pytest.raises(
         BadParameter, match=f"{field} is .* needed: (a positive number|finite numbers)"
     ):
-        replace(STAGES["lms-y"], **{field: Number(bad, unit, "our choice")})
+        changed: dict[str, Any] = {field: Number(bad, unit, "our choice")}
+        replace(STAGES["lms-y"], **changed)
 
 
 @pytest.mark.parametrize("bad", [0.0, -1.0, float("nan"), 1e3])
@@ -134,9 +138,9 @@ def test_payload_adds_its_mass_matrix(name, added):
         build_structure(stage, Condition(added_payload=a)).bodies[PLATFORM] for a in (0.0, added)
     )
     x, y, z = stage.payload_box.value
-    radii = tuple(float(np.hypot(*edges) / 12**0.5) for edges in ((y, z), (x, z), (x, y)))
+    a, b, c = (float(np.hypot(*edges) / 12**0.5) for edges in ((y, z), (x, z), (x, y)))
     centre = (*bare.centre[:2], stage.payload_height.value)
-    block = replace(bare, mass=1.0, centre=centre, radii=radii)
+    block = replace(bare, mass=1.0, centre=centre, radii=(a, b, c))
     expected = about_origin(bare) + added * about_origin(block)
     np.testing.assert_allclose(about_origin(loaded), expected, rtol=1e-12, atol=1e-12)
 

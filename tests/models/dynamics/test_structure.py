@@ -1,6 +1,7 @@
 """Tests of rigid bodies and springs."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -161,7 +162,7 @@ def test_spreads_always_make_a_possible_body():
     """Any three spreads give radii of gyration that a distribution of mass can have."""
     rng = np.random.default_rng(0)
     for spreads in np.exp(rng.normal(-2, 2, (200, 3))):
-        numbers = dict(
+        numbers: dict[str, Any] = dict(
             zip(
                 ("load_spread_feed", "load_spread_lateral", "load_spread_vertical"),
                 (Number(float(s), "m", "our choice") for s in spreads),

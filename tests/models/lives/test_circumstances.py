@@ -1,6 +1,7 @@
 """Tests of what acts on logs besides wear."""
 
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import numpy as np
 import pytest
@@ -87,7 +88,8 @@ def test_structure_lags_by_first_order(lag_h):
             apart.append(structure - climate.behind(later, lag_h))
     # The season of `Climate` goes in whole days.
     assert np.abs(apart).max() < 0.12
-    assert HALL.behind(start, 1e-9) == pytest.approx(HALL.at(start, _NoNoise()), abs=1e-6)
+    noiseless: Any = _NoNoise()
+    assert HALL.behind(start, 1e-9) == pytest.approx(HALL.at(start, noiseless), abs=1e-6)
 
 
 class _NoNoise:

@@ -203,7 +203,7 @@ def test_grease_ages_and_is_renewed():
     """The guide's loss falls from 1, steps up when regreased, and falls again."""
     grease = Grease(800.0, 1.4, 0.8, 700.0)
     before, after = (
-        [grease.at(s) for s in np.linspace(*ends, 9)] for ends in ((0, 799), (800, 3e3))
+        [grease.at(s) for s in np.linspace(low, high, 9)] for low, high in ((0, 799), (800, 3e3))
     )
     assert before[0] == 1.0
     assert after[0] == pytest.approx(1.4)

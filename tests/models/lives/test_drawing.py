@@ -52,12 +52,12 @@ def test_a_seed_makes_one_machine(name):
         assert drawn[0].value != drawn[1].value
     assert first.numbers.keys() == other.numbers.keys()
     assert (first.stage.flexible is None) == ("full" not in name)
-    if first.stage.flexible is not None:
-        stiffness = [
-            [part.stiffness.value for part in stage.flexible.parts]
-            for stage in (first.stage, stage_named(name))
-        ]
-        assert not np.any(np.isclose(*stiffness, rtol=1e-6))
+    drawn_parts, parts = first.stage.flexible, stage_named(name).flexible
+    if drawn_parts is not None and parts is not None:
+        stiffness, known = (
+            [part.stiffness.value for part in flexible.parts] for flexible in (drawn_parts, parts)
+        )
+        assert not np.any(np.isclose(stiffness, known, rtol=1e-6))
 
 
 def test_numbers_follow_their_distributions():

@@ -22,7 +22,7 @@ from models.lives.further_lives import (
     life_named,
 )
 from models.lives.simulation import Plan, _positions, _text_of, schedule, simulate_life
-from models.lives.wear_families import PowerLoss, Product, Settling, Shocks
+from models.lives.wear_families import Cycles, PowerLoss, Product, Settling, Shocks
 
 # What of the condition each life changes, at the end of 8,000 km at the latest.
 CHANGES = {
@@ -123,8 +123,9 @@ def test_greasings_are_declared_or_not(tmp_path):
         simulate_life(plan, tmp_path / plan.life)
         work.append(pd.read_csv(tmp_path / plan.life / "maintenance.csv"))
     lives = [plan.draw_life() for plan in plans]
-    assert lives[0].grease == lives[1].grease
-    every, last = lives[0].grease.every_km, schedule(plans[0])[-1].travel_km
+    grease = lives[0].grease
+    assert isinstance(grease, Cycles) and grease == lives[1].grease
+    every, last = grease.every_km, schedule(plans[0])[-1].travel_km
     assert set(work[0]["action"]) == {"regrease"} and len(work[0]) == last // every
     assert work[1].empty
 
@@ -237,6 +238,7 @@ def test_truth_of_a_drawn_machine(tmp_path):
     for name in ("preload", "mount", "grease", "contact", "level"):
         assert re.fullmatch(r"[a-z][^'\"\[\]]*", truth[f"{name}_law"][0]), name
     cycles = own.grease
+    assert isinstance(cycles, Cycles)
     assert truth["grease_law"][0] == (
         f"cycles(every_km={cycles.every_km:.6g}, aged={cycles.aged:.6g}, "
         f"scale_km={cycles.scale_km:.6g})"

@@ -233,6 +233,7 @@ def test_a_life_followed_to_its_failure_passes_it(name):
     now, whole = (Plan("lms-y", name, 40, 1.0, 8, until=until) for until in ("now", "failure"))
     assert whole.draw_life() == now.draw_life()
     failure = whole.draw_life().failure_km()
+    assert failure is not None
     passed = [
         v.condition.guide_preload <= 0.6 or v.condition.mount_stiffness <= 0.7
         for v in schedule(whole)
@@ -247,7 +248,8 @@ def test_a_life_until_its_failure_needs_two_logs():
     with pytest.raises(BadParameter, match="logs is 1; needed: at least 2"):
         Plan("lms-y", "both", 1, 1.0, 0, until="failure")
     plan = Plan("lms-y", "both", 2, 1.0, 0, until="failure")
-    assert schedule(plan)[-1].travel_km > plan.draw_life().failure_km()
+    failure = plan.draw_life().failure_km()
+    assert failure is not None and schedule(plan)[-1].travel_km > failure
 
 
 @pytest.mark.parametrize("changed", [{"logs": 1}, {"file_format": "csv"}])

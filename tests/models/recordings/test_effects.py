@@ -33,7 +33,9 @@ GROUND = [NOISE_INPUTS.index(f"ground_{axis}") for axis in "xyz"]
 def changed(effects, position, seed=0):
     """Return what effects make of noise of ones (noise input, time)."""
     white = np.ones((len(NOISE_INPUTS), position.size))
-    changes(STAGE, effects, position, np.random.default_rng(seed), 20000.0)(0, white)
+    change = changes(STAGE, effects, position, np.random.default_rng(seed), 20000.0)
+    assert change is not None
+    change(0, white)
     return white
 
 
@@ -77,6 +79,7 @@ def test_hits_come_at_random_and_chunks_join():
     position, parts = np.zeros(400000), np.ones((len(NOISE_INPUTS), 400000))
     whole = changed(blows, position, seed=3)
     change = changes(STAGE, blows, position, np.random.default_rng(3), 20000.0)
+    assert change is not None
     for start in range(0, 400000, 70000):
         change(start, parts[:, start : start + 70000])
     np.testing.assert_array_equal(whole, parts)
@@ -145,9 +148,8 @@ def test_refuses_what_no_stage_has(wrong):
 @pytest.mark.slow
 def test_effects_leave_the_rest_of_a_seed_alone():
     """The noise of a seed is the same with effects: gusts and hits have a stream of their own."""
-    seconds = {"seconds": 0.5, "rng": None}
     logs = [
-        record(STAGE, **{**seconds, "rng": np.random.default_rng(5)}, effects=effects)
+        record(STAGE, seconds=0.5, rng=np.random.default_rng(5), effects=effects)
         for effects in (LINEAR, Effects(floor=Floor(wander=0.0, gusts_per_s=0.0)), FULL)
     ]
     assert all(tuple(log.columns) == COLUMNS for log in logs)

@@ -1,5 +1,7 @@
 """Tests of the reference profiles."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -82,7 +84,10 @@ def test_impossible_profiles_are_refused(field, value):
 
 def test_moves_end_within_a_day():
     """Dwells and crawls of more than a day are refused, just less is driven."""
-    for wanted in ({"dwell": 86400.0}, {"velocity": 3e-6}, {"dwell": 900.0, "strokes": 100}):
+    cases: tuple[dict[str, Any], ...] = (
+        {"dwell": 86400.0}, {"velocity": 3e-6}, {"dwell": 900.0, "strokes": 100},
+    )  # fmt: skip
+    for wanted in cases:
         with pytest.raises(BadParameter, match=r"duration of all strokes.* at most 86400 s"):
             Profile(**{"velocity": 0.4, "stroke": 0.28, **wanted})
     assert Profile(0.4, 0.28, dwell=86000.0).seconds == pytest.approx(86400, rel=0.01)

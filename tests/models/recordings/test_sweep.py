@@ -94,7 +94,7 @@ def test_every_period_is_alike(name):
     diagonal = diagonalise(closed_loop(STAGES[name]))
     force = TUNINGS[name].force_constant
     delta_e, current = OUTPUTS.index("delta_e"), OUTPUTS.index("current")
-    expected = force * frequency_response(diagonal, index)[:, :, column]
+    expected = force * frequency_response(diagonal, index.astype(float))[:, :, column]
     held = np.exp(-1j * np.pi * index / SAMPLE_RATE_HZ) * np.sinc(index / SAMPLE_RATE_HZ)
     for k, direct in ((delta_e, 0.0), (current, 1.0)):
         exact = held * expected[:, k] + direct

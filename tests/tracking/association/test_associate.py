@@ -25,7 +25,7 @@ from lmshealth.tracking.association.associate import (
     associate_log,
     measurements_of,
 )
-from lmshealth.tracking.association.hypotheses import Hypotheses
+from lmshealth.tracking.association.hypotheses import Hypotheses, extend
 
 Array = NDArray[np.float64]
 STD_F, STD_ZETA = 1e-3, 0.1
@@ -40,10 +40,10 @@ def rng() -> np.random.Generator:
 
 
 def say(
-    ln_f: Sequence[float],
+    ln_f: Sequence[float] | Array,
     names: Sequence[str] | None = None,
     *,
-    ln_zeta: Sequence[float] | None = None,
+    ln_zeta: Sequence[float] | Array | None = None,
     shapes: Array | None = None,
     sources: Sequence[str] | None = None,
 ) -> Estimates:
@@ -447,7 +447,12 @@ def test_estimates_without_a_value_or_std_are_refused(changes: dict[str, Any]) -
 @pytest.mark.parametrize("name", ["sources", "ln_damping", "cov", "shapes"])
 def test_fields_that_do_not_fit_are_refused(name: str) -> None:
     """The error names the field."""
-    wrong = {"sources": ("acc",), "ln_damping": np.zeros(3), "cov": np.eye(2), "shapes": np.eye(3)}
+    wrong: dict[str, Any] = {
+        "sources": ("acc",),
+        "ln_damping": np.zeros(3),
+        "cov": np.eye(2),
+        "shapes": np.eye(3),
+    }
     with pytest.raises(ValueError, match=name):
         replace(say([4.6, 4.8]), **{name: wrong[name]})
 
@@ -554,7 +559,6 @@ def test_chances_are_those_of_all_sequences_of_assignments(
         seen.append(extended.probabilities(2))
         return extended
 
-    extend = module.extend
     monkeypatch.setattr(module, "extend", watched)
     rng = np.random.default_rng(seed)
     ln_f = 4.8 + np.array([-1e-3, 1e-3]) * rng.uniform(0.5, 2) + STD_F * rng.standard_normal((4, 2))

@@ -116,7 +116,7 @@ def test_an_unknown_damping_is_averaged_over() -> None:
     """Odds without ln ζ are the mean of the odds with it over the ln ζ of clutter."""
     damping = np.linspace(-30.0, 30.0, 6001)
     n = damping.size
-    first = Measurements(*(np.array([x]) for x in (4.6, 1e-6, 0.0, 0.005)), np.empty((1, 0)))
+    first = replace(measured([4.6]), var_zeta=np.array([0.005]))
     filters = ModeFilters.empty(0, 0).start(first, ROW, np.zeros(0), 50.0)
     many = Scan(0, np.arange(n), np.full(n, -1), measured([4.601] * n), ROW)
     known = replace(many.measurements, ln_zeta=damping, var_zeta=np.full(n, 0.005))
