@@ -13,7 +13,7 @@ from lmshealth._private.result import Result as _Result
 if TYPE_CHECKING:
     from lmshealth.batch.analysis import analyse as analyse
     from lmshealth.batch.assess import assess as assess
-    from lmshealth.batch.run import Settings as Settings
+    from lmshealth.batch.ingest import Settings as Settings
     from lmshealth.batch.run import run as run
     from lmshealth.errors import LmshealthError as LmshealthError
     from lmshealth.health.inference import infer as infer
@@ -39,7 +39,7 @@ __version__ = version("lmshealth")
 _HOMES = {
     "LmshealthError": "errors",
     "LogEstimates": "modal.log_estimates",
-    "Settings": "batch.run",
+    "Settings": "batch.ingest",
     "analyse": "batch.analysis",
     "assess": "batch.assess",
     "build_history": "tracking.history",

@@ -14,6 +14,7 @@ from numpy.linalg import LinAlgError
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
+from lmshealth.batch.workers import Pool
 from lmshealth.errors import LmshealthError
 from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import Epoch, epochs_to_infer, infer
@@ -103,9 +104,8 @@ def assess(
     >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
-    mapper = map if executor is None else partial(map_in_order, executor)
     machine = Machine("", (), stage, work, epochs, seed)
-    return _assess(readings, machine, Parts({}, mapper))
+    return _assess(readings, machine, Parts({}, executor))
 
 
 def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) -> Assessment:
@@ -184,8 +184,13 @@ class Parts:
     """
 
     known: Mapping[str, bytes]
-    mapper: Callable[..., Iterable[Any]] = map
+    executor: Executor | None = None
     used: dict[str, bytes] = field(default_factory=dict)
+
+    @property
+    def mapper(self) -> Callable[..., Iterable[Any]]:
+        """Function that maps, in parallel where there is an executor."""
+        return map if self.executor is None else partial(map_in_order, self.executor)
 
     def map(
         self, kind: Any, function: Callable[..., object], *columns: Iterable[Any]
@@ -254,7 +259,8 @@ def assess_all(
 ) -> dict[str, str]:
     """Assess every machine whose assessment is not in the store; with ``force``, every machine.
 
-    Return the machines that could not be assessed, and why: one must not end the batch.
+    No part of an earlier assessment is used then. Return the machines that could not be assessed,
+    and why: one must not end the batch.
     """
     store, failed, known = resources.store, dict[str, str](), set[str]()
 
@@ -263,10 +269,16 @@ def assess_all(
         known.update(machine.name for machine in found)
         return found
 
+    def job(part: Sequence[Machine]) -> _Job:
+        [one] = part
+        return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
+
     fetch(machines)
     left = [machine for machine in machines if machine.name not in known]
     resources.progress("assessing", len(known), len(machines))
-    for k, (machine, made) in enumerate(_assessed(left, resources, fetch, force=force), start=1):
+    work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
+    mapper = partial(_assessed, pool=resources.pool, n_machines=len(left))
+    for k, ((machine, *_), made) in enumerate(work.divided(left, store, mapper), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         else:
@@ -276,35 +288,17 @@ def assess_all(
 
 
 def _assessed(
-    machines: Sequence[Machine],
-    resources: Resources,
-    fetch: Callable[[Sequence[Machine]], list[Machine]],
-    *,
-    force: bool,
-) -> Iterator[tuple[Machine, PackedAssessment | str]]:
-    """Assess machines in parallel; where they are fewer than workers, the parts of each.
-
-    With ``force`` no part of an earlier assessment is used.
-    """
-    pool, store = resources.pool, resources.store
-
-    def job(part: Sequence[Machine]) -> _Job:
-        [one] = part
-        return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
-
-    def mapper(jobs: Iterator[_Job]) -> Iterator[tuple[_Job, PackedAssessment | str]]:
-        if pool.executor is None or len(machines) >= pool.size:
-            yield from pool.map_unordered(_assess_packed, jobs, lambda _, why: why)
-            return
-        for job in jobs:
-            try:
-                yield job, _assess_packed(job, pool.executor, pool.crashes)
-            except pool.crashes:  # a worker was killed: without workers it only takes longer
-                yield job, _assess_packed(job)
-
-    work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
-    for (machine, *_), made in work.divided(machines, store, mapper):
-        yield machine, made
+    jobs: Iterator[_Job], pool: Pool, n_machines: int
+) -> Iterator[tuple[_Job, PackedAssessment | str]]:
+    """Assess machines in parallel; where they are fewer than workers, the parts of each."""
+    if pool.executor is None or n_machines >= pool.size:
+        yield from pool.map_unordered(_assess_packed, jobs, lambda _, why: why)
+        return
+    for job in jobs:
+        try:
+            yield job, _assess_packed(job, pool.executor, pool.crashes)
+        except pool.crashes:  # a worker was killed: without workers it only takes longer
+            yield job, _assess_packed(job)
 
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
@@ -332,10 +326,9 @@ def _assess_packed(
 ) -> PackedAssessment | str:
     """Assess a machine; return why it fails, but raise what workers fail of."""
     machine, logs, known = job
-    mapper = map if executor is None else partial(map_in_order, executor)
 
     def work() -> PackedAssessment:
-        parts, readings = Parts(known, mapper), unpack_logs(logs)
+        parts, readings = Parts(known, executor), unpack_logs(logs)
         made = pack_assessment(_assess(readings, machine, parts))
         parts.used.update(_pack_rows(readings, machine, known.get(_ROWS)))
         return replace(made, parts=parts.used)

@@ -4,7 +4,8 @@ import logging
 import os
 import time
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import AbstractContextManager
+from dataclasses import dataclass, field
 from datetime import datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -12,8 +13,9 @@ from typing import Any, Generic, NamedTuple, Self, TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint
 from lmshealth.batch import constants
+from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.store import Identified, OutcomeRow, Store
-from lmshealth.batch.workers import Pool
+from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
@@ -116,30 +118,73 @@ class Work(Generic[Piece, Job]):
         return others
 
 
-class Reading(NamedTuple):
-    """How logs are read: `columns` to `latest` as of `read_log`, links as of `find_logs`.
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """Settings of a run.
 
-    Files that are still growing are no logs yet.
+    Attributes
+    ----------
+    store : str or None
+        SQLAlchemy URL; None for a SQLite file in the folder of the output.
+    workers : int
+        Processes of this machine; results do not depend on it. The command line takes one per
+        processor by default.
+    scheduler : str or None
+        Address of a Dask scheduler, whose workers replace the processes.
+    epochs : int
+        Most epochs per machine at which health is inferred.
+    seed : int
+        Of all random numbers.
+    columns : ColumnMap or None
+        How logs are read; None where their columns are those of the log contract.
+    max_memory : float
+        Most memory in bytes that reading a log may take.
+    latest : datetime or None
+        Latest moment of a log or of maintenance; None for a day from now.
+    follow_links : bool
+        Whether symbolic links out of the folder of logs are followed.
+    alerts : Alerts
+        Which changes since the last run are delivered, and how.
+    growing : frozenset of Path
+        Files that are left to a later run.
+
+    Examples
+    --------
+    Two processes, and a store for a team; the password that its address may hold is not shown:
+
+    >>> import lmshealth
+    >>> settings = lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
+    >>> settings.workers, settings.epochs, "secret" in repr(settings)
+    (2, 40, False)
     """
 
+    store: str | None = field(default=None, repr=False)  # it may contain a password
+    workers: int = 1
+    scheduler: str | None = None
+    epochs: int = 40
+    seed: int = 0
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
     latest: datetime | None = None
     follow_links: bool = False
+    alerts: Alerts = field(default_factory=Alerts)
     growing: frozenset[Path] = frozenset()
+
+    def pool(self) -> AbstractContextManager[Pool]:
+        """Open the workers."""
+        return cluster(self.scheduler) if self.scheduler else processes(self.workers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Ingested:
-    """Logs of each machine that have estimates, and the digest of its description.
+    """Logs of each machine that have estimates, and its description.
 
     Refused are logs as a whole, copies, and rows of a manifest that name no log; ``logs`` are the
     names of all logs that are there or that a manifest lists; the outcomes of ``n_cached`` logs
     were in the store.
     """
 
-    machines: dict[str, tuple[LogKey, ...]]
-    descriptions: dict[str, str]
+    machines: dict[str, tuple[Stage, tuple[LogKey, ...]]]
     refused: tuple[Refusal, ...]
     logs: frozenset[str]
     n_cached: int
@@ -179,7 +224,7 @@ class _Outcome(NamedTuple):
 
 
 def ingest(
-    folder: Path, stages: Sequence[Stage], resources: Resources, *, out: Path, reading: Reading
+    folder: Path, stages: Sequence[Stage], resources: Resources, *, out: Path, settings: Settings
 ) -> Ingested:
     """Identify every log of a folder whose outcome is not in the store yet.
 
@@ -188,12 +233,12 @@ def ingest(
     """
     store, progress = resources.store, resources.progress
     folder = folder.absolute()  # workers may have another working directory
-    manifest = read_manifest(folder, follow_links=reading.follow_links)
-    archive = find_logs(folder, manifest=manifest, follow_links=reading.follow_links)
+    manifest = read_manifest(folder, follow_links=settings.follow_links)
+    archive = find_logs(folder, manifest=manifest, follow_links=settings.follow_links)
     inside = out.resolve()
-    logs = (path for path in archive.logs if path not in reading.growing)
+    logs = (path for path in archive.logs if path not in settings.growing)
     found = [path for path in logs if inside not in path.resolve().parents]
-    tasks, refused = _tasks(folder, found, manifest, reading, resources)
+    tasks, refused = _tasks(folder, found, manifest, settings.columns, resources)
     refused += [
         Refusal(name_of(path, folder), NOT_LISTED, "it is read with its own metadata; add a row")
         for path in found
@@ -212,7 +257,7 @@ def ingest(
     cached = set()
 
     def fetch(part: Sequence[_Task]) -> Iterator[_Task]:
-        for task, outcome in _cached(part, stages, store, reading.latest):
+        for task, outcome in _cached(part, stages, store, settings.latest):
             add(_Outcome.of(task, outcome, is_new=False))
             cached.add(task.name)
             yield task
@@ -220,7 +265,7 @@ def ingest(
     known = {task.name for task in fetch(tasks)}
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in known]
-    how = {"max_memory": reading.max_memory, "latest": reading.latest}
+    how = {"max_memory": settings.max_memory, "latest": settings.latest}
     identify = partial(_identify_logs, stages=tuple(stages), how=how)
     done = 0
     for part in _identified(left, identify, resources, fetch):
@@ -231,11 +276,10 @@ def ingest(
         progress("identifying", len(cached) + done, len(tasks))
     names = {name_of(path, folder) for path in found}
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
-    machines, descriptions, others = _grouped(groups, [stage.digest for stage in stages])
+    machines, others = _grouped(groups, stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
     return Ingested(
         machines=machines,
-        descriptions=descriptions,
         refused=(*archive.refused, *refused, *lost),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=len(cached),
@@ -243,37 +287,41 @@ def ingest(
 
 
 def _grouped(
-    found: dict[str, dict[str, list[LogKey]]], order: list[str]
-) -> tuple[dict[str, tuple[LogKey, ...]], dict[str, str], list[Refusal]]:
-    """Return logs and description of each machine, and refusals of logs of its other ones."""
-    machines, descriptions, refused = {}, {}, []
+    found: dict[str, dict[str, list[LogKey]]], stages: Sequence[Stage]
+) -> tuple[dict[str, tuple[Stage, tuple[LogKey, ...]]], list[Refusal]]:
+    """Return description and logs of each machine, and refusals of logs of its other ones."""
+    by_digest = {stage.digest: stage for stage in stages}
+    order, machines, refused = [*by_digest], {}, list[Refusal]()
     for name, by in sorted(found.items()):
         most = max(by, key=lambda digest: (len(by[digest]), -order.index(digest)))
-        machines[name], descriptions[name] = tuple(sorted(by[most])), most
+        machines[name] = by_digest[most], tuple(sorted(by[most]))
         others = [log for digest in by if digest != most for log, _ in by[digest]]
         detail = (
             f"{len(by[most])} logs of {name} belong to another stage description than this "
             "one; a machine has one: see column description of manifest.csv"
         )
         refused += [Refusal(log, "no-stage", detail) for log in others]
-    return machines, descriptions, refused
+    return machines, refused
 
 
 def _tasks(
     folder: Path,
     found: Sequence[Path],
     manifest: Manifest,
-    reading: Reading,
+    columns: ColumnMap | None,
     resources: Resources,
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
     digests = _all_digests({path: _file_key(path, folder) for path in found}, resources)
     tasks: list[_Task] = []
-    refused: list[Refusal] = list(manifest.refused)
-    for path in found:
-        digest = digests[path]
-        if isinstance(digest, BadLog):
-            refused.append(Refusal(name_of(path, folder), digest.reason, digest.detail))
+    refused = [
+        *manifest.refused,
+        *(
+            Refusal(name_of(path, folder), digest.reason, digest.detail)
+            for path in found
+            if isinstance(digest := digests[path], BadLog)
+        ),
+    ]
     seen: dict[tuple[str, str], str] = {}
     # Of several copies the one in a manifest is analysed: only that one has its metadata.
     for path in sorted(found, key=lambda path: not manifest.names(path)):
@@ -291,7 +339,7 @@ def _tasks(
             refused.append(Refusal(name, error.reason, error.detail))
             continue
         seen[content] = name
-        tasks.append(_Task(path, name, overrides, digest, reading.columns))
+        tasks.append(_Task(path, name, overrides, digest, columns))
     return tasks, refused
 
 
@@ -402,13 +450,10 @@ def _identified(
 
 
 def _crashed(tasks: Sequence[_Task], why: str) -> list[_Outcome]:
-    return [_Outcome.of(task, _end_of_worker(task, why), is_new=True) for task in tasks]
-
-
-def _end_of_worker(task: _Task, why: str) -> Identified:
     needed = "no other log is affected; run again with fewer --workers"
-    refusal = Refusal(task.name, "crashed", f"{why} (crash or out of memory); {needed}")
-    return Identified((refusal,), lasting=False)
+    detail = f"{why} (crash or out of memory); {needed}"
+    ends = [(task, Refusal(task.name, "crashed", detail)) for task in tasks]
+    return [_Outcome.of(task, Identified((end,), lasting=False), is_new=True) for task, end in ends]
 
 
 def _identify_logs(

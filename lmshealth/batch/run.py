@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import partial
@@ -14,23 +14,13 @@ import msgspec
 from lmshealth._private.files import remove_abandoned, write_text
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
-from lmshealth.batch.alerts import (
-    Alerts,
-    Scope,
-    announce,
-    deliver,
-    last_number,
-    write_statuses,
-)
+from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import NOT_LISTED, Progress, Reading, Resources, Work, ingest
+from lmshealth.batch.ingest import NOT_LISTED, Ingested, Progress, Resources, Settings, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
 from lmshealth.batch.status import Change, Status
 from lmshealth.batch.store import Store, default_url, unpack_or_none
-from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import LmshealthError, NothingUsable
-from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.io.refusal import visible
@@ -39,63 +29,6 @@ from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """Settings of a run.
-
-    Attributes
-    ----------
-    store : str or None
-        SQLAlchemy URL; None for a SQLite file in the folder of the output.
-    workers : int
-        Processes of this machine; results do not depend on it. The command line takes one per
-        processor by default.
-    scheduler : str or None
-        Address of a Dask scheduler, whose workers replace the processes.
-    epochs : int
-        Most epochs per machine at which health is inferred.
-    seed : int
-        Of all random numbers.
-    columns : ColumnMap or None
-        How logs are read; None where their columns are those of the log contract.
-    max_memory : float
-        Most memory in bytes that reading a log may take.
-    latest : datetime or None
-        Latest moment of a log or of maintenance; None for a day from now.
-    follow_links : bool
-        Whether symbolic links out of the folder of logs are followed.
-    alerts : Alerts
-        Which changes since the last run are delivered, and how.
-    growing : frozenset of Path
-        Files that are left to a later run.
-
-    Examples
-    --------
-    Two processes, and a store for a team; the password that its address may hold is not shown:
-
-    >>> import lmshealth
-    >>> settings = lmshealth.Settings(workers=2, store="postgresql://me:secret@host/fleet")
-    >>> settings.workers, settings.epochs, "secret" in repr(settings)
-    (2, 40, False)
-    """
-
-    store: str | None = field(default=None, repr=False)  # it may contain a password
-    workers: int = 1
-    scheduler: str | None = None
-    epochs: int = 40
-    seed: int = 0
-    columns: ColumnMap | None = None
-    max_memory: float = MAX_MEMORY
-    latest: datetime | None = None
-    follow_links: bool = False
-    alerts: Alerts = field(default_factory=Alerts)
-    growing: frozenset[Path] = frozenset()
-
-    def pool(self) -> AbstractContextManager[Pool]:
-        """Open the workers."""
-        return cluster(self.scheduler) if self.scheduler else processes(self.workers)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -175,15 +108,11 @@ def run(
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
         scope = Scope(folder, out, last_number(store))
         resources = Resources(store, pool, progress)
-        reading = Reading(*(getattr(settings, name) for name in Reading._fields))
-        ingested = ingest(folder, stages, resources, out=out, reading=reading)
+        ingested = ingest(folder, stages, resources, out=out, settings=settings)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
-        by_digest = {stage.digest: stage for stage in stages}
-        described = {name: by_digest[own] for name, own in ingested.descriptions.items()}
-        options = {"epochs": settings.epochs, "seed": settings.seed}
         machines = [
-            Machine(name, logs, described[name], work.of(name), **options)
-            for name, logs in ingested.machines.items()
+            Machine(name, logs, stage, work.of(name), settings.epochs, settings.seed)
+            for name, (stage, logs) in ingested.machines.items()
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
@@ -201,10 +130,7 @@ def run(
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
-    copies = {refusal.log for refusal in refused if refusal.reason == "duplicate"}
-    unlisted = {refusal.log for refusal in refused if refusal.reason == NOT_LISTED}
-    others = {refusal.log for refusal in refused if refusal.reason not in ("duplicate", NOT_LISTED)}
-    lost = (others - copies | excluded) & ingested.logs
+    counted, lost = _counted(done, ingested, refused, excluded)
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
@@ -212,12 +138,7 @@ def run(
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
     return replace(
-        done,
-        n_logs=len(ingested.logs - copies),
-        n_refused=len(lost),
-        n_remembered=ingested.n_cached,
-        n_unlisted=len(unlisted),
-        n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
+        counted,
         failed=failed | done.failed,
         statuses=statuses,
         changes=tuple(changes),
@@ -271,6 +192,25 @@ def _prepare(out: Path) -> None:
         remove_abandoned(out)
     except OSError as error:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
+
+
+def _counted(
+    result: RunResult, ingested: Ingested, refused: Sequence[Refusal], excluded: set[str]
+) -> tuple[RunResult, set[str]]:
+    """Add the counts of logs to a result; return the logs that were refused as a whole too."""
+    apart = "duplicate", NOT_LISTED
+    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in apart)
+    others = {refusal.log for refusal in refused if refusal.reason not in apart}
+    lost = (others - copies | excluded) & ingested.logs
+    counted = replace(
+        result,
+        n_logs=len(ingested.logs - copies),
+        n_refused=len(lost),
+        n_remembered=ingested.n_cached,
+        n_unlisted=len(unlisted),
+        n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
+    )
+    return counted, lost
 
 
 def _others(folder: Path, logs: frozenset[str]) -> str:

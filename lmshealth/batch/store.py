@@ -20,7 +20,7 @@ from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from threading import Event, Timer
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple, Self, TypeVar
 from urllib.parse import quote
 
 import sqlalchemy as sql
@@ -40,6 +40,10 @@ from lmshealth.report.assessment import Summary
 
 Outcome = LogEstimates | tuple[Refusal, ...]
 """Result of a log: its modal estimates, or why it was refused."""
+
+Condition = sql.ColumnElement[bool]
+
+Record = TypeVar("Record")
 
 _INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 
@@ -246,16 +250,15 @@ class Store:
         self._engine, self._address = _connect(url, create=create)
         self._shown, self._writes = shown_address(self._address), create
         self._claims: Connection | None = None
-        self._alone: Connection | None = None
+        self._open: Connection | None = None  # transaction
         self.damaged: Counter[str] = Counter()  # rows that were damaged, by the name of the table
         with self._faults():
             tables = sql.inspect(self._engine).get_table_names()
-        optional = {table.name for table in (_HASHED, _ANNOUNCED, _UNSENT, *_VIEWS.values())}
-        if missing := _METADATA.tables.keys() - optional - set(tables):
+        if _ASSESSED.name not in tables:  # all are made together
             older = any(re.fullmatch(r"(identified|assessed)_\d+", table) for table in tables)
             found = "only results of another version of lmshealth" if older else "no results"
             self.close()
-            raise self.unfilled(f"{found} (no table {min(missing)})")
+            raise self.unfilled(f"{found} (no table {_ASSESSED.name})")
 
     def unfilled(self, found: str) -> StoreError:
         """Return the error of a store without the results that are needed."""
@@ -344,11 +347,7 @@ class Store:
                     time.sleep(constants.OTHERS_POLL_S)
             else:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
-            self._alone = connection
-            try:
-                yield
-            finally:
-                self._alone = None
+            yield
 
     # Logs
 
@@ -358,9 +357,8 @@ class Store:
 
     def put_digests(self, digests: Mapping[str, str]) -> None:
         """Store digests of the content of files."""
-        with self._begin() as connection:
-            rows = [{"key": key, "content": digest.encode()} for key, digest in digests.items()]
-            self._put_rows(connection, _HASHED, rows)
+        rows = [{"key": key, "content": digest.encode()} for key, digest in digests.items()]
+        self._put(_HASHED, rows)
 
     def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
         """Fetch the outcomes of those logs that are stored, under their names of that time."""
@@ -374,9 +372,7 @@ class Store:
 
     def put_identified(self, rows: Iterable[OutcomeRow]) -> None:
         """Store outcomes of logs in one transaction."""
-        whole = [row._asdict() | {"version": VERSION} for row in rows]
-        with self._begin() as connection:
-            self._put_rows(connection, _IDENTIFIED, whole)
+        self._put(_IDENTIFIED, [row._asdict() | {"version": VERSION} for row in rows])
 
     # Machines
 
@@ -397,17 +393,17 @@ class Store:
         own, parts = _id(machine), made.parts
         contents = {name: getattr(made, name) for name in ("content", "evidence", "summary")}
         with self._begin() as connection:
-            self._put_rows(connection, _ASSESSED, [{"machine": own, "key": key} | contents])
+            self._put(_ASSESSED, [{"machine": own, "key": key} | contents])
             if parts is None:
                 return
             of_this = _PARTS.c.machine == own
             connection.execute(sql.delete(_PARTS).where(of_this, _PARTS.c.key.not_in(list(parts))))
             rows = [{"machine": own, "key": k, "content": part} for k, part in parts.items()]
-            self._put_rows(connection, _PARTS, rows)
+            self._put(_PARTS, rows)
 
     def put_part(self, machine: str, key: str, content: bytes) -> None:
         """Store one more part of the last assessment of a machine."""
-        self._put(_PARTS, machine=_id(machine), key=key, content=content)
+        self._put(_PARTS, [{"machine": _id(machine), "key": key, "content": content}])
 
     def part(self, machine: str, key: str) -> bytes | None:
         """Fetch a part of the last assessment of a machine; None where it is not stored."""
@@ -418,9 +414,7 @@ class Store:
 
         There are none for one that was lost: from its own parts it would have other draws.
         """
-        content = self._record(_PRESENT, "content", machine=_id(machine))
-        present: Published | None = unpack_or_none(content, Published)
-        if present is not None and key in present.kept:
+        if any(key in one.kept for one in self._decoded(_PRESENT, Published, machine=_id(machine))):
             return {}
         return {key: part for (_, key), (part,) in self._intact(_PARTS, machine=_id(machine))}
 
@@ -434,7 +428,7 @@ class Store:
         earlier = _POINTS.c.machine == _id(machine), _POINTS.c.quantity != "remaining_km"
         with self._begin() as connection:
             connection.execute(sql.delete(_POINTS).where(*earlier))
-            self._put_rows(connection, _POINTS, _named(rows))
+            self._put(_POINTS, _named(rows))
 
     def put_status(
         self, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
@@ -451,14 +445,14 @@ class Store:
             | {"name": one.stage, "key": fingerprint(one), "noticed_at": noticed_at}
             for one in changes
         ]
-        with self._begin() as connection:
-            self._put_rows(connection, _STATUS, _named(present))
-            self._put_rows(connection, _CHANGES, _named(changed))
+        with self._begin():
+            self._put(_STATUS, _named(present))
+            self._put(_CHANGES, _named(changed))
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that belong to no machine, and return its key."""
         key = fingerprint(refused)
-        self._put(_REFUSED, key=key, content=pack(refused))
+        self._put(_REFUSED, [{"key": key, "content": pack(refused)}])
         return key
 
     def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
@@ -470,72 +464,60 @@ class Store:
         own, key, stored = _id(machine), keys[0], _ASSESSED.c
         present = pack(Published(machine, key, refused, tuple(keys)))
         summary = self._record(_ASSESSED, "summary", machine=own, key=key)
-        number = 1 + max((one.number for _, one in self._summarised(machine)), default=0)
+        summaries = self._decoded(_SUMMARIES, _Summarised, machine=own)
+        number = 1 + max((one.number for one in summaries), default=0)
         others = sql.delete(_ASSESSED).where(stored.machine == own, stored.key.not_in(keys))
         with self._begin() as connection:
-            self._put_rows(
-                connection, _PRESENT, [{"machine": own, "name": machine} | {"content": present}]
-            )
+            self._put(_PRESENT, [{"machine": own, "name": machine, "content": present}])
             if summary is not None:
                 content = pack(_Summarised(number, summary))
-                row = {"machine": own, "key": key, "content": content}
-                self._put_rows(connection, _SUMMARIES, [row])
+                self._put(_SUMMARIES, [{"machine": own, "key": key, "content": content}])
             connection.execute(others)
 
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
-        others = [one for own, one in self._summarised(machine) if own != key]
-        newest_first = sorted(others, key=lambda one: one.number, reverse=True)
+        found = self._decoded(
+            _SUMMARIES, _Summarised, _SUMMARIES.c.key != key, machine=_id(machine)
+        )
+        newest_first = sorted(found, key=lambda one: one.number, reverse=True)
         summaries = (unpack_or_none(one.summary, Summary) for one in newest_first)
         return next((summary for summary in summaries if summary is not None), None)
 
-    def _summarised(self, machine: str) -> list[tuple[str, _Summarised]]:
-        """Fetch the summaries of all published assessments of a machine, with their keys."""
-        rows = self._intact(_SUMMARIES, machine=_id(machine))
-        found = ((key, unpack_or_none(content, _Summarised)) for (_, key), (content,) in rows)
-        return [(key, one) for key, one in found if one is not None]
-
     def published(self) -> tuple[Published, ...]:
         """List the published assessments of all machines by name; `StoreError` if none is."""
-        found = [unpack_or_none(content, Published) for _, (content,) in self._intact(_PRESENT)]
-        present: list[Published] = [one for one in found if one is not None]
+        present = self._decoded(_PRESENT, Published)
         if not present:
             raise self.unfilled("no assessment")
         return tuple(sorted(present, key=lambda one: one.machine))
 
     def refused(self, keys: Iterable[str]) -> tuple[Refusal, ...]:
         """Fetch lists of logs that belong to no machine, each refusal once."""
-        found: dict[Refusal, None] = {}
-        for key in dict.fromkeys(keys):
-            content = self._record(_REFUSED, "content", key=key)
-            found |= dict.fromkeys(unpack_or_none(content, tuple[Refusal, ...]) or ())
-        return tuple(found)
+        lists = (
+            self._decoded(_REFUSED, tuple[Refusal, ...], key=key) for key in dict.fromkeys(keys)
+        )
+        return tuple(dict.fromkeys(one for found in lists for refused in found for one in refused))
 
     # Alerts
 
     def announced(self) -> dict[str, Announced]:
         """Fetch what was announced of each machine last."""
-        found = [unpack_or_none(content, Announced) for _, (content,) in self._intact(_ANNOUNCED)]
-        return {one.status.stage: one for one in found if one is not None}
+        return {one.status.stage: one for one in self._decoded(_ANNOUNCED, Announced)}
 
     def put_announced(self, announced: Iterable[Announced]) -> None:
         """Store what was announced of machines."""
-        stages = [(one.status.stage, pack(one)) for one in announced]
-        rows = [{"machine": _id(m), "name": m, "content": content} for m, content in stages]
-        with self._begin() as connection:
-            self._put_rows(connection, _ANNOUNCED, rows)
+        self._put(
+            _ANNOUNCED,
+            _named({"name": one.status.stage, "content": pack(one)} for one in announced),
+        )
 
     def unsent(self) -> list[Unsent]:
         """Fetch the changes that are to be delivered, the oldest first."""
-        found = [unpack_or_none(content, Unsent) for _, (content,) in self._intact(_UNSENT)]
-        unsent: list[Unsent] = [one for one in found if one is not None]
-        return sorted(unsent, key=lambda one: (one.number, one.change.stage))
+        found = self._decoded(_UNSENT, Unsent)
+        return sorted(found, key=lambda one: (one.number, one.change.stage))
 
     def put_unsent(self, unsent: Iterable[Unsent]) -> None:
         """Store changes that are to be delivered."""
-        rows = [_unsent_keys(one) | {"content": pack(one)} for one in unsent]
-        with self._begin() as connection:
-            self._put_rows(connection, _UNSENT, rows)
+        self._put(_UNSENT, [_unsent_keys(one) | {"content": pack(one)} for one in unsent])
 
     def remove_unsent(self, sent: Iterable[Unsent]) -> None:
         """Remove changes that were delivered."""
@@ -550,36 +532,42 @@ class Store:
         asked = list(dict.fromkeys(keys))
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
             part = asked[first : first + constants.ROWS_PER_QUERY]
-            yield from ((key, content) for (key,), (content,) in self._intact(table, key=part))
+            rows = self._intact(table, table.c.key.in_(part))
+            yield from ((key, content) for (key,), (content,) in rows)
+
+    def _decoded(
+        self, table: sql.Table, kind: type[Record], *where: Condition, **keys: str
+    ) -> list[Record]:
+        """Fetch those records that this version can decode."""
+        rows = self._intact(table, *where, **keys)
+        found = (unpack_or_none(content, kind) for _, (content,) in rows)
+        return [one for one in found if one is not None]
 
     def _record(self, table: sql.Table, column: str, **keys: str) -> bytes | None:
         """Fetch one record; None where there is none, or it is damaged."""
-        return next((content for _, (content,) in self._intact(table, column, **keys)), None)
+        return next((content for _, (content,) in self._intact(table, column=column, **keys)), None)
 
     def _intact(
-        self, table: sql.Table, *columns: str, **keys: str | Sequence[str]
+        self, table: sql.Table, *where: Condition, column: str | None = None, **keys: str
     ) -> list[tuple[tuple[str, ...], tuple[bytes, ...]]]:
         """Fetch keys and records of rows, by default all records of each.
 
         Rows of which a record is damaged are removed and counted.
         """
-        named = columns or [one.name for one in table.columns if isinstance(one.type, _Bytes)]
+        records = [one.name for one in table.columns if isinstance(one.type, _Bytes)]
+        named = records if column is None else [column]
         query = sql.select(*table.primary_key.columns, *(table.c[name] for name in named))
-        for name, key in keys.items():
-            one = table.c[name]
-            query = query.where(one == key if isinstance(key, str) else one.in_(key))
         with self._begin() as connection:
-            rows = [tuple(row) for row in connection.execute(query)]
+            rows = connection.execute(query.where(*where).filter_by(**keys)).all()
         found, n = list[tuple[tuple[str, ...], tuple[bytes, ...]]](), len(table.primary_key)
         for row in rows:
-            opened = [
-                _unsealed(one, name, *row[:n]) for name, one in zip(named, row[n:], strict=True)
-            ]
-            records = tuple(record for record in opened if record is not None)
-            if len(records) == len(named):
-                found.append((row[:n], records))
+            keys_of_row, stored = tuple(row[:n]), zip(named, row[n:], strict=True)
+            opened = [_unsealed(one, name, *keys_of_row) for name, one in stored]
+            intact = tuple(record for record in opened if record is not None)
+            if len(intact) == len(named):
+                found.append((keys_of_row, intact))
             else:
-                self._remove_damaged(table, row[:n])
+                self._remove_damaged(table, keys_of_row)
         return found
 
     def _remove_damaged(self, table: sql.Table, keys: tuple[Any, ...]) -> None:
@@ -587,17 +575,11 @@ class Store:
         self.damaged[name] += 1
         _logger.info("damaged row of %s in the store %s", name, self._shown)
         if self._writes:
-            columns = zip(table.primary_key.columns, keys, strict=True)
+            row = dict(zip(table.primary_key.columns.keys(), keys, strict=True))
             with self._begin() as connection:
-                connection.execute(sql.delete(table).where(*(one == key for one, key in columns)))
+                connection.execute(sql.delete(table).filter_by(**row))
 
-    def _put(self, table: sql.Table, **row: Any) -> None:
-        with self._begin() as connection:
-            self._put_rows(connection, table, [row])
-
-    def _put_rows(
-        self, connection: Connection, table: sql.Table, rows: Sequence[dict[str, Any]]
-    ) -> None:
+    def _put(self, table: sql.Table, rows: Sequence[dict[str, Any]]) -> None:
         """Write rows, their records sealed, in one statement; later writes replace them."""
         if not rows:
             return
@@ -605,17 +587,22 @@ class Store:
         keys = [column.name for column in table.primary_key]
         rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
         upsert = insert.on_conflict_do_update(index_elements=keys, set_=rest)
-        connection.execute(upsert, [_sealed(row, keys) for row in rows])
+        with self._begin() as connection:
+            connection.execute(upsert, [_sealed(row, keys) for row in rows])
 
     @contextmanager
     def _begin(self) -> Iterator[Connection]:
-        """Open a transaction, or go on with that of `alone`."""
+        """Open a transaction, or go on with the one that is open."""
         with self._faults():
-            if self._alone is not None:
-                yield self._alone
-            else:
-                with self._engine.begin() as connection:
+            if self._open is not None:
+                yield self._open
+                return
+            with self._engine.begin() as connection:
+                self._open = connection
+                try:
                     yield connection
+                finally:
+                    self._open = None
 
     @contextmanager
     def _faults(self) -> Iterator[None]:
@@ -630,13 +617,12 @@ class Store:
             raise StoreError(f"the store {self._shown} failed: {why}; {step}") from None
 
 
+def _id(name: str) -> str:
+    return hashlib.sha256(name.encode("utf-8", "surrogatepass")).hexdigest()
+
+
 def _lock_number(key: str) -> int:
-    digest = hashlib.sha256(key.encode("utf-8", "surrogatepass")).digest()
-    return int.from_bytes(digest[:8], signed=True)
-
-
-def _id(machine: str) -> str:
-    return hashlib.sha256(machine.encode("utf-8", "surrogatepass")).hexdigest()
+    return int.from_bytes(bytes.fromhex(_id(key))[:8], signed=True)
 
 
 def _named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -815,19 +801,16 @@ def _create_tables(engine: Engine) -> None:
 
 def _carry_over(connection: Connection, table: sql.Table, existing: set[str]) -> None:
     """Copy the rows of the last schema that no run computes again, by the columns of both."""
-    name, _, number = table.name.rpartition("_")
-    found = (re.fullmatch(rf"{name}_(\d+)", other) for other in existing)
-    older = max((n for one in found if one and (n := int(one[1])) < int(number)), default=None)
-    if table not in _CARRIED or older is None:
+    name = table.name.rpartition("_")[0]
+    older = [n for n in range(1, constants.SCHEMA) if f"{name}_{n}" in existing]
+    if table not in _CARRIED or not older:
         return
-    there = {column["name"] for column in sql.inspect(connection).get_columns(f"{name}_{older}")}
-    columns = [column for column in table.columns if column.name in there]
-    if all(column.nullable for column in table.columns if column not in columns):
-        before = sql.table(f"{name}_{older}", *(sql.column(c.name, c.type) for c in columns))
-        insert = _INSERT[connection.dialect.name](table)
+    before = sql.Table(f"{name}_{older[-1]}", sql.MetaData(), autoload_with=connection)
+    columns = [column.name for column in table.columns if column.name in before.columns]
+    if all(column.nullable for column in table.columns if column.name not in columns):
         # SQLite needs a condition in front of ON CONFLICT.
-        every = sql.select(before).where(sql.text("1 = 1"))
-        insert = insert.from_select([c.name for c in columns], every)
+        every = sql.select(*(before.c[name] for name in columns)).where(sql.text("1 = 1"))
+        insert = _INSERT[connection.dialect.name](table).from_select(columns, every)
         connection.execute(insert.on_conflict_do_nothing())  # of another run at the same time
 
 

@@ -7,7 +7,8 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from lmshealth.batch.run import RunResult, Settings, run
+from lmshealth.batch.ingest import Settings
+from lmshealth.batch.run import RunResult, run
 from lmshealth.errors import LmshealthError
 from lmshealth.stage.description import Stage
 

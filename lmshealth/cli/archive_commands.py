@@ -10,7 +10,8 @@ import click
 
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.run import RunResult, Settings
+from lmshealth.batch.ingest import Settings
+from lmshealth.batch.run import RunResult
 from lmshealth.batch.run import report as write_pages
 from lmshealth.batch.run import run as run_pipeline
 from lmshealth.batch.store import Store

@@ -22,7 +22,8 @@ from lmshealth.batch import alerts as alerting
 from lmshealth.batch import constants, ingest, outputs
 from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts, announce, run_command
-from lmshealth.batch.run import RunResult, Settings, run
+from lmshealth.batch.ingest import Settings
+from lmshealth.batch.run import RunResult, run
 from lmshealth.batch.store import Identified, Store
 from lmshealth.errors import NothingUsable
 from lmshealth.stage.description import Stage

@@ -32,7 +32,8 @@ from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
-from lmshealth.batch.run import RunResult, Settings, report, run
+from lmshealth.batch.ingest import Settings
+from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NotConverged, NothingUsable

@@ -14,7 +14,8 @@ from typing import Any
 import pytest
 
 from lmshealth.batch import watch as watching
-from lmshealth.batch.run import RunResult, Settings
+from lmshealth.batch.ingest import Settings
+from lmshealth.batch.run import RunResult
 from lmshealth.batch.watch import watch
 from lmshealth.errors import NothingUsable
 from studies.harness.servers import wait_until

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import fft
 
 from lmshealth import identify, infer, load_stage, prognose, run
-from lmshealth.batch.run import Settings
+from lmshealth.batch.ingest import Settings
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.read_tables import Drifts
 from lmshealth.tracking.state_space import StateSpace
