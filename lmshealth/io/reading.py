@@ -13,23 +13,23 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.channel_checks import (
+from lmshealth.io.checks.channel_checks import (
     check_signal,
     independent,
     magnitudes,
     missing_ranges,
     roughness,
 )
+from lmshealth.io.checks.consistency import Findings, Motion, compare
+from lmshealth.io.checks.prediction import filled
+from lmshealth.io.checks.sample_faults import check_sign, coarse_levels, spikes, unwrapped
 from lmshealth.io.column_map import ColumnMap, Role, Signal
-from lmshealth.io.consistency import Findings, Motion, compare
 from lmshealth.io.formats.content import Content
 from lmshealth.io.formats.foreign import frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
-from lmshealth.io.prediction import filled
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
-from lmshealth.io.sample_faults import check_sign, coarse_levels, spikes, unwrapped
 from lmshealth.io.time_axis import (
     IntArray,
     TimeAxis,

@@ -8,8 +8,8 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
-from lmshealth.io.channel_checks import Roughness
-from lmshealth.io.prediction import Prediction, fit_prediction, within
+from lmshealth.io.checks.channel_checks import Roughness
+from lmshealth.io.checks.prediction import Prediction, fit_prediction, within
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import IntArray
 
