@@ -12,7 +12,7 @@ import numpy as np
 
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, in_unit
+from lmshealth.io.buffers import IntArray, Samples, in_unit
 from lmshealth.io.checks.channel_checks import (
     check_signal,
     independent,
@@ -31,7 +31,6 @@ from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import (
-    IntArray,
     TimeAxis,
     pieces,
     resampled,

@@ -4,19 +4,27 @@ Samples are never sorted; `prediction` fills short gaps only (README.md, "Time")
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
+from lmshealth.io.buffers import (
+    BLOCK,
+    NO_RANGES,
+    IntArray,
+    Samples,
+    Spool,
+    blocks,
+    runs,
+    smallest_step,
+)
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
-IntArray = NDArray[np.int64]
 # Time in s of samples, by their index, and its derivatives.
 Clock = Callable[..., FloatArray]
 
@@ -44,7 +52,7 @@ class TimeAxis(NamedTuple):
     sample_rate: float
     breaks: IntArray
     note: str
-    lost: IntArray = np.empty((0, 2), dtype=np.int64)
+    lost: IntArray = NO_RANGES
     clocks: tuple[Clock, ...] = ()
     dropped: IntArray = np.empty(0, dtype=np.int64)
 
@@ -55,7 +63,7 @@ class TimeAxis(NamedTuple):
         """
         shift = np.concatenate([[0], np.cumsum(self.dropped)])
         if not self.dropped.any():
-            return self, np.empty((0, 2), dtype=np.int64)
+            return self, NO_RANGES
         known = self.dropped > 0
         start = (self.breaks + shift[:-1])[known]
         added = np.stack([start, start + self.dropped[known]], axis=1)
@@ -94,13 +102,10 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
             raise Unusable("time", f"{found}; needed increasing time stamps")
         return _axis(time, rate, step, 0.0)
     except Unusable:
-        if not coarse:
-            raise
         # Rounding to a step near the interval makes them unlike: the clock decides.
-        try:
-            return _axis(time, rate, step, step)
-        except Unusable:
-            pass
+        if coarse:
+            with suppress(Unusable):
+                return _axis(time, rate, step, step)
         raise
 
 
@@ -122,7 +127,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
             slopes += slope.tolist()
             lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
         clocks.append(clock)
-    gone = np.concatenate([*lost, np.empty((0, 2), dtype=np.int64)])
+    gone = np.concatenate([NO_RANGES, *lost])
     n_lost = int(np.sum(gone[:, 1] - gone[:, 0]))
     notes = [note] if note else []
     if n_lost:
@@ -248,13 +253,13 @@ def _residual(
     time: Samples, stretch: tuple[int, int], clock: Clock, interval: float, step: float
 ) -> IntArray:
     """Find the ranges of samples whose stamps are off the clock; refuse periodic jitter."""
-    found = [np.empty((0, 2), dtype=np.int64)]
+    found = [NO_RANGES]
     for at, stamps in blocks(time, *stretch):
         error = stamps - clock(np.arange(at, at + stamps.size))
         if np.ptp(error) <= _ROUNDING * step:
             continue
         off = np.abs(error) > constants.JITTER * interval + step / 2
-        found.append(np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2) + at)
+        found.append(runs(off, at))
         error[off] = 0
         line = 2 * np.abs(np.fft.rfft(error - error.mean())).max() / error.size
         by_chance = 2 * error.std() * np.sqrt((np.log(error.size) + _CHANCE) / error.size)
@@ -319,7 +324,7 @@ def pieces(
     ``missing`` holds for each channel the half-open ranges in which it has no samples, shape
     ``(n, 2)``; ``breaks`` the samples before which time is interrupted, ascending.
     """
-    gone = np.concatenate([*missing, np.empty((0, 2), dtype=np.int64)])
+    gone = np.concatenate([NO_RANGES, *missing])
     gone = gone[np.argsort(gone[:, 0], kind="stable")]
     # A piece begins where all missing ranges so far have ended.
     start = np.concatenate([[0], np.maximum.accumulate(gone[:, 1])])
@@ -418,7 +423,6 @@ def _step(block: FloatArray) -> float:
     """Estimate the step of stored positions in m from the second differences."""
     uneven = np.abs(np.diff(block, 2))
     # At a velocity of a whole number of steps per sample only few differences are uneven.
-    apart = np.diff(np.unique(block))
-    smallest = float(apart.min()) if apart.size else 0.0
+    smallest = smallest_step(block)
     visible = smallest if float(uneven.max()) > 0.5 * smallest else 0.0
     return max(visible, float(np.quantile(uneven, _QUANTILE)))
