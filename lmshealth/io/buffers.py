@@ -6,9 +6,8 @@ from collections.abc import Callable, Iterator
 from typing import IO, ClassVar, cast
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io.refusal import Unusable
 
 # A minute at 20 kHz: longer columns stay on disk.
@@ -35,7 +34,6 @@ class Stored:
 
 
 Samples = FloatArray | Stored
-IntArray = NDArray[np.int64]
 NO_RANGES: IntArray = np.empty((0, 2), dtype=np.int64)
 
 

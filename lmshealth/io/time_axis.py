@@ -10,18 +10,9 @@ from typing import NamedTuple, Self
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import (
-    BLOCK,
-    NO_RANGES,
-    IntArray,
-    Samples,
-    Spool,
-    blocks,
-    runs,
-    smallest_step,
-)
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, runs, smallest_step
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
@@ -235,6 +226,8 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
 
     They are missing (NaN), or interpolated as those of a set point are.
     """
+    if not added.size:
+        return values
     spool = Spool(values.size + int(np.sum(added[:, 1] - added[:, 0])))
     taken = at = 0
     for start, stop in added.tolist():
@@ -385,7 +378,7 @@ def set_velocity(
     reach = _reach(position, pieces, sample_rate)
     velocity = Spool()
     for start, stop in pieces:
-        _fill(velocity, start)
+        velocity.append(np.broadcast_to(np.nan, (start - velocity.size,)))
         for at, block in blocks(position, start, stop):
             low, high = max(start, at - reach), min(stop, at + block.size + reach)
             around = position[low:high]
@@ -394,14 +387,8 @@ def set_velocity(
             after = np.minimum(index + reach, high - low - 1)
             before = np.maximum(index - reach, 0)
             velocity.append((around[after] - around[before]) * sample_rate / (after - before))
-    _fill(velocity, position.size)
+    velocity.append(np.broadcast_to(np.nan, (position.size - velocity.size,)))
     return velocity.samples()
-
-
-def _fill(velocity: Spool, stop: int) -> None:
-    """Append NaN up to a sample."""
-    for _, block in blocks(np.broadcast_to(np.nan, (stop,)), velocity.size):
-        velocity.append(block)
 
 
 def _reach(position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float) -> int:

@@ -9,9 +9,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, NO_RANGES, IntArray, Samples, blocks, runs
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import resolution, too_many
 

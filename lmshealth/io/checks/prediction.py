@@ -10,9 +10,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import IntArray, Samples, Spool, blocks, places
+from lmshealth.io.buffers import Samples, Spool, blocks, places
 
 # Samples of each of the places from which the model is estimated, frequencies at which the error of
 # filled samples is compared, and share of the sample rate up to which that is done.

@@ -1,22 +1,12 @@
 """Faults of a channel that its samples show: wrapped counters, single bad samples, lost signs."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import (
-    BLOCK,
-    NO_RANGES,
-    IntArray,
-    Samples,
-    Spool,
-    blocks,
-    places,
-    smallest_step,
-)
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, places, smallest_step
 from lmshealth.io.checks.channel_checks import Roughness
 from lmshealth.io.checks.prediction import Prediction, fit_prediction, within
 from lmshealth.io.refusal import Unusable
@@ -126,13 +116,11 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
         x[gone] = model.mean
         errors = model.errors(x)
         i = 0
-        while True:
+        while i < errors.size:
             lacks = gone[i + _ORDER : i + _ORDER + _STRIDE]
             off = (np.abs(errors[i : i + _STRIDE]) > whole / 2) | lacks
             if not off.any():
                 i += _STRIDE
-                if i >= errors.size:
-                    break
                 continue
             i += int(off.argmax())
             lacking = bool(gone[i + _ORDER])
@@ -185,17 +173,15 @@ def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
     if model is None:
         return NO_RANGES
     least = constants.SPIKE_LEVELS * smallest_step(values[:BLOCK])
-    starts = np.flatnonzero(np.diff(suspects, prepend=-_ORDER) > 3)
     found: list[_Spike] = []
     doubtful: list[_Spike] = []
     others, last = 0, -_BLOW
-    for a, b in pairwise([*starts.tolist(), suspects.size]):
-        one = _spike(values, missing, model, suspects[a:b], least)
+    for place in np.split(suspects, np.flatnonzero(np.diff(suspects) > 3) + 1):
+        one = _spike(values, missing, model, place, least)
         if one is not None:
             (found if one.clear else doubtful).append(one)
-            continue
-        if suspects[a] - last > _BLOW:
-            others, last = others + 1, int(suspects[a])
+        elif place[0] - last > _BLOW:
+            others, last = others + 1, int(place[0])
     # In white noise nothing goes on after a blow: there only outliers that stand alone are spikes.
     if not others and all(one.size > constants.SPIKE_ALONE for one in doubtful):
         found += doubtful
