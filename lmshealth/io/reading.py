@@ -32,6 +32,7 @@ from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import (
+    Ranges,
     TimeAxis,
     pieces,
     resampled,
@@ -43,7 +44,6 @@ from lmshealth.io.time_axis import (
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
-Ranges = tuple[tuple[int, int], ...]
 _REFERENCES: tuple[Role, ...] = ("reference_velocity", "reference_position")
 
 

@@ -16,6 +16,7 @@ from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, runs,
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
+Ranges = tuple[tuple[int, int], ...]
 # Time in s of samples, by their index, and its derivatives.
 Clock = Callable[..., FloatArray]
 
@@ -263,8 +264,8 @@ def _residual(
 
 
 def resampled(
-    columns: Sequence[tuple[Samples, bool]], ranges: Sequence[tuple[int, int]], axis: TimeAxis
-) -> tuple[list[Samples], tuple[tuple[int, int], ...]]:
+    columns: Sequence[tuple[Samples, bool]], ranges: Ranges, axis: TimeAxis
+) -> tuple[list[Samples], Ranges]:
     """Resample the pieces of columns of a varying rate to the rate of the axis.
 
     Signals by a windowed sinc that passes up to 0.45 of the rate; the others (second entry false)
@@ -309,9 +310,7 @@ def _kernel(place: FloatArray, density: FloatArray, half: int) -> tuple[FloatArr
     return weights / weights.sum(axis=1, keepdims=True), index
 
 
-def pieces(
-    n_samples: int, missing: Sequence[IntArray], breaks: IntArray
-) -> tuple[tuple[int, int], ...]:
+def pieces(n_samples: int, missing: Sequence[IntArray], breaks: IntArray) -> Ranges:
     """Cut a record into half-open ranges without gaps; single samples are left out.
 
     ``missing`` holds for each channel the half-open ranges in which it has no samples, shape
@@ -367,9 +366,7 @@ def resolution(time: Samples, relative: float = 0.0) -> float:
     return floating
 
 
-def set_velocity(
-    position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float
-) -> Samples:
+def set_velocity(position: Samples, pieces: Ranges, sample_rate: float) -> Samples:
     """Differentiate a set position piece by piece, never across a gap.
 
     The difference spans so many samples that the steps in which positions are stored do not show.
@@ -391,7 +388,7 @@ def set_velocity(
     return velocity.samples()
 
 
-def _reach(position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float) -> int:
+def _reach(position: Samples, pieces: Ranges, sample_rate: float) -> int:
     """Compute how many samples to either side the difference must span to hide the steps."""
     most = max(1, int(constants.LONGEST_REACH * sample_rate))
     step = fastest = 0.0

@@ -9,7 +9,7 @@ from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import too_many
+from lmshealth.io.time_axis import Ranges, too_many
 
 # Standard deviation of normal noise over the median of its magnitude, and samples of a block from
 # which the usual second difference is taken.
@@ -90,9 +90,7 @@ def check_signal(values: Samples) -> Roughness:
     return rough
 
 
-def independent(
-    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]], most: int
-) -> list[int]:
+def independent(columns: Sequence[Samples], ranges: Ranges, most: int) -> list[int]:
     """Order channels by what each adds to those before, by a pivoted Cholesky decomposition.
 
     Columns of ``(n_samples,)`` without missing samples in the half-open ranges. Return the indices
@@ -119,9 +117,7 @@ def independent(
     return order
 
 
-def magnitudes(
-    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]]
-) -> dict[int, list[int]]:
+def magnitudes(columns: Sequence[Samples], ranges: Ranges) -> dict[int, list[int]]:
     """Find channels that are the magnitude of others, each with the indices of these.
 
     With r = (x² + y² + z²)^½ - g the square of r is linear in r, x², y² and z², which have equal
