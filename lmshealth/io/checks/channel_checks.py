@@ -9,11 +9,12 @@ from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import Ranges, too_many
+from lmshealth.io.time_axis import too_many
 
 # Standard deviation of normal noise over the median of its magnitude, and samples of a block from
 # which the usual second difference is taken.
 _NORMAL, _SAMPLE = 1.4826, 1 << 12
+_Ranges = Sequence[tuple[int, int]]
 
 
 def missing_ranges(values: Samples, added: IntArray = NO_RANGES) -> tuple[IntArray, str]:
@@ -90,7 +91,7 @@ def check_signal(values: Samples) -> Roughness:
     return rough
 
 
-def independent(columns: Sequence[Samples], ranges: Ranges, most: int) -> list[int]:
+def independent(columns: Sequence[Samples], ranges: _Ranges, most: int) -> list[int]:
     """Order channels by what each adds to those before, by a pivoted Cholesky decomposition.
 
     Columns of ``(n_samples,)`` without missing samples in the half-open ranges. Return the indices
@@ -117,7 +118,7 @@ def independent(columns: Sequence[Samples], ranges: Ranges, most: int) -> list[i
     return order
 
 
-def magnitudes(columns: Sequence[Samples], ranges: Ranges) -> dict[int, list[int]]:
+def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[int]]:
     """Find channels that are the magnitude of others, each with the indices of these.
 
     With r = (x² + y² + z²)^½ - g the square of r is linear in r, x², y² and z², which have equal
