@@ -7,7 +7,7 @@ from typing import IO, ClassVar, cast
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io.refusal import Unusable
 
 # A minute at 20 kHz: longer columns stay on disk.
@@ -34,6 +34,7 @@ class Stored:
 
 
 Samples = FloatArray | Stored
+NO_RANGES: IntArray = np.empty((0, 2), dtype=np.int64)
 
 
 def blocks(
@@ -52,6 +53,24 @@ def blocks(
         begin = max(start, at - overlap)
         yield begin, samples[begin:following]
         at = following
+
+
+def places(size: int, length: int) -> list[int]:
+    """Return the starts of eight stretches of a length, evenly over a record of a size."""
+    starts = np.linspace(0, max(0, size - length), 8).astype(int)
+    return sorted(set(starts.tolist()))
+
+
+def runs(marked: BoolArray, at: int = 0) -> IntArray:
+    """Return the half-open ranges of marked samples, ``(n_ranges, 2)``; ``at`` is the first."""
+    edges = np.diff(marked.view(np.int8), prepend=0, append=0)
+    return np.flatnonzero(edges).reshape(-1, 2) + at
+
+
+def smallest_step(values: FloatArray) -> float:
+    """Return the smallest difference of two levels of samples ``(n,)``; 0 where there is none."""
+    apart = np.diff(np.unique(values[np.isfinite(values)]))
+    return float(apart.min()) if apart.size else 0.0
 
 
 class Spool:

@@ -25,8 +25,6 @@ Role = Literal[
     "displacement", "acceleration", "current", "reference_velocity", "reference_position", "time"
 ]
 
-STANDARD_GRAVITY = 9.80665
-
 _UNITS: dict[str, tuple[str, float]] = {
     "m": ("length", 1.0),
     "mm": ("length", 1e-3),
@@ -36,7 +34,7 @@ _UNITS: dict[str, tuple[str, float]] = {
     "mm_s": ("velocity", 1e-3),
     "m_s2": ("acceleration", 1.0),
     "mm_s2": ("acceleration", 1e-3),
-    "g": ("acceleration", STANDARD_GRAVITY),
+    "g": ("acceleration", 9.80665),
     "a": ("current", 1.0),
     "ma": ("current", 1e-3),
     "s": ("time", 1.0),

@@ -93,7 +93,7 @@ def find_logs(
     detail = "holds samples, and its suffix is not read; rename it to .csv, or move it out"
     refused = [Refusal(name_of(path, root), "skipped", detail) for path in skipped]
     detail = "manifest.csv lists it, and a hidden file or a table is no log; rename it"
-    others = (_name_in(path, root) for path in sorted(listed) if os.path.isfile(path))
+    others = (name_of(path, _absolute(root)) for path in sorted(listed) if os.path.isfile(path))
     refused += [Refusal(name, "bad-row", detail) for name in others if name not in named]
     return FileList(found.logs, (*found.refused, *refused))
 
@@ -141,11 +141,6 @@ def _merged(root: Path, found: FileList, *, follow_links: bool = False) -> Manif
 def name_of(path: Path, folder: Path) -> str:
     """Name a file relative to the folder of logs, as printable text."""
     return shown(path.relative_to(folder).as_posix())
-
-
-def _name_in(path: Path, root: Path) -> str:
-    """Name an absolute path relative to the folder of logs."""
-    return name_of(path, _absolute(root))
 
 
 def _absolute(path: Path) -> Path:
@@ -211,7 +206,7 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         if trouble:
             manifest.bad[log] = f"{place}: {trouble}"
         if not os.path.isfile(log):
-            yield Refusal(_name_in(log, root), "missing-file", f"{place} names no file")
+            yield Refusal(name_of(log, _absolute(root)), "missing-file", f"{place} names no file")
     if any(row.keys() >= {"stage", "recorded_at"} for row in own.values()):
         manifest.registers.add(_absolute(path.parent))
     for log, row in own.items():

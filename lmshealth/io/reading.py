@@ -10,27 +10,28 @@ from typing import NamedTuple, cast
 
 import numpy as np
 
+from lmshealth._private.arrays import IntArray
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.channel_checks import (
+from lmshealth.io.checks.channel_checks import (
     check_signal,
     independent,
     magnitudes,
     missing_ranges,
     roughness,
 )
+from lmshealth.io.checks.consistency import Findings, Motion, compare
+from lmshealth.io.checks.prediction import filled
+from lmshealth.io.checks.sample_faults import check_sign, coarse_levels, spikes, unwrapped
 from lmshealth.io.column_map import ColumnMap, Role, Signal
-from lmshealth.io.consistency import Findings, Motion, compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
 from lmshealth.io.metadata import parse_metadata
-from lmshealth.io.prediction import filled
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
-from lmshealth.io.sample_faults import check_sign, coarse_levels, spikes, unwrapped
 from lmshealth.io.time_axis import (
-    IntArray,
+    Ranges,
     TimeAxis,
     pieces,
     resampled,
@@ -42,7 +43,6 @@ from lmshealth.io.time_axis import (
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
 _DYNAMIC = ("displacement", "acceleration")
-Ranges = tuple[tuple[int, int], ...]
 _REFERENCES: tuple[Role, ...] = ("reference_velocity", "reference_position")
 
 
@@ -108,8 +108,9 @@ def read_log(
     used = ColumnMap() if columns is None else columns
     try:
         content = load(Path(path), used, max_memory)
-        metadata = parse_metadata(_stated(content, used, overrides), latest)
-        return _to_log(content, used, metadata, name=label, digest=digest)
+        filled_in = {key: value for key, value in (overrides or {}).items() if value.strip()}
+        stated = content.metadata | used.constants() | filled_in
+        return _to_log(content, used, parse_metadata(stated, latest), name=label, digest=digest)
     except Unusable as error:
         raise BadLog(label, error.reason, error.detail) from error
 
@@ -151,14 +152,6 @@ class _Series(NamedTuple):
     values: Samples
 
 
-def _stated(
-    content: Content, layout: ColumnMap, overrides: Mapping[str, str] | None
-) -> dict[str, str]:
-    """Merge the metadata of a file, of the column map and of a manifest."""
-    filled = {key: value for key, value in (overrides or {}).items() if value.strip()}
-    return content.metadata | layout.constants() | filled
-
-
 def _to_log(
     content: Content,
     layout: ColumnMap,
@@ -171,17 +164,18 @@ def _to_log(
     metadata, rate = parsed
     series = _series(content, layout)
     stamps = [item.values for item in series if item.signal.role == "time"]
-    axis = time_axis(stamps[0] if stamps else None, rate)
-    axis, added = axis.completed()
-    series = [_completed(item, added) for item in series]
-    refused = [replace(refusal, log=name) for refusal in content.refused]
-    if axis.note:
-        refused.append(Refusal(name, "gaps", axis.note, channel="time_s"))
+    axis, added = time_axis(stamps[0] if stamps else None, rate).completed()
+    # Missing samples are inserted where time lacks them, and those of a set point are interpolated.
+    series = [
+        _Series(signal, with_dropped(values, added, linear=signal.role in _REFERENCES))
+        for signal, values in series
+    ]
+    refused = [*content.refused, *_listed("time_s", {"gaps": axis.note})]
     missing: list[IntArray] = [axis.lost]
     channels = []
     for item in series:
         if item.signal.role in _MEASURED:
-            read = _measured(item, axis, added, name, refused)
+            read = _measured(item, axis, added, refused)
             if read is not None:
                 missing.append(read[1])
                 kind = cast(ChannelKind, item.signal.role)
@@ -189,16 +183,17 @@ def _to_log(
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
     references = [item for role in _REFERENCES for item in series if item.signal.role == role]
-    gone = _missing(references[0], name, refused) if references else None
+    gone = _missing(references[0], refused) if references else None
     if gone is not None:
         missing.append(gone)
     found = _compared(series, channels, metadata.velocity, axis)
-    refused += [Refusal(name, why, note, channel=channel) for why, channel, note in found.notes]
+    for why, channel, note in found.notes:
+        refused += _listed(channel, {why: note})
     breaks = np.union1d(axis.breaks, found.dropped)
     ranges = pieces(channels[0].values.size, [*missing, found.repeated], breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
-    channels = _without_copies(channels, ranges, name, refused)
+    channels = _without_copies(channels, ranges, refused)
     velocity = None if gone is None else references[0].values
     if axis.clocks:
         channels, velocity, ranges = _at_one_rate(channels, velocity, ranges, axis)
@@ -212,7 +207,7 @@ def _to_log(
         channels=tuple(channels),
         reference_velocity=velocity,
         pieces=ranges,
-        refused=tuple(refused),
+        refused=tuple(replace(refusal, log=name) for refusal in refused),
         guessed=content.guessed,
     )
 
@@ -280,29 +275,19 @@ def _check_signals(
         raise Unusable("columns", f"no signal: {_NEEDED}; {there}{step}")
 
 
-def _completed(item: _Series, added: IntArray) -> _Series:
-    """Insert the samples that time lacks; those of a set point are interpolated."""
-    if not added.size:
-        return item
-    return item._replace(
-        values=with_dropped(item.values, added, linear=item.signal.role in _REFERENCES)
-    )
-
-
-def _missing(item: _Series, name: str, refused: list[Refusal]) -> IntArray | None:
+def _missing(item: _Series, refused: list[Refusal]) -> IntArray | None:
     """Find the missing samples of a set point; None if it cannot be used, which is refused."""
     try:
         gone, note = missing_ranges(item.values)
     except Unusable as error:
-        refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
+        refused += _listed(item.signal.name, {error.reason: error.detail})
         return None
-    if note:
-        refused.append(Refusal(name, "gaps", note, channel=item.signal.name))
+    refused += _listed(item.signal.name, {"gaps": note})
     return gone
 
 
 def _measured(
-    item: _Series, axis: TimeAxis, added: IntArray, name: str, refused: list[Refusal]
+    item: _Series, axis: TimeAxis, added: IntArray, refused: list[Refusal]
 ) -> tuple[Samples, IntArray] | None:
     """Check the samples of a channel, and repair what is repaired exactly.
 
@@ -325,7 +310,7 @@ def _measured(
             gone = np.concatenate([gone, bad])
             gone = gone[np.argsort(gone[:, 0], kind="stable")]
     except Unusable as error:
-        refused.append(Refusal(name, error.reason, error.detail, channel=item.signal.name))
+        refused += _listed(item.signal.name, {error.reason: error.detail})
         return None
     values, left = filled(values, gone, axis.breaks)
     open_ones = f"{len(left)} of {len(gone)} ranges are not filled" if left.size else ""
@@ -333,11 +318,7 @@ def _measured(
         notes["gaps"] += f"; {open_ones or 'they are filled by linear prediction'}"
     else:
         notes["gaps"] = open_ones
-    refused += [
-        Refusal(name, reason, detail, channel=item.signal.name)
-        for reason, detail in notes.items()
-        if detail
-    ]
+    refused += _listed(item.signal.name, notes)
     return values, left
 
 
@@ -356,7 +337,7 @@ def _at_one_rate(
 
 
 def _without_copies(
-    channels: list[Channel], ranges: Sequence[tuple[int, int]], name: str, refused: list[Refusal]
+    channels: list[Channel], ranges: Ranges, refused: list[Refusal]
 ) -> list[Channel]:
     """Leave out channels of vibration that are combinations of the others, which are refused."""
     dynamic = [channel for channel in channels if channel.kind in _DYNAMIC]
@@ -364,13 +345,19 @@ def _without_copies(
     copies = [channel for k, channel in enumerate(dynamic) if k not in order]
     others = listed(dynamic[k].name for k in sorted(order))
     detail = f"is a multiple or combination of {others}; check whether a sensor is recorded twice"
-    refused += [Refusal(name, "dependent", detail, channel=copy.name) for copy in copies]
+    for copy in copies:
+        refused += _listed(copy.name, {"dependent": detail})
     rest = [one for one in channels if one.kind == "acceleration" and one not in copies]
     for k, axes in magnitudes([one.values for one in rest], ranges).items():
         what = f"is the magnitude of {listed(rest[j].name for j in axes)}, which are used"
-        refused.append(Refusal(name, "dependent", what, channel=rest[k].name))
+        refused += _listed(rest[k].name, {"dependent": what})
         copies.append(rest[k])
     return [channel for channel in channels if channel not in copies]
+
+
+def _listed(channel: str, found: Mapping[str, str]) -> list[Refusal]:
+    """Make refusals of a channel by reason and detail; `_to_log` adds the name of the log."""
+    return [Refusal("", why, detail, channel=channel) for why, detail in found.items() if detail]
 
 
 def _why(refused: list[Refusal]) -> str:

@@ -1,22 +1,22 @@
 """The time axis: sample rate, interruptions, resampling, and the set velocity of a set position.
 
-Samples are never sorted; `prediction` fills short gaps only (README.md, "Time").
+Samples are never sorted; `checks.prediction` fills short gaps only (README.md, "Time").
 """
 
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, runs, smallest_step
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
-IntArray = NDArray[np.int64]
+Ranges = tuple[tuple[int, int], ...]
 # Time in s of samples, by their index, and its derivatives.
 Clock = Callable[..., FloatArray]
 
@@ -44,7 +44,7 @@ class TimeAxis(NamedTuple):
     sample_rate: float
     breaks: IntArray
     note: str
-    lost: IntArray = np.empty((0, 2), dtype=np.int64)
+    lost: IntArray = NO_RANGES
     clocks: tuple[Clock, ...] = ()
     dropped: IntArray = np.empty(0, dtype=np.int64)
 
@@ -55,7 +55,7 @@ class TimeAxis(NamedTuple):
         """
         shift = np.concatenate([[0], np.cumsum(self.dropped)])
         if not self.dropped.any():
-            return self, np.empty((0, 2), dtype=np.int64)
+            return self, NO_RANGES
         known = self.dropped > 0
         start = (self.breaks + shift[:-1])[known]
         added = np.stack([start, start + self.dropped[known]], axis=1)
@@ -94,13 +94,10 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
             raise Unusable("time", f"{found}; needed increasing time stamps")
         return _axis(time, rate, step, 0.0)
     except Unusable:
-        if not coarse:
-            raise
         # Rounding to a step near the interval makes them unlike: the clock decides.
-        try:
-            return _axis(time, rate, step, step)
-        except Unusable:
-            pass
+        if coarse:
+            with suppress(Unusable):
+                return _axis(time, rate, step, step)
         raise
 
 
@@ -122,7 +119,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
             slopes += slope.tolist()
             lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
         clocks.append(clock)
-    gone = np.concatenate([*lost, np.empty((0, 2), dtype=np.int64)])
+    gone = np.concatenate([NO_RANGES, *lost])
     n_lost = int(np.sum(gone[:, 1] - gone[:, 0]))
     notes = [note] if note else []
     if n_lost:
@@ -230,6 +227,8 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
 
     They are missing (NaN), or interpolated as those of a set point are.
     """
+    if not added.size:
+        return values
     spool = Spool(values.size + int(np.sum(added[:, 1] - added[:, 0])))
     taken = at = 0
     for start, stop in added.tolist():
@@ -248,13 +247,13 @@ def _residual(
     time: Samples, stretch: tuple[int, int], clock: Clock, interval: float, step: float
 ) -> IntArray:
     """Find the ranges of samples whose stamps are off the clock; refuse periodic jitter."""
-    found = [np.empty((0, 2), dtype=np.int64)]
+    found = [NO_RANGES]
     for at, stamps in blocks(time, *stretch):
         error = stamps - clock(np.arange(at, at + stamps.size))
         if np.ptp(error) <= _ROUNDING * step:
             continue
         off = np.abs(error) > constants.JITTER * interval + step / 2
-        found.append(np.flatnonzero(np.diff(off, prepend=False, append=False)).reshape(-1, 2) + at)
+        found.append(runs(off, at))
         error[off] = 0
         line = 2 * np.abs(np.fft.rfft(error - error.mean())).max() / error.size
         by_chance = 2 * error.std() * np.sqrt((np.log(error.size) + _CHANCE) / error.size)
@@ -265,8 +264,8 @@ def _residual(
 
 
 def resampled(
-    columns: Sequence[tuple[Samples, bool]], ranges: Sequence[tuple[int, int]], axis: TimeAxis
-) -> tuple[list[Samples], tuple[tuple[int, int], ...]]:
+    columns: Sequence[tuple[Samples, bool]], ranges: Ranges, axis: TimeAxis
+) -> tuple[list[Samples], Ranges]:
     """Resample the pieces of columns of a varying rate to the rate of the axis.
 
     Signals by a windowed sinc that passes up to 0.45 of the rate; the others (second entry false)
@@ -311,15 +310,13 @@ def _kernel(place: FloatArray, density: FloatArray, half: int) -> tuple[FloatArr
     return weights / weights.sum(axis=1, keepdims=True), index
 
 
-def pieces(
-    n_samples: int, missing: Sequence[IntArray], breaks: IntArray
-) -> tuple[tuple[int, int], ...]:
+def pieces(n_samples: int, missing: Sequence[IntArray], breaks: IntArray) -> Ranges:
     """Cut a record into half-open ranges without gaps; single samples are left out.
 
     ``missing`` holds for each channel the half-open ranges in which it has no samples, shape
     ``(n, 2)``; ``breaks`` the samples before which time is interrupted, ascending.
     """
-    gone = np.concatenate([*missing, np.empty((0, 2), dtype=np.int64)])
+    gone = np.concatenate([NO_RANGES, *missing])
     gone = gone[np.argsort(gone[:, 0], kind="stable")]
     # A piece begins where all missing ranges so far have ended.
     start = np.concatenate([[0], np.maximum.accumulate(gone[:, 1])])
@@ -369,9 +366,7 @@ def resolution(time: Samples, relative: float = 0.0) -> float:
     return floating
 
 
-def set_velocity(
-    position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float
-) -> Samples:
+def set_velocity(position: Samples, pieces: Ranges, sample_rate: float) -> Samples:
     """Differentiate a set position piece by piece, never across a gap.
 
     The difference spans so many samples that the steps in which positions are stored do not show.
@@ -380,7 +375,7 @@ def set_velocity(
     reach = _reach(position, pieces, sample_rate)
     velocity = Spool()
     for start, stop in pieces:
-        _fill(velocity, start)
+        velocity.append(np.broadcast_to(np.nan, (start - velocity.size,)))
         for at, block in blocks(position, start, stop):
             low, high = max(start, at - reach), min(stop, at + block.size + reach)
             around = position[low:high]
@@ -389,17 +384,11 @@ def set_velocity(
             after = np.minimum(index + reach, high - low - 1)
             before = np.maximum(index - reach, 0)
             velocity.append((around[after] - around[before]) * sample_rate / (after - before))
-    _fill(velocity, position.size)
+    velocity.append(np.broadcast_to(np.nan, (position.size - velocity.size,)))
     return velocity.samples()
 
 
-def _fill(velocity: Spool, stop: int) -> None:
-    """Append NaN up to a sample."""
-    for _, block in blocks(np.broadcast_to(np.nan, (stop,)), velocity.size):
-        velocity.append(block)
-
-
-def _reach(position: Samples, pieces: Sequence[tuple[int, int]], sample_rate: float) -> int:
+def _reach(position: Samples, pieces: Ranges, sample_rate: float) -> int:
     """Compute how many samples to either side the difference must span to hide the steps."""
     most = max(1, int(constants.LONGEST_REACH * sample_rate))
     step = fastest = 0.0
@@ -418,7 +407,6 @@ def _step(block: FloatArray) -> float:
     """Estimate the step of stored positions in m from the second differences."""
     uneven = np.abs(np.diff(block, 2))
     # At a velocity of a whole number of steps per sample only few differences are uneven.
-    apart = np.diff(np.unique(block))
-    smallest = float(apart.min()) if apart.size else 0.0
+    smallest = smallest_step(block)
     visible = smallest if float(uneven.max()) > 0.5 * smallest else 0.0
     return max(visible, float(np.quantile(uneven, _QUANTILE)))

@@ -5,20 +5,18 @@ x_t = Σ φ_k x_{t-k} + e_t with white e of variance σ²; a = (1, -φ). The mis
 matrix of b_l = Σ a_k a_{k+l} [Janssen1986]. README.md, "Missing samples".
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 import numpy as np
 
-from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool, blocks
-from lmshealth.io.time_axis import IntArray
+from lmshealth.io.buffers import Samples, Spool, blocks, places
 
 # Samples of each of the places from which the model is estimated, frequencies at which the error of
 # filled samples is compared, and share of the sample rate up to which that is done.
-_PLACE, _N_PLACES, _N_FREQUENCIES, _USABLE = 1 << 13, 8, 129, 0.45
+_PLACE, _N_FREQUENCIES, _USABLE = 1 << 13, 129, 0.45
 _ORDER = constants.PREDICTION_ORDER
 
 
@@ -74,17 +72,14 @@ def fit_prediction(values: Samples, bad: IntArray) -> Prediction | None:
 
     ``bad`` are ascending half-open ranges, ``(n_ranges, 2)``; None where too few windows remain.
     """
-    starts = np.unique(np.linspace(0, max(0, values.size - _PLACE), _N_PLACES).astype(int))
-    parts = [(at, values[at : min(at + _PLACE, values.size)]) for at in starts.tolist()]
+    if values.size <= constants.PREDICTION_SAMPLES:
+        return None
+    parts = [(at, values[at : at + _PLACE]) for at in places(values.size, _PLACE)]
     usable = [(x, ~within(bad, at, x.size)) for at, x in parts]
     n = sum(int(good.sum()) for _, good in usable)
-    if n <= constants.PREDICTION_SAMPLES:
-        return None
-    mean = float(sum(x[good].sum() for x, good in usable) / n)
+    mean = float(sum(x[good].sum() for x, good in usable) / max(n, 1))
     gram, rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
     for x, good in usable:
-        if x.size <= _ORDER:
-            continue
         whole = np.convolve(~good, np.ones(_ORDER + 1), "valid") < 0.5
         window = np.lib.stride_tricks.sliding_window_view(x - mean, _ORDER + 1)[whole]
         gram += window.T @ window
@@ -120,53 +115,41 @@ def filled(values: Samples, missing: IntArray, breaks: IntArray) -> tuple[Sample
     model = fit_prediction(values, missing) if short.any() else None
     if model is None:
         return values, missing
-    order = np.sort(size[short]).tolist()
-    allowed = model.error_shares(order, values.size) <= constants.FILLED_ERROR
-    longest = max((n for n, fits in zip(order, allowed, strict=True) if fits), default=0)
+    order = np.sort(size[short])
+    refused = ~(model.error_shares(order.tolist(), values.size) <= constants.FILLED_ERROR)
     # Of equal lengths all are filled, or none.
-    if not all(fits for n, fits in zip(order, allowed, strict=True) if n == longest):
-        longest = max((n for n in order if n < longest), default=0)
-    short = size <= longest
+    short &= size < order[refused].min(initial=constants.LONGEST_FILLED + 1)
+    if not short.any():
+        return values, missing
     blocked = np.concatenate([missing[~short], np.stack([breaks, breaks], axis=1)])
-    places: list[tuple[int, FloatArray]] = []
-    left = [missing[~short]]
-    for group in _clusters(missing[short]):
+    where, what, left = [], [], [missing[~short]]
+    # Gaps that lie less than the order from each other are filled together.
+    gaps = missing[short]
+    apart = np.flatnonzero(gaps[1:, 0] - gaps[:-1, 1] >= _ORDER) + 1
+    for group in np.split(gaps, apart):
         first, last = int(group[0, 0]) - _ORDER, int(group[-1, 1]) + _ORDER
         inside = first >= 0 and last <= values.size
         if inside and not ((blocked[:, 0] < last) & (blocked[:, 1] > first)).any():
             x = values[first:last].copy()
             unknown = np.concatenate([np.arange(a, b) for a, b in group - first])
-            x[unknown] = 0.0
             x[unknown] = model.expected(x, unknown)
             if (model.errors(x) ** 2).max() < constants.ORDINARY**2 * model.variance:
-                places.append((first, x))
+                where.append(first + unknown)
+                what.append(x[unknown])
                 continue
         left.append(group)
     rest = np.concatenate(left)
-    return _replaced(values, places), rest[np.argsort(rest[:, 0], kind="stable")]
+    if where:
+        values = _replaced(values, np.concatenate(where), np.concatenate(what))
+    return values, rest[np.argsort(rest[:, 0], kind="stable")]
 
 
-def _clusters(gaps: IntArray) -> Iterator[IntArray]:
-    """Yield gaps that lie less than the order from each other together."""
-    apart = np.flatnonzero(gaps[1:, 0] - gaps[:-1, 1] >= _ORDER) + 1
-    for a, b in pairwise([0, *apart.tolist(), len(gaps)]):
-        if a < b:
-            yield gaps[a:b]
-
-
-def _replaced(values: Samples, places: Sequence[tuple[int, FloatArray]]) -> Samples:
-    """Return samples with the stretches from some ascending indices on replaced."""
-    if not places:
-        return values
+def _replaced(values: Samples, where: IntArray, what: FloatArray) -> Samples:
+    """Return samples of which those of ascending indices are replaced."""
     spool = Spool(values.size)
-    starts = np.array([first for first, _ in places])
     for at, block in blocks(values):
         part = block.copy()
-        longest = max(x.size for _, x in places)
-        low, high = np.searchsorted(starts, [at - longest, at + block.size])
-        for first, x in places[low:high]:
-            a, b = max(first, at), min(first + x.size, at + block.size)
-            if a < b:
-                part[a - at : b - at] = x[a - first : b - first]
+        own = slice(*np.searchsorted(where, [at, at + block.size]))
+        part[where[own] - at] = what[own]
         spool.append(part)
     return spool.samples()

@@ -1,36 +1,33 @@
 """Checks of channels: missing samples, constant value, clipping, linear dependence."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, blocks
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import IntArray, too_many
+from lmshealth.io.time_axis import too_many
 
 # Standard deviation of normal noise over the median of its magnitude, and samples of a block from
 # which the usual second difference is taken.
 _NORMAL, _SAMPLE = 1.4826, 1 << 12
-_NONE: IntArray = np.empty((0, 2), dtype=np.int64)
+_Ranges = Sequence[tuple[int, int]]
 
 
-def missing_ranges(values: Samples, added: IntArray = _NONE) -> tuple[IntArray, str]:
+def missing_ranges(values: Samples, added: IntArray = NO_RANGES) -> tuple[IntArray, str]:
     """Find the missing samples (NaN, infinite or absurd) of a channel, ``(n_samples,)`` in SI.
 
     Return half-open ranges in which every sample is missing, ascending, ``(n_ranges, 2)``, and
     their counts as a text, empty if nothing is missing. `Unusable` (``missing-samples``) where they
     are so many that they would cut the other channels to pieces.
     """
-    found = [np.empty(0, dtype=np.int64)]
-    for at, block in blocks(values):
-        missing = ~(np.abs(block) < constants.LARGEST_MAGNITUDE)
-        if missing.any():
-            edges = np.diff(missing.view(np.int8), prepend=0, append=0)
-            found.append(np.flatnonzero(edges) + at)
-    bounds = np.concatenate(found)
+    found = [
+        runs(~(np.abs(block) < constants.LARGEST_MAGNITUDE), at) for at, block in blocks(values)
+    ]
+    bounds = np.concatenate(found, axis=None)
     # A range that ends at the edge of a block continues in the next.
     twice = np.flatnonzero(np.diff(bounds) == 0)
     bounds = np.delete(bounds, np.concatenate([twice, twice + 1]))
@@ -94,9 +91,7 @@ def check_signal(values: Samples) -> Roughness:
     return rough
 
 
-def independent(
-    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]], most: int
-) -> list[int]:
+def independent(columns: Sequence[Samples], ranges: _Ranges, most: int) -> list[int]:
     """Order channels by what each adds to those before, by a pivoted Cholesky decomposition.
 
     Columns of ``(n_samples,)`` without missing samples in the half-open ranges. Return the indices
@@ -123,9 +118,7 @@ def independent(
     return order
 
 
-def magnitudes(
-    columns: Sequence[Samples], ranges: Sequence[tuple[int, int]]
-) -> dict[int, list[int]]:
+def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[int]]:
     """Find channels that are the magnitude of others, each with the indices of these.
 
     With r = (x² + y² + z²)^½ - g the square of r is linear in r, x², y² and z², which have equal
@@ -160,16 +153,6 @@ def _regression(
     return weights, float(rest @ rest) / total if total else 1.0
 
 
-def _measured(values: Samples) -> Iterator[FloatArray]:
-    """Yield the samples block by block, without the missing ones."""
-    for _, block in blocks(values):
-        there = np.abs(block) < constants.LARGEST_MAGNITUDE
-        if there.all():
-            yield block
-        elif there.any():
-            yield block[there]
-
-
 def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     """Count the samples at the maximum that clipping explains (README.md, "Method"), else 0.
 
@@ -177,11 +160,11 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     """
     n_at = n_adjacent = 0
     below = low
-    for block in _measured(values):
+    for _, block in blocks(values):
+        block = block[np.isfinite(block)]
         at = block == sign * high
-        n_block = int(np.count_nonzero(at))
-        n_at += n_block
-        n_adjacent += int(np.count_nonzero(at[1:] & at[:-1])) if n_block else 0
+        n_at += int(np.count_nonzero(at))
+        n_adjacent += int(np.count_nonzero(at[1:] & at[:-1]))
         below = max(below, float(np.max(sign * block, where=~at, initial=low)))
     if n_at < max(constants.FEWEST_STUCK, constants.CLIPPED_SHARE / 2 * values.size):
         return 0
@@ -189,5 +172,5 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     if n_adjacent < constants.ADJACENT_SHARE * n_at or high - low < constants.FEWEST_LEVELS * step:
         return 0
     floor = high - (constants.LEVELS_BELOW + 0.5) * step
-    n_below = sum(int(np.count_nonzero(sign * b > floor)) for b in _measured(values)) - n_at
+    n_below = sum(int(np.count_nonzero(sign * b > floor)) for _, b in blocks(values)) - n_at
     return n_at if n_at > constants.CLIPPING_RATIO * n_below else 0

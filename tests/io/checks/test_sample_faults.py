@@ -4,9 +4,15 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lmshealth.io.channel_checks import magnitudes, roughness
+from lmshealth.io.checks.channel_checks import magnitudes, roughness
+from lmshealth.io.checks.sample_faults import (
+    check_sign,
+    coarse_levels,
+    level_step,
+    spikes,
+    unwrapped,
+)
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.sample_faults import check_sign, coarse_levels, level_step, spikes, unwrapped
 
 NONE = np.empty((0, 2), dtype=np.int64)
 N = 30_000

@@ -1,17 +1,15 @@
 """Faults of a channel that its samples show: wrapped counters, single bad samples, lost signs."""
 
-from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, Spool, blocks
-from lmshealth.io.channel_checks import Roughness
-from lmshealth.io.prediction import Prediction, fit_prediction, within
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, places, smallest_step
+from lmshealth.io.checks.channel_checks import Roughness
+from lmshealth.io.checks.prediction import Prediction, fit_prediction, within
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import IntArray
 
 _ORDER = constants.PREDICTION_ORDER
 # Samples over which what follows a blow is one with it.
@@ -58,7 +56,7 @@ def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Sam
     largest = float(np.sqrt(2 * np.log(values.size))) + constants.WRAP_BEND
     if rough.step <= span / 2 or rough.bend <= largest * rough.usual:
         return values, ""
-    jumps = _jumps(values, span / 2)
+    jumps = _beyond(values, 1, span / 2)
     bad = np.concatenate([missing, np.stack([jumps, jumps + 1], axis=1)])
     model = fit_prediction(values, bad)
     step = level_step(values)
@@ -93,11 +91,15 @@ def _refuse_unknown(values: Samples, jumps: IntArray, model: Prediction, span: f
         raise Unusable("wrapped", f"{found}; {needed}")
 
 
-def _jumps(values: Samples, limit: float) -> IntArray:
-    """Return the samples that differ by more than a limit from the one before."""
-    found = [np.empty(0, dtype=np.int64)]
-    for at, block in blocks(values, overlap=1):
-        found.append(np.flatnonzero(np.abs(np.diff(block)) > limit) + at + 1)
+def _beyond(values: Samples, order: int, limit: float) -> IntArray:
+    """Return the samples whose first or second difference exceeds a limit.
+
+    The first is that from the sample before, the second that from both beside it.
+    """
+    found = [
+        np.flatnonzero(np.abs(np.diff(block, order)) > limit) + at + 1
+        for at, block in blocks(values, overlap=order)
+    ]
     return np.unique(np.concatenate(found))
 
 
@@ -114,13 +116,11 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
         x[gone] = model.mean
         errors = model.errors(x)
         i = 0
-        while True:
+        while i < errors.size:
             lacks = gone[i + _ORDER : i + _ORDER + _STRIDE]
             off = (np.abs(errors[i : i + _STRIDE]) > whole / 2) | lacks
             if not off.any():
                 i += _STRIDE
-                if i >= errors.size:
-                    break
                 continue
             i += int(off.argmax())
             lacking = bool(gone[i + _ORDER])
@@ -163,37 +163,32 @@ def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
     The signal itself is as its linear prediction expects it after and before them; a blow instead
     goes on in it. ``missing`` are ascending half-open ranges, and so is the result, ``(n, 2)``.
     """
-    none = np.empty((0, 2), dtype=np.int64)
     if rough.bend <= constants.SUSPECT * rough.usual:
-        return none
-    suspects = _suspects(values, constants.SUSPECT * rough.usual)
+        return NO_RANGES
+    suspects = _beyond(values, 2, constants.SUSPECT * rough.usual)
     if not suspects.size or suspects.size > 3 * constants.MOST_SPIKES * values.size:
-        return none
+        return NO_RANGES
     bad = np.concatenate([missing, np.stack([suspects - 1, suspects + 2], axis=1)])
     model = fit_prediction(values, bad)
     if model is None:
-        return none
-    sample = np.unique(values[:BLOCK])
-    apart = np.diff(sample[np.isfinite(sample)])
-    least = constants.SPIKE_LEVELS * float(apart.min(initial=np.inf) if apart.size else 0.0)
-    starts = np.flatnonzero(np.diff(suspects, prepend=-_ORDER) > 3)
+        return NO_RANGES
+    least = constants.SPIKE_LEVELS * smallest_step(values[:BLOCK])
     found: list[_Spike] = []
     doubtful: list[_Spike] = []
     others, last = 0, -_BLOW
-    for a, b in pairwise([*starts.tolist(), suspects.size]):
-        one = _spike(values, missing, model, suspects[a:b], least)
+    for place in np.split(suspects, np.flatnonzero(np.diff(suspects) > 3) + 1):
+        one = _spike(values, missing, model, place, least)
         if one is not None:
             (found if one.clear else doubtful).append(one)
-            continue
-        if suspects[a] - last > _BLOW:
-            others, last = others + 1, int(suspects[a])
+        elif place[0] - last > _BLOW:
+            others, last = others + 1, int(place[0])
     # In white noise nothing goes on after a blow: there only outliers that stand alone are spikes.
     if not others and all(one.size > constants.SPIKE_ALONE for one in doubtful):
         found += doubtful
     energy = sum(one.energy for one in found)
     few = len(found) < constants.SPIKE_SHARE * others
     if few or energy < constants.SPIKE_ENERGY * values.size:
-        return none
+        return NO_RANGES
     ranges = np.array([one.samples for one in found], dtype=np.int64)
     return ranges[np.argsort(ranges[:, 0])]
 
@@ -210,14 +205,6 @@ class _Spike(NamedTuple):
     clear: bool
 
 
-def _suspects(values: Samples, limit: float) -> IntArray:
-    """Return the samples whose second difference exceeds a limit."""
-    found = [np.empty(0, dtype=np.int64)]
-    for at, block in blocks(values, overlap=2):
-        found.append(np.flatnonzero(np.abs(np.diff(block, 2)) > limit) + at + 1)
-    return np.unique(np.concatenate(found))
-
-
 def _spike(
     values: Samples, missing: IntArray, model: Prediction, suspects: IntArray, least: float
 ) -> _Spike | None:
@@ -229,9 +216,7 @@ def _spike(
     gone = np.flatnonzero(within(missing, first, x.size))
     if gone.size and (gone[0] < _ORDER or gone[-1] >= x.size - _ORDER):
         return None
-    x[gone] = 0.0
-    if gone.size:
-        x[gone] = model.expected(x, gone)
+    x[gone] = model.expected(x, gone)
     errors = model.errors(x) ** 2 / model.variance
     for n in (1, 2):
         tried = []
@@ -287,8 +272,8 @@ def check_sign(values: Samples, rough: Roughness) -> None:
 
 def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:
     """Return whether a channel comes near its edge throughout; a drift is there for a while."""
-    n = max(constants.LEVEL_SAMPLES // 8, 1)
-    for at in np.linspace(0, max(0, values.size - n), 8).astype(int).tolist():
+    n = constants.LEVEL_SAMPLES // 8
+    for at in places(values.size, n):
         x = values[at : at + n] if is_lower else -values[at : at + n]
         if np.isfinite(x).any() and np.nanmin(x) - low > (middle - low) / 2:
             return False
@@ -320,6 +305,5 @@ def coarse_levels(values: Samples) -> str:
 def _sample(values: Samples, most: int) -> FloatArray:
     """Return so many samples of eight places at most, without the missing ones."""
     n = most // 8
-    starts = np.unique(np.linspace(0, max(0, values.size - n), 8).astype(int)).tolist()
-    x = np.concatenate([values[at : at + n] for at in starts])
+    x = np.concatenate([values[at : at + n] for at in places(values.size, n)])
     return np.asarray(x[np.isfinite(x)])

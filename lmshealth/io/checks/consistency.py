@@ -9,11 +9,11 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, blocks
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
-from lmshealth.io.time_axis import IntArray, resolution, too_many
+from lmshealth.io.time_axis import resolution, too_many
 
 # Samples per block of displacement; blocks that are joined; fewest of them in motion that a rate is
 # computed from; standard error at which it is exact enough.
@@ -157,8 +157,8 @@ def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
     if not size.any():
         return 0.0, 0.0
     moving = size > constants.MOVING * np.quantile(size[size > 0], 0.9)
-    edges = np.flatnonzero(np.diff(moving, prepend=False, append=False)).reshape(-1, 2)
-    start, stop = edges[np.argmax(edges[:, 1] - edges[:, 0])] * _LENGTH
+    motions = runs(moving)
+    start, stop = motions[np.argmax(motions[:, 1] - motions[:, 0])] * _LENGTH
     middle = max(start, (start + stop - _STRETCH) // 2)
     stretch = position[middle : min(stop, middle + _STRETCH) + 1]
     apart = np.abs(np.diff(stretch))
@@ -336,9 +336,11 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
 
     Samples are selected by their own hash, so that a copy of a stretch has those of the original.
     """
-    values = _finest(measured)
-    if values is None:
-        return np.empty((0, 2), dtype=np.int64)
+    middle = measured[0].size // 2
+    levels = [np.unique(one[middle : middle + 512]).size for one in measured]
+    if max(levels) < constants.FEWEST_LEVELS:
+        return NO_RANGES
+    values = measured[int(np.argmax(levels))]
     size = values.size
     found: list[tuple[int, int]] = []
     end, periodic = 0, 0
@@ -356,14 +358,6 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
     return np.array([] if periodic > size / 2 else found, dtype=np.int64).reshape(-1, 2)
 
 
-def _finest(measured: Sequence[Samples]) -> Samples | None:
-    """Return the channel of most levels; None where the finest is too coarse."""
-    middle = measured[0].size // 2
-    levels = [np.unique(one[middle : middle + 512]).size for one in measured]
-    k = int(np.argmax(levels))
-    return measured[k] if levels[k] >= constants.FEWEST_LEVELS else None
-
-
 def _alike(values: Samples) -> Iterator[tuple[int, int]]:
     """Yield samples whose next ones probably equal those a lag before, ascending, with the lag."""
     keys, places = [], []
@@ -376,11 +370,8 @@ def _alike(values: Samples) -> Iterator[tuple[int, int]]:
         keys.append(key)
         places.append(at + k)
     key, place = np.concatenate(keys), np.concatenate(places)
-    # The order of selection replaces the last bits, so that one fast sort finds equal keys.
-    n_bits = np.uint64(max(place.size, 2).bit_length())
-    key = np.sort((key >> n_bits << n_bits) | np.arange(place.size, dtype=np.uint64))
-    same = np.flatnonzero((key[1:] ^ key[:-1]) >> n_bits == 0)
-    order = (key & ((np.uint64(1) << n_bits) - np.uint64(1))).astype(np.int64)
+    order = np.argsort(key, kind="stable")
+    same = np.flatnonzero(np.diff(key[order]) == 0)
     first, second = place[order[same]], place[order[same + 1]]
     for k in np.argsort(second):
         yield int(second[k]), int(second[k] - first[k])
