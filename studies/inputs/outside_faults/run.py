@@ -30,7 +30,7 @@ from studies.harness.claims import Claim
 from studies.harness.study import Row, Study
 from studies.inputs.outside_faults.case import Case, Program
 
-SCRIPTS = ("run", "case", "figure")
+SCRIPTS = ("run", "case", "no_logs")
 
 EACH = 6  # of the cases of the quick form
 SIDES = ("fault", "control")
