@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable, Iterator
-from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
@@ -49,9 +48,6 @@ def _missing(name: str) -> str | None:
         except PdfError as error:
             return str(error)
         return None
-    if name == "peers":
-        missing = [module for module in ("pyoma2", "pyOMA") if find_spec(module) is None]
-        return f"{' and '.join(missing)}: pip install '.[peers]'" if missing else None
     if name == "postgres":
         return servers.missing_postgres()
     if name == "distributed":

@@ -280,7 +280,7 @@ class Textbook:
                     h[a, at["jump f", j, one.mode]] = h[r + a, at["jump z", j, one.mode]] = 1
         return h
 
-    def told(self) -> FloatArray:
+    def observed(self) -> FloatArray:
         """Give the contrasts that make ln f, ln ζ and drift of a state."""
         c = np.zeros((3, len(self.history.modes), len(self.at)))
         for i, mode in enumerate(self.history.modes):
@@ -293,7 +293,7 @@ class Textbook:
 def kalman(history: History, wander: Wander, known: Known) -> Followed:
     """Filter by the five textbook equations."""
     book = Textbook(history, wander, known)
-    (x, p), told, evidence = book.prior(), book.told(), 0.0
+    (x, p), observed, evidence = book.prior(), book.observed(), 0.0
     out = []
     for k in range(len(history.logs)):
         f, q = book.moved(k)
@@ -308,7 +308,9 @@ def kalman(history: History, wander: Wander, known: Known) -> Followed:
             nis = float(innovation @ np.linalg.solve(s, innovation))
             evidence += float(stats.multivariate_normal.logpdf(innovation, cov=s))
             x, p = x + gain @ innovation, p - gain @ h @ p
-        out.append((told @ x, np.einsum("pia,ab,qjb->piqj", told, p, told), evidence, nis))
+        out.append(
+            (observed @ x, np.einsum("pia,ab,qjb->piqj", observed, p, observed), evidence, nis)
+        )
     return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
 
@@ -316,7 +318,7 @@ def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
     """Filter by filterpy, log by log."""
     book = Textbook(history, wander, known)
     kalman = KalmanFilter(dim_x=len(book.names), dim_z=1)
-    (kalman.x, kalman.P), told, evidence = book.prior(), book.told(), 0.0
+    (kalman.x, kalman.P), observed, evidence = book.prior(), book.observed(), 0.0
     out = []
     for k in range(len(history.logs)):
         f, q = book.moved(k)
@@ -326,8 +328,8 @@ def filterpy_loop(history: History, wander: Wander, known: Known) -> Followed:
         if rows.size:
             kalman.update(y, R=r, H=book.seen(k)[rows])
             nis, evidence = float(kalman.mahalanobis) ** 2, evidence + float(kalman.log_likelihood)
-        cov = np.einsum("pia,ab,qjb->piqj", told, kalman.P, told)
-        out.append((told @ kalman.x, cov, evidence, nis))
+        cov = np.einsum("pia,ab,qjb->piqj", observed, kalman.P, observed)
+        out.append((observed @ kalman.x, cov, evidence, nis))
     return Followed(*(np.array(part) for part in zip(*out, strict=True)))
 
 
@@ -431,11 +433,11 @@ def batch(history: History, wander: Wander, known: Known, *, smoothed: bool = Fa
         mean = prior + cross[:, use] @ solved[:, 0]
         cov = own - cross[:, use] @ solved[:, 1:]
         base = max([b for b in history.baselines if b <= k], default=0)
-        told = np.zeros((3, m, n, 2, m))
+        observed = np.zeros((3, m, n, 2, m))
         for i in range(m):
-            told[0, i, k, 0, i] = told[1, i, k, 1, i] = told[2, i, k, 0, i] = 1
-            told[2, i, base, 0, i] -= 1
-        flat = told.reshape(3 * m, -1)
+            observed[0, i, k, 0, i] = observed[1, i, k, 1, i] = observed[2, i, k, 0, i] = 1
+            observed[2, i, base, 0, i] -= 1
+        flat = observed.reshape(3 * m, -1)
         evidence = -0.5 * (off[use] @ solved[:, 0] + log_det + use.size * np.log(2 * np.pi))
         out.append(
             (

@@ -22,8 +22,8 @@ SYSTEM = {"chown", "fork", "forkpty", "geteuid", "getloadavg", "getpgid", "getui
           "killpg", "mkfifo", "nice", "openpty", "register_at_fork", "sched_getaffinity", "setsid",
           "sysconf", "uname", "wait4", "WNOHANG"}  # fmt: skip
 # Modules of extras that the workflow `compat` does not install.
-EXTRAS = {"apprise", "bokeh", "ipykernel", "jupytext", "nbclient", "nbconvert", "pooch", "psycopg",
-          "weasyprint"}  # fmt: skip
+EXTRAS = {"apprise", "weasyprint", "ipykernel", "jupytext", "nbclient", "nbconvert", "pooch",
+          "psycopg"}  # fmt: skip
 
 
 def _without(module: ModuleType, names: Iterable[str]) -> ModuleType:

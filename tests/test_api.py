@@ -83,7 +83,7 @@ def test_no_other_name_is_found() -> None:
 
 
 @pytest.mark.parametrize("name", lmshealth.__all__)
-def test_every_name_is_typed_and_told(name: str) -> None:
+def test_every_name_is_typed_and_documented(name: str) -> None:
     """Every parameter and every result has a type, and every name says what it is for."""
     found = getattr(lmshealth, name)
     assert inspect.getdoc(found)

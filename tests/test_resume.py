@@ -35,7 +35,7 @@ def scaled(number):
     return SCALE * number / 3  # no round number
 
 
-def told(rows):
+def outcomes(rows):
     return len(rows)
 '''
 TASKS = [("a", k) for k in range(5)] + [("b", 0)]

@@ -11,12 +11,12 @@ from typing import Any, NamedTuple, TypeVar
 
 from numpy.linalg import LinAlgError
 
+from lmshealth._private.seeds import seed_of
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.batch.workers import Pool
 from lmshealth.errors import LmshealthError
-from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import Epoch, epochs_to_infer, infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.io.log import Notice

@@ -12,11 +12,11 @@ from msgspec.structs import replace
 from numpy.linalg import LinAlgError
 
 from lmshealth._private.files import write_draws, write_text
+from lmshealth._private.seeds import seed_of
 from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
 from lmshealth.errors import BadTable, NotConverged, NotEnoughData
-from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.health.inference import epochs_to_infer, infer_together
 from lmshealth.health.inference import infer as infer_health
 from lmshealth.health.results import Health

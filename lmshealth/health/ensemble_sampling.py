@@ -1,9 +1,8 @@
-"""Markov chain Monte Carlo: independent emcee ensembles, seeds, starts, convergence."""
+"""Markov chain Monte Carlo: independent emcee ensembles, starts, convergence."""
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -51,17 +50,6 @@ def thin(draws: FloatArray, n: int) -> FloatArray:
     """Take n evenly spaced draws along the second axis."""
     index = np.linspace(0, draws.shape[1] - 1, n).round().astype(int)
     return np.asarray(draws[:, index])
-
-
-def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
-    """Return the random stream of a step of the computation."""
-    return np.random.SeedSequence([*np.atleast_1d(seed).tolist(), *steps])
-
-
-def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
-    """Derive the seed of a computation from the user's seed and a hash of its inputs."""
-    digest = hashlib.sha256("\n".join(inputs).encode()).hexdigest()
-    return seed, int(digest[:12], 16)
 
 
 def sample(

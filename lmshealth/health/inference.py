@@ -10,6 +10,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly
+from lmshealth._private.seeds import stream
 from lmshealth.errors import BadStage, BadTable, NotConverged, NotEnoughData
 from lmshealth.health import constants
 from lmshealth.health.ensemble_sampling import (
@@ -19,7 +20,6 @@ from lmshealth.health.ensemble_sampling import (
     sample_by_importance,
     start_from_prior,
     start_near,
-    stream,
     thin,
 )
 from lmshealth.health.epoch_posterior import EpochPosterior, MachineDrifts

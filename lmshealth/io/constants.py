@@ -1,7 +1,7 @@
 """Limits that decide which logs, channels and samples are refused.
 
 They are read as ``constants.NAME``. Lengths of text and counts that only bound what damaged or
-hostile files may claim were chosen far above every honest export.
+hostile files may claim were chosen far above every plausible export.
 """
 
 from datetime import UTC, datetime, timedelta

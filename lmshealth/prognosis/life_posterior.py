@@ -11,9 +11,10 @@ from scipy.special import softmax
 from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import FloatArray, ReadOnly, freeze
+from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.health.constants import MAX_PARETO_K, MIN_ESS
-from lmshealth.health.ensemble_sampling import Sample, sample, start_among, stream, thin
+from lmshealth.health.ensemble_sampling import Sample, sample, start_among, thin
 from lmshealth.health.importance_sampling import (
     WeightedDraws,
     importance_sample,

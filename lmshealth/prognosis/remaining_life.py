@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.seeds import stream
 from lmshealth.errors import BadStage, NotEnoughData
-from lmshealth.health.ensemble_sampling import stream
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.life_posterior import LifePosterior, LifeStart, fit_life
 from lmshealth.prognosis.map_error import modes_off_map

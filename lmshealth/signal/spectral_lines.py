@@ -17,7 +17,8 @@ class Line:
     """A narrow spectral line of a channel that is not a mode.
 
     Its frequency is in Hz and the amplitude of its sine in `unit`; `kind` is the name of an order
-    of the stage, ``order of … mm``, ``mains`` or ``unknown``.
+    of the stage, ``order of … mm``, ``mains`` or ``unknown``. modal/ambient/README.md, "Lines", has
+    who decides what is one.
     """
 
     frequency: float

@@ -1,4 +1,7 @@
-"""Prior distributions of a stage description, single and joint (README.md, "Priors")."""
+"""Prior distributions of a stage description, single and joint (README.md, "Priors").
+
+Their values are in the descriptions: ``descriptions/*.toml``.
+"""
 
 from __future__ import annotations
 

@@ -30,7 +30,7 @@ def spoiled(change):
     return made
 
 
-def told(readings):
+def assessed(readings):
     """Track a machine, infer its health at the last log, and print the verdict."""
     history, _ = lh.build_history(readings, stage)
     track = lh.track(history, stage)
@@ -44,7 +44,7 @@ def told(readings):
 # ## As it should be
 
 # %%
-right, health, verdict = told(logs)
+right, health, verdict = assessed(logs)
 assert verdict == "both"
 health
 
@@ -57,7 +57,7 @@ health
 # preload and mount moves pitch against roll and yaw like that.
 
 # %%
-apart, wide, _ = told(
+apart, wide, _ = assessed(
     spoiled(lambda k, mode: 0.04 * max(k - 9, 0) / 14 if mode == "pitch" else 0.0)
 )
 
@@ -85,7 +85,7 @@ wide
 # ## A jump: all modes fall by 3 % between two logs
 
 # %%
-_, _, verdict = told(spoiled(lambda k, mode: -0.03 if k >= 16 else 0.0))
+_, _, verdict = assessed(spoiled(lambda k, mode: -0.03 if k >= 16 else 0.0))
 assert verdict == "step"
 
 # %% [markdown]
@@ -100,7 +100,7 @@ assert verdict == "step"
 # %%
 loss = stage.drift(np.log([[0.9, 1.0]]), ("roll", "pitch", "yaw"))[0]
 share = dict(zip(("roll", "pitch", "yaw"), loss, strict=True))
-_, alike, _ = told(spoiled(lambda k, mode: share[mode] * k / 23))
+_, alike, _ = assessed(spoiled(lambda k, mode: share[mode] * k / 23))
 before, after = (one.latest(0.5)[0] for one in (health, alike))
 print(f"guide preload {before:.2f} as it should be, {after:.2f} spoiled")
 assert after < before - 0.04

@@ -83,7 +83,7 @@ def test_parquet_to_modes(race: Race) -> None:
 def test_epoch(race: Race, stage: Stage) -> None:
     """An epoch gives 2,000 effective draws a second, and takes 3 s with all that is done of it.
 
-    Both are told in effective draws of emcee in a plain loop over the same posterior.
+    Both are stated in effective draws of emcee in a plain loop over the same posterior.
     """
     posterior = epoch_posterior(stage)
     (view,) = posterior.machines
@@ -96,8 +96,10 @@ def test_epoch(race: Race, stage: Stage) -> None:
         draws.append(loop * found.cpu_s / found.ess)
         epochs.append(loop * cpu_s(partial(infer, drifts, stage, turn)))
     beside = f"one effective draw of {LOOP}"
-    race.told(draws, name="an effective draw of an epoch", beside=beside, at_most=LOOP_RATE / 2000)
-    race.told(epochs, name="a converged epoch", beside=beside, at_most=3.0 * LOOP_RATE)
+    race.record(
+        draws, name="an effective draw of an epoch", beside=beside, at_most=LOOP_RATE / 2000
+    )
+    race.record(epochs, name="a converged epoch", beside=beside, at_most=3.0 * LOOP_RATE)
 
 
 def test_walker_of_a_life(race: Race, stage: Stage) -> None:
@@ -115,7 +117,7 @@ def test_walker_of_a_life(race: Race, stage: Stage) -> None:
 
 
 def test_life(race: Race, stage: Stage) -> None:
-    """The posterior of a life of 100 logs takes 10 s, told in walkers by filterpy."""
+    """The posterior of a life of 100 logs takes 10 s, stated in walkers by filterpy."""
     life, seeds = degrading_life(stage, 100, np.random.default_rng(0)), count()
     ways = two_ways(life, stage, 64, LOOPED)
     race(
@@ -179,7 +181,7 @@ def test_cost_of_one_more_log(race: Race, many: NDArray[np.float64]) -> None:
     """A log costs as much among the last 500 of 1,000 as among the first, by its own yardstick."""
     own = many[:, 0] / many[:, 1:].sum(axis=1)
     half = own.size // 2
-    race.told(
+    race.record(
         (own[-half:] / own[:half]).tolist(),
         name="a log among the last 500 of 1,000",
         beside="one among the first 500; both over the same log by itself",
@@ -190,7 +192,7 @@ def test_cost_of_one_more_log(race: Race, many: NDArray[np.float64]) -> None:
 def test_cost_beside_identification(race: Race, many: NDArray[np.float64]) -> None:
     """Reading, store and bookkeeping take 15 % of what the identification does."""
     in_run, _, identification, other = many.T
-    race.told(
+    race.record(
         ((in_run - other) / identification - 1).tolist(),
         name="reading, store and bookkeeping of a log",
         beside="its identification",
@@ -209,7 +211,7 @@ def test_two_workers(race: Race) -> None:
             rates = [identified(folder, Settings(workers=n)).rate() for n in (1, 2)]
             return min(two / one, 2.0) / (rates[1] / rates[0])
 
-        race.told(
+        race.record(
             [turn() for _ in range(7)],
             name="the gain of two processes without a run",
             beside="the gain of two workers over one",

@@ -72,10 +72,10 @@ class Race:
         assert benchmark.stats is not None
         own = benchmark.stats.stats.data
         times = zip(own, amounts, theirs, strict=True)
-        self.told([t / n / other for t, n, other in times], name=name, beside=beside,
+        self.record([t / n / other for t, n, other in times], name=name, beside=beside,
                   at_most=at_most)  # fmt: skip
 
-    def told(self, ratios: Sequence[float], *, name: str, beside: str, at_most: float) -> None:
+    def record(self, ratios: Sequence[float], *, name: str, beside: str, at_most: float) -> None:
         """Hold ratios that were measured elsewhere."""
         figure = Figure(name, beside, at_most, tuple(ratios))
         self._request.config.stash[_FIGURES][name] = figure.row()

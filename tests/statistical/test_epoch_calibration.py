@@ -13,7 +13,7 @@ import numpy as np
 from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.health.ensemble_sampling import stream
+from lmshealth._private.seeds import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage

@@ -67,7 +67,7 @@ def life(
     )
 
 
-def told(found: Track) -> set[tuple[str, int, str]]:
+def labels_of(found: Track) -> set[tuple[str, int, str]]:
     """Return kind, place and source of the detected steps, without alarms."""
     return {(e.kind, e.epoch, e.source) for e in found.events if e.kind != "alarm"}
 
@@ -91,7 +91,7 @@ def test_what_happened_is_found_with_its_kind_place_and_size(stage: Stage, kind:
     z = []
     for seed in range(8):
         found = track(life(seed, **given), stage)
-        assert told(found) == {(kind, PLACE, given.get("source", ""))}
+        assert labels_of(found) == {(kind, PLACE, given.get("source", ""))}
         assert bool(found.alarms) <= (kind == "step")
         assert found.outliers == ()
         size = given["jump"][1 if kind == "regreasing" else 0]
@@ -122,7 +122,7 @@ def test_the_same_jumps_without_the_loop_are_damage(stage: Stage) -> None:
     """Negative control: without a change of the following error the jumps raise alarms."""
     given = HAPPENINGS["servo"] | {"loop": 1.0}
     tracks = [track(life(seed, **given), stage) for seed in range(8)]
-    assert not any(("servo", PLACE, "") in told(found) for found in tracks)
+    assert not any(("servo", PLACE, "") in labels_of(found) for found in tracks)
     assert sum(bool(found.alarms) for found in tracks) >= 6
 
 
@@ -154,11 +154,11 @@ def test_two_steps_in_a_row_are_two_steps(stage: Stage) -> None:
         history = life(seed, jump=(-0.03, 0.0))
         later = (np.arange(N_LOGS) >= PLACE + 3)[:, None]
         found = track(replace(history, ln_frequency=history.ln_frequency - 0.04 * later), stage)
-        assert told(found) == {("step", PLACE, ""), ("step", PLACE + 3, "")}
+        assert labels_of(found) == {("step", PLACE, ""), ("step", PLACE + 3, "")}
         retuned = life(seed, **HAPPENINGS["servo"])
         moved = later * np.array([0, 0, 1, 1])
         found = track(replace(retuned, ln_frequency=retuned.ln_frequency + 0.006 * moved), stage)
-        assert told(found) == {("servo", PLACE, ""), ("sensor", PLACE + 3, "delta_e")}
+        assert labels_of(found) == {("servo", PLACE, ""), ("sensor", PLACE + 3, "delta_e")}
         assert found.alarms == ()
 
 

@@ -86,7 +86,7 @@ def run(
     return kept
 
 
-def told(history: History, stage: Stage, wander: Wander) -> Followed:
+def followed_by(history: History, stage: Stage, wander: Wander) -> Followed:
     """Filter with the bank under one setting; return what the oracles return."""
     space = StateSpace(history, stage, history.steps)
     sources = FilterModel(space).sources
@@ -119,7 +119,7 @@ def furthest(found: Followed, book: Followed, judged: BoolArray) -> float:
 def test_one_setting_is_the_textbook_filter(stage: Stage, wander: Wander, oracle: str) -> None:
     """Means, covariances, evidence and NIS are those of every oracle, to 1e-10 of the std."""
     history = awkward_history(np.random.default_rng(1))
-    found, book = told(history, stage, wander), ORACLES[oracle](history, wander, KNOWN)
+    found, book = followed_by(history, stage, wander), ORACLES[oracle](history, wander, KNOWN)
     # Before the first baseline nobody says what a drift is.
     judged = np.arange(len(history.logs)) >= history.baselines[0]
     assert furthest(found, book, judged) < 1e-10
@@ -132,7 +132,7 @@ def test_one_setting_is_the_textbook_filter(stage: Stage, wander: Wander, oracle
 def test_another_setting_is_told_from_it(stage: Stage) -> None:
     """Negative control: the filter with another setting or other steps differs."""
     history = awkward_history(np.random.default_rng(1))
-    found, judged = told(history, stage, SETTINGS[0]), np.arange(len(history.logs)) >= 1
+    found, judged = followed_by(history, stage, SETTINGS[0]), np.arange(len(history.logs)) >= 1
     assert furthest(found, kalman(history, SETTINGS[2], KNOWN), judged) > 0.1
     for j in range(len(history.steps)):
         fewer = replace(history, steps=history.steps[:j] + history.steps[j + 1 :])

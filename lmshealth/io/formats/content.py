@@ -65,7 +65,7 @@ class Format:
 def unpacked(path: Path) -> Iterator[Path]:
     """Copy a file that gzip compressed to a temporary one as it was; other files are yielded.
 
-    `Unusable`: ``too-large`` for more than the file can honestly hold.
+    `Unusable`: ``too-large`` for more than the file can hold.
     """
     with path.open("rb") as stream:
         packed = stream.read(len(GZIP)) == GZIP

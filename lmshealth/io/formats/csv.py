@@ -105,7 +105,7 @@ class Text:
         """Read a block of at most ``size`` bytes; empty at the end of the file.
 
         `Unusable`: ``corrupt`` for a NUL byte, for lines or rows without end and for an end inside
-        a row, ``too-large`` for more than the file can honestly hold.
+        a row, ``too-large`` for more than the file can hold.
         """
         block, self._ahead = self._ahead or self._stream.read(size), self._stream.read(size)
         while 0 < len(self._ahead) < _TRAILER and (more := self._stream.read(size)):

@@ -30,9 +30,9 @@ from itertools import pairwise
 from pathlib import Path
 
 from lmshealth import load_stage
+from lmshealth._private.seeds import seed_of
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
-from lmshealth.health.ensemble_sampling import seed_of
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.report.assessment import Assessment

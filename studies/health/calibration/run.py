@@ -26,8 +26,8 @@ from functools import cache
 
 import numpy as np
 
+from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
-from lmshealth.health.ensemble_sampling import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.health.inference import draw as draw_chains

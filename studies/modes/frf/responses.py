@@ -260,12 +260,12 @@ def read_benches(data: Path, *, quick: bool) -> Row:
         log = mapped(data, name)
         for output in ("delta_e_motor", "delta_e_load"):
             reading = read_frf(log, "current_input", output, period=5.0)
-            guide[f"{Path(name).stem} {output}"] = told(reading)
+            guide[f"{Path(name).stem} {output}"] = summarised(reading)
     log = mapped(data, records.BENCH)
     bench: dict[str, Row] = {}
     for output in ("delta_e_motor", "delta_e_load"):
         reading = read_frf(log, "current", output)
-        bench[output] = told(reading)
+        bench[output] = summarised(reading)
         frequency = reading.fit.ordinates.frequency
         inside = (frequency > 40) & (frequency < 70)
         lowest = np.argmin(np.abs(reading.fit.response[inside]))
@@ -285,7 +285,7 @@ def mapped(data: Path, name: str) -> Log:
         return read_log(data / name, columns=load_columns(path))
 
 
-def told(reading: FrfReading) -> Row:
+def summarised(reading: FrfReading) -> Row:
     """Return the one mode of a reading."""
     modes, fit = reading.modes, reading.fit
     if len(modes.names) != 1:

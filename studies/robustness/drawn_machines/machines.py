@@ -89,7 +89,7 @@ def _tracked(life: Life, history: History, found: Track, stage: Stage) -> Row:
     }
 
 
-def told(kind: str, seed: int, is_drawn: bool, logs: int) -> Row:
+def reported(kind: str, seed: int, is_drawn: bool, logs: int) -> Row:
     """Take one life to its prognosis, and compare with its truth."""
     plan = plan_of(kind, seed, logs, is_drawn=is_drawn)
     life, history = estimated(plan)

@@ -47,7 +47,13 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.metrics import clopper_pearson
 from studies.harness.provenance import code_of
 from studies.harness.study import Row, Study, judge_places, judge_scores, share_row
-from studies.robustness.drawn_machines.machines import PARAMETERS, RISK, followed, identified, told
+from studies.robustness.drawn_machines.machines import (
+    PARAMETERS,
+    RISK,
+    followed,
+    identified,
+    reported,
+)
 
 FIRST_SEED = 1000
 # Machines with all answers, healthy ones, per circumstance, raw, of the control; logs; raw logs.
@@ -111,8 +117,8 @@ def main() -> None:
     raw = [row for rows in collect(work, [(seed,) for seed in seeds[: int(n["raw"])]])
            for row in rows]  # fmt: skip
     known = [(KNOWN_LIVES[k % 4], FIRST_SEED + k, False, logs) for k in range(int(n["control"]))]
-    control = collect(told, known)
-    machines = collect(told, [("drawn", seed, True, logs) for seed in seeds])
+    control = collect(reported, known)
+    machines = collect(reported, [("drawn", seed, True, logs) for seed in seeds])
     answer: Row = {
         "sizes": n,
         "estimator": {f.__name__: code_of(f) for f in (identify, track, infer, prognose)},
