@@ -10,7 +10,8 @@ import numpy as np
 from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 
-from lmshealth.health.ensemble_sampling import start_from_prior, stream
+from lmshealth._private.seeds import stream
+from lmshealth.health.ensemble_sampling import start_from_prior
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.inference import draw
 from lmshealth.stage.description import Stage

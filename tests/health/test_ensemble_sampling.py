@@ -9,6 +9,7 @@ from emcee.autocorr import integrated_time
 from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.health import constants
 from lmshealth.health import ensemble_sampling as sampling
@@ -19,7 +20,6 @@ from lmshealth.health.ensemble_sampling import (
     start_among,
     start_from_prior,
     start_near,
-    stream,
 )
 
 MEAN = np.array([0.3, -1.2])
