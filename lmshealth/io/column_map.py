@@ -278,8 +278,9 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
 def _fault(pattern: str) -> str:
     """Return what is wrong with a regular expression; empty where nothing is."""
     try:
-        re.compile(pattern, re.MULTILINE)
-    except re.error as error:
+        for mark in (DELIMITER, r"\;"):
+            re.compile(pattern.replace(DELIMITER, mark), re.MULTILINE)
+    except (re.error, OverflowError, RecursionError) as error:
         return f"{pattern!r} is no regular expression: {error}"
     return ""
 

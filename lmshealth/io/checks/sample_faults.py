@@ -259,11 +259,14 @@ def check_sign(values: Samples, rough: Roughness) -> None:
         # Most samples are at the edge; the other end, unlike that of a sine, has none.
         edge &= below[2] < constants.AT_EDGE * below[3]
         edge &= above[5] <= constants.EDGE / 2 * above[6]
-        # A sine that decays, with one sample beyond an end, is as wide above its median as below.
-        edge &= abs(np.log((q[4] - q[3]) / (q[3] - q[2]))) > np.log(constants.LOPSIDED)
+        # A sine that decays, with one sample beyond an end, is as wide above its median as below;
+        # so may be the magnitude of a sine with noise, whose edge is at zero.
+        at_zero = 0 <= low < constants.NEAR_ZERO * q[3]
+        sides = sorted((float(q[4] - q[3]), float(q[3] - q[2])))
+        edge &= at_zero or sides[1] > constants.LOPSIDED * sides[0]
         scale = float(own.std())
         skew = float(np.mean((own - own.mean()) ** 3)) / scale**3
-        from_zero = 0 <= low < constants.NEAR_ZERO * q[3] and skew > constants.MAGNITUDE_SKEW
+        from_zero = at_zero and skew > constants.MAGNITUDE_SKEW
         if (edge or from_zero) and _reaches(values, own is x, low, float(q[3])):
             end = f"below {rough.low:.4g}" if own is x else f"above {rough.high:.4g}"
             detail = f"no sample is {end} (SI), as of a magnitude, which shows modes at sums and "

@@ -5,6 +5,7 @@ All of it is found from the first lines of the file, unless the column map state
 """
 
 import csv
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field, replace
@@ -40,6 +41,8 @@ _NUMBER = {
     mark: re.compile(rf"[+-]?({body})(e[+-]?\d+)?{_EMPTY}", re.IGNORECASE)
     for mark, body in ((".", r"\d+\.?\d*|\.\d+"), (",", r"\d+(,\d+)?"))
 }
+# Number of a column in its name.
+_INDEX = re.compile(r"\d{1,6}", re.ASCII)
 # Numbers with marks between thousands: certainly, and possibly.
 _THOUSANDS = re.compile(r"[+-]?\d{1,3}((,\d{3})+\.\d+|(\.\d{3})+,\d+|([,.]\d{3}){2,})")
 _MAYBE_THOUSANDS = re.compile(r"[+-]?[1-9]\d{0,2},\d{3}")
@@ -119,7 +122,7 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
             # One name over rows such as "1,5".
             found = found._replace(delimiter=";", decimal=",", n_fields=1)
             heads = list(_heads(lines[: found.first], skip, found))
-        _check_thousands(lines[found.first :], found)
+        _check_thousands(lines[found.first :], found.delimiter)
     _check_no_row_before(lines[skip : found.first], found)
     n_first = len(fields_of(lines[found.first], found.delimiter)) if found.share else 0
     names, units, where = _names(heads, found, max(n_first, found.n_fields), columns)
@@ -155,15 +158,20 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
     delimiter = chr(int(delimiter)) if re.fullmatch(r"\d{1,3}", delimiter) else delimiter
     # The numbers of the first row may be whole.
     has_commas = delimiter != "," and any("," in row for row in rows)
-    decimal = _value(layout.decimal, header) or ("," if has_commas else ".")
-    if len(delimiter) != 1 or decimal not in (".", ","):
+    decimal = columns.csv.decimal or _value(layout.decimal, header)
+    if not decimal:
+        _check_thousands(rows, delimiter)
+        decimal = "," if has_commas else "."
+    quoted = any('"' in row for row in rows)
+    if len(delimiter) != 1 or decimal not in (".", ",") or (delimiter == decimal and not quoted):
         marks = f"the delimiter {delimiter[:9]!r}, the decimal mark {decimal[:9]!r}"
         raise corrupt(f"its header has {marks}")
     row = fields_of(rows[0], delimiter) if rows else []
     channels = _channels(layout, header, delimiter, row, columns)
     found = {key: _value(pattern, header) for key, pattern in layout.metadata.items()}
     metadata = {key: value.strip() for key, value in found.items() if value.strip()}
-    metadata |= _start(layout.start, header) if layout.start else {}
+    if layout.start and "recorded_at" not in columns.metadata:
+        metadata |= _start(layout.start, header)
     return Dialect(delimiter, decimal, channels, start, metadata, segments=layout.segments)
 
 
@@ -272,9 +280,9 @@ def _check_no_row_before(lines: Sequence[str], found: _Rows) -> None:
         raise corrupt(f"row 1 has {len(fields)} fields, the next {found.n_fields}; {step}")
 
 
-def _check_thousands(lines: Sequence[str], found: _Rows) -> None:
+def _check_thousands(lines: Sequence[str], delimiter: str) -> None:
     """Refuse rows whose commas or points may be decimal marks or marks between thousands."""
-    words = [word.strip() for line in lines for word in fields_of(line, found.delimiter)]
+    words = [word.strip() for line in lines for word in fields_of(line, delimiter)]
     if sure := next(filter(_THOUSANDS.fullmatch, words), None):
         raise Unusable("columns", f"{sure!r} has marks between thousands; export without them")
     marked = [word for word in words if "," in word]
@@ -365,9 +373,10 @@ def _value(pattern: str | None, header: str) -> str:
 def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str]:
     """Return what a pattern finds for each of ``n`` columns, or in a longer row for each field."""
     if pattern and "column" in re.compile(pattern).groupindex:
-        found = {int(m["column"]): m[m.re.groups].strip()
-                 for m in re.finditer(pattern, header, re.MULTILINE)}  # fmt: skip
-        first = int(n in found)  # columns are counted from 1 where there is an n-th
+        found = {int(m["column"]): (m[m.re.groups] or "").strip()
+                 for m in re.finditer(pattern, header, re.MULTILINE)
+                 if _INDEX.fullmatch(m["column"])}  # fmt: skip
+        first = int(0 not in found)  # columns are counted from 0 or 1
         return [found.get(k + first, "") for k in range(n)]
     row = [one.strip() for one in fields_of(_value(pattern, header), delimiter)]
     if len(row) == 1 < n:
@@ -431,15 +440,16 @@ def _start(start: StartMoment, header: str) -> dict[str, str]:
             found = datetime.strptime(text, start.format)
         else:
             found = datetime.fromisoformat(text.replace("/", "-").replace(",", "."))
-    except ValueError as error:
-        step = "correct the format of its layout"
+    except (ValueError, OverflowError, re.error) as error:
+        step = "correct the format of its layout, or set recorded_at by a column map"
         raise Unusable("metadata", f"starts at {text!r}, no {start.format}; {step}") from error
     return {"recorded_at" if found.tzinfo else LOCAL_TIME: found.isoformat()}
 
 
 def _number(text: str) -> float | None:
-    """Read a number with a decimal point or comma; None for any other text."""
+    """Read a finite number with a decimal point or comma; None for any other text."""
     try:
-        return float(text.replace(",", "."))
+        found = float(text.replace(",", "."))
     except ValueError:
         return None
+    return found if math.isfinite(found) else None

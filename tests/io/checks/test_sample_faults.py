@@ -109,12 +109,14 @@ def test_signals_have_no_bad_samples(name, seed):
     assert not spikes(x, NONE, roughness(x)).size
 
 
-@pytest.mark.parametrize("name", ["abs", "negative", "coupled", "square", "two", "three"])
+@pytest.mark.parametrize("name", ["abs", "line", "negative", "coupled", "square", "two", "three"])
 def test_magnitudes_are_refused(name):
     """Without its sign a vibration is none, also after its mean was removed."""
     x, y, z = (vibration(seed) for seed in range(3))
+    line = 5 * np.sin(0.15 * np.arange(N)) + x
     values = {
-        "abs": np.abs(x), "negative": -np.abs(x), "coupled": np.abs(x) - 0.8, "square": x**2,
+        "abs": np.abs(x), "line": np.abs(line), "negative": -np.abs(x),
+        "coupled": np.abs(x) - 0.8, "square": x**2,
         "two": np.hypot(x, y), "three": np.sqrt(x**2 + y**2 + z**2),
     }[name]  # fmt: skip
     with pytest.raises(Unusable) as caught:

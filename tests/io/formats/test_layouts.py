@@ -163,6 +163,8 @@ def test_a_file_of_two_layouts_is_refused(folder: Path) -> None:
         ('name = "ACME recorder"\n', "", "name: missing"),
         ("decimal", "decimals", "decimals: unknown key.*most like it is decimal"),
         (r"'\AACME recorder', ", "'(', ", r"recognise: '\(' is no regular expression"),
+        (r"'\AACME recorder', ", "'a{99999999999}', ", "is no regular expression"),
+        ("names = '^(Channel{d}", "names = '^([C-{d}]hannel", "is no regular expression"),
         (r"['\AACME recorder', '^\[Data\]']", "['^[A-Z0-9]', ';']", "also fits other tables"),
         ('delimiter = ";"', 'delimiter = ";;"', "got ';;', needed one character, or a group"),
         ('decimal = ","', "decimal = 7", "Expected"),
@@ -197,6 +199,12 @@ def test_a_folder_has_layouts_of_different_names(folder: Path) -> None:
     [
         ("rows_after = '^", "rows_after = '^Never", "corrupt", "is a ACME recorder without a line"),
         ('delimiter = ";"', "delimiter = '^Axis(:..)'", "corrupt", "the delimiter ': a'"),
+        (
+            'delimiter = ";"',
+            'delimiter = ","',
+            "corrupt",
+            "the delimiter ',', the decimal mark ','",
+        ),
         ("names = '^", "names = '^No", "corrupt", "its header has no row of names"),
         ("rows_after", "required = ['Gain']\nrows_after", "corrupt", "without a line Gain before"),
         ('"%d.%m', '"%d/%m', "metadata", "starts at '05.01.2026 08:15:30', no %d/%m"),

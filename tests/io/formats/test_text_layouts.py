@@ -2,13 +2,17 @@
 
 import gzip
 import itertools
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.io.column_map import ColumnMap
+from lmshealth.io.column_map import ColumnMap, CsvLayout
+from lmshealth.io.formats.dialect import stated_dialect
 from lmshealth.io.reading import read_log
+from lmshealth.io.refusal import Unusable
 
 X = np.round(1e-3 * np.sin(np.arange(400) * 0.7), 6)
 Y = np.round(1e-3 * np.cos(np.arange(400) * 0.3), 6)
@@ -57,6 +61,31 @@ def test_twincat_scope(tmp_path, delimiter, decimal, compressed):
     moment = log.metadata.recorded_at
     assert log.sample_rate == 1000 and moment is not None and moment.year == 2023
     assert [(r.channel, r.reason) for r in log.refused] == [("acc_slow_m_s2", "time")]
+
+
+@pytest.mark.parametrize("mark", [" ", '"'])
+def test_twincat_scope_with_padded_or_quoted_numbers(tmp_path, mark):
+    """Rows that do not begin with a digit are read from the first one on."""
+    end = mark.strip()
+    lines = twincat(";", ",").split("\n")
+    rows = [
+        ";".join(f"{mark}{one}{end}" if one else "" for one in line.split(";"))
+        if line[:1].isdigit()
+        else line
+        for line in lines
+    ]
+    (tmp_path / "log.csv").write_text("\n".join(rows))
+    np.testing.assert_allclose(read_log(tmp_path / "log.csv").channels[0].values[:], X, atol=1e-12)
+
+
+def test_twincat_scope_with_marks_between_thousands(tmp_path):
+    """Whole numbers with commas are refused; the column map decides what a comma is."""
+    text = re.sub(r"-?\d+\.\d+", "1,042", twincat(";", "."))
+    (tmp_path / "log.csv").write_text(text)
+    with pytest.raises(BadLog, match="'1,042' may have a mark between thousands"):
+        read_log(tmp_path / "log.csv")
+    found = stated_dialect(text.splitlines(), ColumnMap(csv=CsvLayout(decimal=",")))
+    assert found is not None and found.decimal == ","
 
 
 @pytest.mark.parametrize("decimal", [".", ","])
@@ -157,6 +186,29 @@ def test_gcs_array(tmp_path):
     log = read_log(tmp_path / "log.dat", columns=columns)
     assert log.sample_rate == 1000
     np.testing.assert_allclose(log.channels[0].values[:], 1e-3 * X, atol=1e-12)
+
+
+@pytest.mark.parametrize("names", [{0: "a", 1: "b", 2: "c"}, {1: "a", 2: "b"}])
+@pytest.mark.parametrize("end", ["", " "])
+def test_numbered_names_keep_their_columns(tmp_path, names, end):
+    """Columns are counted from 0 or 1, with more names than fields and with an empty last field."""
+    head = ["# SEPARATOR = 59", "# SAMPLE_TIME = 0.001"]
+    head += [f"# NAME{k} = {name} (g)" for k, name in names.items()] + ["# END_HEADER"]
+    rows = [f"{number(X[k])};{number(Y[k])}" + (";" if end else "") for k in range(400)]
+    (tmp_path / "log.dat").write_text("\n".join([*head, *rows, ""]))
+    log = read_log(tmp_path / "log.dat")
+    assert [one.name for one in log.channels] == ["acc_a", "acc_b"]
+    np.testing.assert_allclose(log.channels[1].values[:], 9.80665 * Y, rtol=1e-5)
+
+
+def test_a_clock_that_is_none_is_replaced_by_the_column_map():
+    """A moment that cannot be read is refused with the step that helps."""
+    text = (Path(__file__).parent / "layouts" / "labview.lvm").read_text(encoding="utf-8")
+    lines = text.replace("2026/01/05", "2026/01/05\nTime\t24:00:00").splitlines()
+    with pytest.raises(Unusable, match="or set recorded_at by a column map"):
+        stated_dialect(lines, ColumnMap())
+    moment = {"recorded_at": "2026-01-06T00:00:00+00:00"}
+    assert stated_dialect(lines, ColumnMap(metadata=moment)) is not None
 
 
 @pytest.mark.parametrize("stats", ["", "##stats errors=0\n"])
