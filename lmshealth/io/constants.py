@@ -115,7 +115,7 @@ samples are there if the 5 % quantile is nearer than this share of the median: 0
 normal x, 0.1 where the density is constant."""
 LOPSIDED = 1.25
 """Least ratio, or inverse, of the distances of the 95 % and 5 % quantiles from the median where the
-edge is not at zero: 2.1 for |x| - c of normal x, 0.5 for that of a sine, 1 for what has its sign."""
+edge is not at zero: 2.1 for |x| - c of normal x, 0.5 for that of a sine, 1 for signed ones."""
 NEAR_ZERO, MAGNITUDE_SKEW = 0.05, 0.3
 """Least sample of a magnitude over its median, and its skewness: that of a vector has 0.49 in three
 and 0.63 in two dimensions, that of |x| 0.995; normal noise has none."""
