@@ -27,7 +27,7 @@ from typing import Any
 
 from studies.harness.checkout import ROOT, checkout
 from studies.harness.claims import Claim
-from studies.harness.study import Row, Study
+from studies.harness.study import Row, Study, real_data
 from studies.inputs.outside_faults.case import Case, Program
 
 SCRIPTS = ("run", "case", "no_logs")
@@ -46,6 +46,7 @@ KINDS = tuple(
 def main() -> None:
     """Give all cases to both revisions."""
     study = Study(__file__, __doc__, before="e0d0b2d", only="")
+    real_data()  # some inputs are there
     chosen = [one.name for one in cases() if study.options.only in f"{one.kind}: {one.name}"]
     chosen = chosen[::EACH] if study.quick else chosen
     # Each call is a process of its own, so that threads do.
