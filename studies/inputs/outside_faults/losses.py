@@ -103,7 +103,7 @@ def failed_alert(program: Program, folder: Path) -> Seen:
 
 def run_by_hand(program: Program, folder: Path) -> Seen:
     """Find a change in a run without an alert, between two with one."""
-    analyse(program, folder, *alerts(folder, days=1e5))
+    analyse(program, folder, *alerts(folder, days=36500))
     analyse(program, folder, "--silent-days", "1")
     for _ in range(2):
         analyse(program, folder, *alerts(folder))
@@ -326,6 +326,7 @@ def counted(
 ) -> Seen:
     """Run over files, some of which a manifest lists; the summary counts all that were expected."""
     logs = folder / "logs"
+    logs.mkdir()
     for number, name in enumerate(there):
         write_log(logs / name, number, head=head)
     if listed:
