@@ -16,6 +16,7 @@ Run time
 from __future__ import annotations
 
 import os
+import re
 import sys
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -98,13 +99,18 @@ def _row(case: Case, fault: Answer, control: Answer, before: Answer) -> Row:
         "kind": case.kind,
         "case": case.name,
         "right": case.right,
-        "before": before[1],
+        "before": _without_folders(before[1]),
         "right_before": before[0],
-        "now": fault[1],
+        "now": _without_folders(fault[1]),
         "right_now": fault[0],
-        "control": control[1],
+        "control": _without_folders(control[1]),
         "control_right": control[0],
     }
+
+
+def _without_folders(text: str) -> str:
+    """Return an answer with the names of files, without the folders of this computer."""
+    return re.sub(r"(?:/[\w.\-]+)+/(?=[\w.])", "", text)
 
 
 def claims(record: Row) -> list[Claim]:
