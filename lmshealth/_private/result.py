@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from lmshealth._private.tables import MOMENTS
-
 if TYPE_CHECKING:
     import pandas as pd
     from matplotlib.axes import Axes
@@ -40,6 +38,8 @@ class Result:
     def to_frame(self) -> pd.DataFrame:
         """Return the result as a table; units are in the names of its columns, moments in UTC."""
         import pandas as pd
+
+        from lmshealth._private.tables import MOMENTS  # late: --help needs no table
 
         table = pd.DataFrame(self.to_columns())
         for name in table.columns.intersection(MOMENTS):

@@ -19,7 +19,7 @@ from lmshealth.health.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.data.histories import map_std
 from studies.harness.metrics import place
-from studies.health.calibration.lives import believing
+from studies.health.calibration.lives import assuming
 from studies.health.calibration.lives import draw as draw_track
 from studies.health.calibration.run import ranks_of
 from studies.health.one_guide import SHARED, drifts_of
@@ -102,13 +102,13 @@ def test_ranks_at_epochs_of_tracks_are_uniform(rng: np.random.Generator, claims:
     """
     for name in ("lms-x", "lms-y"):
         stage = load_stage(name)
-        for n, believed, state in (
+        for n, assumed, state in (
             (claims.trials, stage, claims.claim),
-            (claims.part.control, believing(stage, 0.0), claims.control),
+            (claims.part.control, assuming(stage, 0.0), claims.control),
         ):
             lives = [draw_track(rng, stage, 1) for _ in range(n)]
             ranks = np.array(
-                [ranks_of(one, believed, rng, [k])[0][0] for k, one in enumerate(lives)]
+                [ranks_of(one, assumed, rng, [k])[0][0] for k, one in enumerate(lives)]
             )
             for own, parameter in zip(ranks.T, ("preload", "mount"), strict=True):
                 state(f"{parameter}, {name}", uniform(own))

@@ -156,12 +156,11 @@ def stated_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect | None:
         raise corrupt(f"is a {layout.name} without a line {listed(absent)} before its rows")
     delimiter = _value(layout.delimiter, header) or " "
     delimiter = chr(int(delimiter)) if re.fullmatch(r"\d{1,3}", delimiter) else delimiter
-    # The numbers of the first row may be whole.
-    has_commas = delimiter != "," and any("," in row for row in rows)
     decimal = columns.csv.decimal or _value(layout.decimal, header)
     if not decimal:
         _check_thousands(rows, delimiter)
-        decimal = "," if has_commas else "."
+        # The numbers of the first row may be whole.
+        decimal = "," if delimiter != "," and any("," in row for row in rows) else "."
     quoted = any('"' in row for row in rows)
     if len(delimiter) != 1 or decimal not in (".", ",") or (delimiter == decimal and not quoted):
         marks = f"the delimiter {delimiter[:9]!r}, the decimal mark {decimal[:9]!r}"

@@ -25,7 +25,7 @@ class Life:
     truth: Array
 
 
-def believing(machine: Stage, share: float) -> Stage:
+def assuming(machine: Stage, share: float) -> Stage:
     """Return the same stage with a share of the error of its map."""
     assert machine.description.map is not None
     less = share * machine.description.map.model_std

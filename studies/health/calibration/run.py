@@ -36,7 +36,7 @@ from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
 from studies.harness.ranks import N_DRAWS, Array, judge, rank, thinned, uniform
 from studies.harness.study import Row, Study
-from studies.health.calibration.lives import Life, believing, draw
+from studies.health.calibration.lives import Life, assuming, draw
 
 SEED = 20261122
 EPOCHS = ("first third", "second third", "last")
@@ -51,7 +51,7 @@ QUICK = {ONE: 8, SHARED: 2, X: 2, EXACT: 8}
 ENOUGH = 250
 # Points of the prior to begin from, and weighted ones of the posterior.
 N_PRIOR, N_POINTS = 500, 2000
-# Share of the map's true error that is believed.
+# Share of the map's true error that is assumed.
 _LESS = {HALVED: np.sqrt(0.5), EXACT: 0.0}
 
 
@@ -82,25 +82,25 @@ def one(kind: str, life: int) -> Row:
     track = drawn.track
     if kind in (DRIFTS, HALVED):
         track = replace(track, drift_cov=track.drift_cov / 2)
-    believed = believing(stage, _LESS[kind]) if kind in _LESS else stage
+    assumed = assuming(stage, _LESS[kind]) if kind in _LESS else stage
     if kind == CHAINS:
-        found = infer(track, believed, [SEED, life], epochs=drawn.epochs)
+        found = infer(track, assumed, [SEED, life], epochs=drawn.epochs)
         draws = [np.log(thinned(own)) for own in found.samples]
         return {"rank": ranks(drawn.truth, draws, rng), "converged": bool(found.converged.all())}
-    place, chains = ranks_of(replace(drawn, track=track), believed, rng, [SEED, life])
+    place, chains = ranks_of(replace(drawn, track=track), assumed, rng, [SEED, life])
     return {"rank": place, "chains": chains}
 
 
 def ranks_of(
-    drawn: Life, believed: Stage, rng: np.random.Generator, key: list[int]
+    drawn: Life, assumed: Stage, rng: np.random.Generator, key: list[int]
 ) -> tuple[list[list[float]], int]:
     """Rank the truth of each epoch; also return whether chains replaced importance sampling."""
-    track, names = drawn.track, believed.informative
+    track, names = drawn.track, assumed.informative
     columns = [track.modes.index(name) for name in names]
     draws, chains = [], 0
     for k in drawn.epochs:
         cov = track.drift_cov[k][np.ix_(columns, columns)]
-        posterior = EpochPosterior.of(believed, names, track.drift[k][columns], cov)
+        posterior = EpochPosterior.of(assumed, names, track.drift[k][columns], cov)
         start = posterior.prior.draw(rng, N_PRIOR)
         try:
             found = importance_sample_to_ess(posterior.log_probability, start, rng, N_POINTS)

@@ -402,7 +402,7 @@ CASES: tuple[Case, ...] = (
     ),
     case(
         "report from a read-only folder with -wal",
-        "says what to copy",
+        "states what to copy",
         partial(read_only, wal=True),
         partial(read_only, wal=True, unwritable=False),
     ),

@@ -37,7 +37,7 @@ from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
 from studies.harness.ranks import N_DRAWS, Array, judge, rank, uniform
 from studies.harness.study import Row, Study
-from studies.health.calibration.lives import believing
+from studies.health.calibration.lives import assuming
 from studies.life.calibration.lives import Life, draw
 
 SEED = 20261123
@@ -78,7 +78,7 @@ def one(kind: str, life: int) -> Row:
     truth = true_quantities(drawn, rng)
     stage = machine()
     if kind == EXACT:
-        stage = believing(stage, 0.0)
+        stage = assuming(stage, 0.0)
     if kind == LOSING:
         stage = always_losing(stage)
     seed, chains = [SEED, life], kind == CHAINS
