@@ -16,17 +16,17 @@ if TYPE_CHECKING:
     from lmshealth.batch.ingest import Settings as Settings
     from lmshealth.batch.run import run as run
     from lmshealth.errors import LmshealthError as LmshealthError
-    from lmshealth.health.inference import infer as infer
-    from lmshealth.health.inference import infer_together as infer_together
-    from lmshealth.health.verdict import judge as judge
     from lmshealth.io.reading import read_log as read_log
+    from lmshealth.life.health import infer as infer
+    from lmshealth.life.health import infer_drifts as infer_drifts
+    from lmshealth.life.maintenance_decision import decide as decide
+    from lmshealth.life.posterior import fit_life as fit_life
+    from lmshealth.life.remaining_life import prognose as prognose
+    from lmshealth.life.verdict import judge as judge
     from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
     from lmshealth.modal.frf.identification import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
     from lmshealth.modal.log_estimates import LogEstimates as LogEstimates
-    from lmshealth.prognosis.life_posterior import fit_life as fit_life
-    from lmshealth.prognosis.maintenance_decision import decide as decide
-    from lmshealth.prognosis.remaining_life import prognose as prognose
     from lmshealth.stage.description import load_stage as load_stage
     from lmshealth.stage.planning import plan as plan
     from lmshealth.tracking.history import build_history as build_history
@@ -43,16 +43,16 @@ _HOMES = {
     "analyse": "batch.analysis",
     "assess": "batch.assess",
     "build_history": "tracking.history",
-    "decide": "prognosis.maintenance_decision",
-    "fit_life": "prognosis.life_posterior",
+    "decide": "life.maintenance_decision",
+    "fit_life": "life.posterior",
     "identify": "modal.identification",
     "identify_decays": "modal.free_decay.identification",
-    "infer": "health.inference",
-    "infer_together": "health.inference",
-    "judge": "health.verdict",
+    "infer": "life.health",
+    "infer_drifts": "life.health",
+    "judge": "life.verdict",
     "load_stage": "stage.description",
     "plan": "stage.planning",
-    "prognose": "prognosis.remaining_life",
+    "prognose": "life.remaining_life",
     "read_frf": "modal.frf.identification",
     "read_log": "io.reading",
     "run": "batch.run",

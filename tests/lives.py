@@ -17,11 +17,11 @@ import numpy as np
 from threadpoolctl import threadpool_info
 
 from lmshealth._private.arrays import BoolArray, FloatArray
-from lmshealth.health.results import Health
+from lmshealth.life.health import Health
 from lmshealth.io.log import Metadata
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History, Series, Step, StepKind
 from lmshealth.tracking.track import Track

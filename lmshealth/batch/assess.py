@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import CancelledError, Executor
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Container, Iterator, Sequence
+from concurrent.futures import CancelledError
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 from numpy.linalg import LinAlgError
 
@@ -15,26 +15,25 @@ from lmshealth._private.seeds import seed_of
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
-from lmshealth.batch.workers import Pool
-from lmshealth.errors import LmshealthError
-from lmshealth.health.inference import Epoch, epochs_to_infer, infer
-from lmshealth.health.verdict import doubt_of_names, judge
+from lmshealth.errors import LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice
-from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.prognosis.fleet_prior import (
+from lmshealth.life import constants
+from lmshealth.life.fleet_prior import (
     EndedLife,
     FleetContribution,
     FleetPrior,
-    MachineEvidence,
     calibrate,
     ended_lives,
     fleet_priors,
     machine_evidence,
 )
-from lmshealth.prognosis.life_posterior import LifeStart
-from lmshealth.prognosis.remaining_life import prognose_with_posterior
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.health import epochs_to_publish, health_of
+from lmshealth.life.exploration import LifeStart
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.remaining_life import parameters_with_limit, prognosis_of
+from lmshealth.life.verdict import doubt_of_names, judge
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
@@ -67,7 +66,6 @@ def assess(
     *,
     epochs: int = 40,
     seed: int = 0,
-    executor: Executor | None = None,
 ) -> Assessment:
     """Compute track, health, prognosis and verdict of one machine.
 
@@ -83,8 +81,6 @@ def assess(
         Most epochs at which health is inferred.
     seed : int
         Of all random numbers.
-    executor : Executor, optional
-        Runs epochs side by side.
 
     Returns
     -------
@@ -105,11 +101,16 @@ def assess(
     'a life needs at least 3 logs and some travel'
     """
     machine = Machine("", (), stage, work, epochs, seed)
-    return _assess(readings, machine, Parts({}, executor))
+    return _assess(readings, machine, None)[0]
 
 
-def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) -> Assessment:
-    """Assess a machine, whose name and keys of logs play no part, as `assess` does."""
+def _assess(
+    readings: Sequence[LogEstimates], machine: Machine, before: StoredLife | None
+) -> tuple[Assessment, StoredLife | None]:
+    """Assess a machine, whose name and keys of logs play no part, as `assess` does.
+
+    Begun with what the assessment before has stored; also returned is what the next begins with.
+    """
     stage, work = machine.stage, machine.work
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
@@ -132,40 +133,26 @@ def _assess(readings: Sequence[LogEstimates], machine: Machine, parts: Parts) ->
         latest=used[-1] if used else None,
         at_baseline=used[history.baseline] if used else None,
     )
-    made = _with_results(made, used, machine.epochs, parts)
-    judgement = judge(stage, history, made.present, made.track, doubt=made.doubt)
-    return replace(made, judgement=judgement)
-
-
-def _with_results(
-    made: Assessment, readings: Sequence[LogEstimates], epochs: int, parts: Parts
-) -> Assessment:
-    """Add the results up to the first that fails, and a notice why it does."""
-    history, stage = made.history, made.stage
-    seed = seed_of(made.seed, history.stage, stage.digest)
     try:
         tracked = track(history, stage)
-        doubt = doubt_of_names(stage, history, tracked, readings)
-        refused = (*made.refused, *outlier_refusals(history, tracked))
-        made = replace(made, track=tracked, refused=refused, doubt=doubt)
-        if doubt or not stage.parameters:
-            return made
-        history = accepted_estimates(history, tracked)
-        # The prognosis takes longest: it is begun before the epochs and fetched after them.
-        has_limit = any(parameter.limit for parameter in stage.parameters)
-        life_key = _life_key(stage, made.seed)
-        before = unpack_or_none(parts.known.get(life_key), LifeStart)
-        life = parts.mapper(_prognose, [history], [stage], [seed], [before]) if has_limit else None
-        if has_limit:
-            made = replace(made, ended=ended_lives(history, stage, seed))
-        chosen = epochs_to_infer(tracked, stage, epochs)
-        mapper = partial(parts.map, Epoch)
-        made = replace(made, health=infer(tracked, stage, seed, epochs=chosen, mapper=mapper))
-        if life is None:
-            return made
-        prognosis, evidence, life_start = next(iter(life))
-        parts.used[life_key] = pack(life_start)
-        return replace(made, prognosis=prognosis, evidence=evidence)
+    except LmshealthError as error:
+        notice = Notice("no-result", "serious", "", str(error))
+        return replace(made, notices=(*made.notices, notice)), None
+    doubt = doubt_of_names(stage, history, tracked, used)
+    refused += outlier_refusals(history, tracked)
+    judgement = judge(stage, history, None, tracked, doubt=doubt)
+    made = replace(
+        made,
+        track=tracked,
+        doubt=doubt,
+        refused=(*not_excited, *refused),
+        judgement=judgement,
+    )
+    if doubt or not stage.parameters:
+        return made, None
+    try:
+        accepted = accepted_estimates(history, tracked)
+        return _with_results(made, accepted, machine.epochs, before)
     except LmshealthError as error:
         why = str(error)
     except LinAlgError as error:  # one machine must not end the run
@@ -173,64 +160,64 @@ def _with_results(
             f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
             "with modes.csv"
         )
-    return replace(made, notices=(*made.notices, Notice("no-result", "serious", "", why)))
+    notice = Notice("no-result", "serious", "", why)
+    return replace(made, notices=(*made.notices, notice)), None
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Parts:
-    """Results of parts of an assessment, packed, by the fingerprint of what they depend on.
+class StoredLife:
+    """What the next assessment of a life begins with."""
 
-    `known` are those of the assessment before, `used` those that this one has used or computed.
+    start: LifeStart  # draws of its posterior
+    n_logs: int
+    verdict: str
+    past: str  # fingerprint of the logs before the baseline, and the lives that ended with them
+    ended: tuple[EndedLife, ...]
+
+
+def _with_results(
+    made: Assessment, history: History, epochs: int, before: StoredLife | None
+) -> tuple[Assessment, StoredLife]:
+    """Add what follows from the posterior of the life of accepted estimates.
+
+    emcee draws it the first time, after each sixteenth log and where the verdict changes; otherwise
+    importance sampling updates it.
     """
-
-    known: Mapping[str, bytes]
-    executor: Executor | None = None
-    used: dict[str, bytes] = field(default_factory=dict)
-
-    @property
-    def mapper(self) -> Callable[..., Iterable[Any]]:
-        """Function that maps, in parallel where there is an executor."""
-        return map if self.executor is None else partial(map_in_order, self.executor)
-
-    def map(
-        self, kind: Any, function: Callable[..., object], *columns: Iterable[Any]
-    ) -> Iterator[Any]:
-        """Map a function over columns of arguments, except where its result is known."""
-        rows = [*zip(*columns, strict=True)]
-        keys = [fingerprint(VERSION, kind.__name__, *row) for row in rows]
-        found = {key: unpack_or_none(self.known.get(key), kind) for key in keys}
-        left = {key: row for key, row in zip(keys, rows, strict=True) if found[key] is None}
-        if left:
-            made = self.mapper(function, *zip(*left.values(), strict=True))
-            found |= dict(zip(left, made, strict=True))
-        self.used.update((k, pack(found[k]) if k in left else self.known[k]) for k in keys)
-        return (found[key] for key in keys)
+    stage, every = made.stage, constants.EMCEE_EVERY
+    seed = seed_of(made.seed, history.stage, stage.digest)
+    past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
+    if before is None or before.past != past:
+        ended = ended_lives(history, stage, seed)
+    else:
+        ended = before.ended
+    chains = before is None or len(history.logs) // every > before.n_logs // every
+    start = None if before is None else before.start
+    life = fit_life(history, stage, seed, chains=chains, before=start)
+    found = _with_life(made, life, history, epochs)
+    if before is not None and not chains and found.judgement.verdict != before.verdict:
+        life = fit_life(history, stage, seed, before=start)
+        found = _with_life(made, life, history, epochs)
+    found = replace(found, ended=ended, evidence=machine_evidence(stage, life))
+    n_logs, verdict = len(history.logs), found.judgement.verdict
+    return found, StoredLife(life.start, n_logs, verdict, past, ended)
 
 
-def map_in_order(
-    executor: Executor, function: Callable[..., Part], *columns: Iterable[Any]
-) -> Iterator[Part]:
-    """Apply a function to columns of arguments in parallel; yield the results in order."""
-    # `Executor.map` cancels futures when it is interrupted, which an executor of loky that is shut
-    # down afterwards would log as an error of its own.
-    futures = [executor.submit(function, *row) for row in zip(*columns, strict=True)]
-    return (future.result() for future in futures)
+def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: int) -> Assessment:
+    """Add what follows from the draws of a life: health, remaining life and verdict."""
+    stage, prognosis, notices = made.stage, None, made.notices
+    health = health_of(life, history, stage, epochs_to_publish(history, stage, epochs))
+    if parameters_with_limit(stage):
+        try:
+            prognosis = prognosis_of(life, history, stage)
+        except NotEnoughData as error:
+            notices = (*notices, Notice("no-result", "serious", "", str(error)))
+    judgement = judge(stage, made.history, health, made.track, doubt=made.doubt)
+    return replace(made, health=health, prognosis=prognosis, judgement=judgement, notices=notices)
 
 
 def _life_key(stage: Stage, seed: int) -> str:
-    """Return the key of the part from which the next posterior of a life is sampled."""
+    """Return the key of the part of an assessment that the next one begins with."""
     return fingerprint(VERSION, "life", stage.digest, seed)
-
-
-def _prognose(
-    history: History, stage: Stage, seed: tuple[int, int], before: LifeStart | None
-) -> tuple[Prognosis, MachineEvidence, LifeStart]:
-    """Return a prognosis, the evidence for a fleet prior, and the start of the next posterior.
-
-    They are smaller than the posterior.
-    """
-    prognosis, posterior = prognose_with_posterior(history, stage, seed, before=before)
-    return prognosis, machine_evidence(stage, posterior), posterior.start
 
 
 # All machines of a run
@@ -277,7 +264,7 @@ def assess_all(
     left = [machine for machine in machines if machine.name not in known]
     resources.progress("assessing", len(known), len(machines))
     work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
-    mapper = partial(_assessed, pool=resources.pool, n_machines=len(left))
+    mapper = partial(resources.pool.map_unordered, _assess_packed, on_crash=lambda _, why: why)
     for k, ((machine, *_), made) in enumerate(work.divided(left, store, mapper), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
@@ -285,20 +272,6 @@ def assess_all(
             failed[machine.name] = made
         resources.progress("assessing", len(known) + k, len(machines))
     return failed
-
-
-def _assessed(
-    jobs: Iterator[_Job], pool: Pool, n_machines: int
-) -> Iterator[tuple[_Job, PackedAssessment | str]]:
-    """Assess machines in parallel; where they are fewer than workers, the parts of each."""
-    if pool.executor is None or n_machines >= pool.size:
-        yield from pool.map_unordered(_assess_packed, jobs, lambda _, why: why)
-        return
-    for job in jobs:
-        try:
-            yield job, _assess_packed(job, pool.executor, pool.crashes)
-        except pool.crashes:  # a worker was killed: without workers it only takes longer
-            yield job, _assess_packed(job)
 
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
@@ -321,19 +294,20 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
     return PackedAssessment(pack(assessment), evidence, summary)
 
 
-def _assess_packed(
-    job: _Job, executor: Executor | None = None, crashes: tuple[type[Exception], ...] = ()
-) -> PackedAssessment | str:
+def _assess_packed(job: _Job) -> PackedAssessment | str:
     """Assess a machine; return why it fails, but raise what workers fail of."""
     machine, logs, known = job
 
     def work() -> PackedAssessment:
-        parts, readings = Parts(known, executor), unpack_logs(logs)
-        made = pack_assessment(_assess(readings, machine, parts))
-        parts.used.update(_pack_rows(readings, machine, known.get(_ROWS)))
-        return replace(made, parts=parts.used)
+        readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
+        before = unpack_or_none(known.get(key), StoredLife)
+        found, after = _assess(readings, machine, before)
+        parts = _pack_rows(readings, machine, known.get(_ROWS))
+        if after is not None:
+            parts[key] = pack(after)
+        return replace(pack_assessment(found), parts=parts)
 
-    return reason_if_failed(work, machine.name, (CancelledError, *crashes))
+    return reason_if_failed(work, machine.name, (CancelledError,))
 
 
 @dataclass(frozen=True, slots=True)
@@ -405,6 +379,7 @@ def apply_fleet_priors(
             key=key,
             content=store.assessment(machine.name, machine.key),
             life=store.part(machine.name, _life_key(machine.stage, machine.seed)),
+            epochs=machine.epochs,
             prior=prior,
             ended=ended,
         )
@@ -455,7 +430,8 @@ class _UpdateJob(NamedTuple):
     machine: str
     key: str
     content: bytes | None  # packed assessment by the description
-    life: bytes | None  # packed start of its posterior, as in `Parts`
+    life: bytes | None  # packed `StoredLife`
+    epochs: int
     prior: FleetPrior | None  # None where the prognosis is calibrated instead
     ended: tuple[EndedLife, ...]
 
@@ -479,9 +455,11 @@ def _update(job: _UpdateJob) -> PackedAssessment | str | None:
         history = accepted_estimates(found.history, found.track)
         stage = job.prior.apply_to(found.stage)
         seed = seed_of(found.seed, history.stage, stage.digest)
-        before = unpack_or_none(job.life, LifeStart)
-        prognosis, _ = prognose_with_posterior(history, stage, seed, before=before)
-        return pack_assessment(replace(found, prognosis=prognosis, fleet=job.prior))
+        before = unpack_or_none(job.life, StoredLife)
+        start = None if before is None else before.start
+        life = fit_life(history, stage, seed, chains=before is None, before=start)
+        made = _with_life(replace(found, stage=stage), life, history, job.epochs)
+        return pack_assessment(replace(made, stage=found.stage, fleet=job.prior))
 
     return reason_if_failed(work, job.machine)
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from lmshealth._private.tables import Row
 from lmshealth.batch import constants
-from lmshealth.health.verdict import NO_HEALTH, degraded_words, undeclared_events
+from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import prognosis_rows
@@ -83,6 +83,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("FAILURE", "limit-reached", reached),
         ("OFF_SPEC", "alarm", status.alarms and not judged),
         ("OFF_SPEC", "step", verdict == "step"),
+        ("OFF_SPEC", OUTSIDE_MAP, verdict == OUTSIDE_MAP),
         ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
         ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
@@ -207,7 +208,7 @@ def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
     found = [
         ("health", row["parameter"], row["recorded_at"], row["q05"], row["median"], row["q95"])
         for row in tables["health"]
-        if row["converged"] and row["identifiable"] and row["informed"] >= INFORMED
+        if row["identifiable"] and row["informed"] >= INFORMED
     ]
     for row in tables["track"][-constants.TRACK_POINTS :]:
         hertz, spread = row["frequency_hz"], 1.645 * row["frequency_std_hz"]

@@ -1,9 +1,7 @@
 """Commands that continue from tables of estimates: track, infer, prognose."""
 
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from datetime import datetime
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,22 +14,19 @@ from lmshealth._private.seeds import seed_of
 from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars
-from lmshealth.errors import BadTable, NotConverged, NotEnoughData
-from lmshealth.health.inference import epochs_to_infer, infer_together
-from lmshealth.health.inference import infer as infer_health
-from lmshealth.health.results import Health
-from lmshealth.health.verdict import doubt_of_names
+from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.io.log import Refusal
-from lmshealth.prognosis.life_posterior import LifePosterior
-from lmshealth.prognosis.maintenance_decision import decide, probability_before
-from lmshealth.prognosis.remaining_life import prognose_with_posterior
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_drifts
+from lmshealth.life.maintenance_decision import decide, probability_before
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.remaining_life import prognosis_of
+from lmshealth.life.verdict import doubt_of_names
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
-from lmshealth.stage.description import Decision, load_stage
+from lmshealth.stage.description import Decision
 from lmshealth.tracking.history import History, missing_mode_notices
-from lmshealth.tracking.read_tables import Drifts, read_drifts, read_machines
+from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals
 from lmshealth.tracking.track import track as track_modes
@@ -114,77 +109,56 @@ def _notes(history: History, refused: list[Refusal]) -> list[str]:
 
 
 @options.command(
-    "infer result/track.csv --stage lms-y --out health.csv --posterior health.nc",
-    "infer y/track.csv --stage lms-y --with x/track.csv lms-x --shared guide_preload "
-    "--out health.csv",
+    "infer result/modes.csv --stage lms-y --out health.csv --posterior health.nc",
+    "infer drifts.csv --stage lms-y --out health.csv",
 )
-@click.argument("table", metavar="TRACK.csv", type=options.TABLE)
+@click.argument("table", metavar="MODES.csv", type=options.TABLE)
 @options.stage_option(required=True)
 @options.out_option(help="Table of the health parameters.")
-@click.option(
-    "--cov",
-    type=options.TABLE,
-    help="Covariances of the drifts; default track_cov.csv in the same folder.",
-)
+@options.COV
+@options.MAINTENANCE
 @click.option("--posterior", type=options.OUT, help="All draws, as NetCDF for ArviZ.")
-@click.option(
-    "--with",
-    "others",
-    type=(options.TABLE, load_stage),
-    multiple=True,
-    metavar="TRACK.csv STAGE",
-    help="Another machine that shares a part with the first; see --shared.",
-)
-@click.option(
-    "--shared",
-    multiple=True,
-    callback=options.once,
-    metavar="PARAMETER",
-    help="Parameter that the machines share.",
-)
 @options.ALLOW_FUTURE
 @options.EPOCHS
 @options.SEED
 @click.pass_context
 def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
-    """Infer the health parameters from a track, epoch by epoch.
+    """Infer the health parameters from a table of estimates, by all logs of a life.
 
-    Required columns: recorded_at, mode, drift and drift_std, as in track.csv. With --with and
-    --shared, machines that share a part (such as one guide in two configurations) are inferred
-    together, at the epochs of the first.
+    Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. From a
+    table with the columns drift and drift_std, as of track.csv, each epoch is inferred from its own
+    drifts alone, since they are filtered; --cov has their covariances, by default track_cov.csv in
+    the same folder.
     """
-    if bool(given["others"]) != bool(given["shared"]):
-        raise click.UsageError("--with and --shared need each other: which parameter is shared?")
-    tables_of = Counter(path.resolve() for path in (table, *(path for path, _ in given["others"])))
-    if repeated := [str(path) for path, times in tables_of.items() if times > 1]:
-        raise click.UsageError(f"{', '.join(repeated)} is named twice: its data would count twice.")
     with progress_bars(PATIENCE) as progress:
-        found, lost = _infer_machines(table, given, progress)
+        if has_drifts(table):
+            found, lost = _infer_drifts(table, given, progress)
+        else:
+            machines, lost = _lives(_machines(table, given), given, progress)
+            found = []
+            for history, life in machines:
+                epochs = epochs_to_publish(history, given["stage"], given["epochs"])
+                found.append(health_of(life, history, given["stage"], epochs))
     for health in found:
         views.print_health(health)
     rows = [row for health in found for row in tables.to_rows(health.to_columns())]
     _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
 
 
-def _infer_machines(
+def _infer_drifts(
     table: Path, given: dict[str, Any], progress: Progress
 ) -> tuple[list[Health], list[str]]:
-    """Infer all machines of a table; return results, and reasons of those that have none."""
-    stage, latest = given["stage"], given["latest"]
-    machines = _read_drifts(table, given["cov"], latest)
-    if given["others"]:
-        others = [
-            (_single(path, _read_drifts(path, None, latest)), own) for path, own in given["others"]
-        ]
-        together = [(_single(table, machines), stage), *others]
-        names = [f"{drifts.stage}\n{own.digest}" for drifts, own in together]
-        seed = seed_of(given["seed"], *names)
-        epochs = epochs_to_infer(*together[0], given["epochs"])
-        mapper = partial(_counting_map, "together", progress)
-        return [infer_together(together, given["shared"], seed, epochs=epochs, mapper=mapper)], []
-    found, lost = [], []
+    """Infer all machines of a table of drifts; return results, and reasons of those without."""
+    stage, found, lost = given["stage"], [], []
+    if given["maintenance"]:
+        raise click.UsageError("--maintenance belongs to a table of estimates: this has drifts")
+    default = table.with_name("track_cov.csv")
+    terms = given["cov"] or (default if default.exists() else None)
+    machines, notes = read_drifts(table, cross_terms=terms, latest=given["latest"])
+    print_notes(f"{table}: {note}" for note in notes)
     known = {mode.name for mode in stage.modes}
-    for drifts in machines:
+    for k, drifts in enumerate(machines):
+        progress("inferring", k, len(machines))
         strange = sorted(set(drifts.modes) - known)
         if strange and known & set(drifts.modes):  # else health would silently do without them
             why = f"modes {strange} are none of {stage.name}, which has {sorted(known)}"
@@ -192,36 +166,21 @@ def _infer_machines(
             continue
         seed = seed_of(given["seed"], drifts.stage, stage.digest)
         try:
-            epochs = epochs_to_infer(drifts, stage, given["epochs"])
-            mapper = partial(_counting_map, drifts.stage, progress)
-            found.append(infer_health(drifts, stage, seed, epochs=epochs, mapper=mapper))
-        except NotEnoughData as why:
+            found.append(infer_drifts(drifts, stage, seed, epochs=given["epochs"]))
+        except (NotEnoughData, NotConverged) as why:
             lost.append(str(why))
+    progress("inferring", len(machines), len(machines))
     return found, lost
 
 
-def _counting_map(
-    name: str, progress: Progress, function: Callable[..., Any], *columns: Sequence[Any]
-) -> Iterator[Any]:
-    """Map a function as ``map`` does, and report the progress."""
-    for k, result in enumerate(map(function, *columns)):
-        progress(name, k + 1, len(columns[0]))
-        yield result
-
-
-def _read_drifts(table: Path, cov: Path | None, latest: datetime | None) -> list[Drifts]:
-    default = table.with_name("track_cov.csv")
-    terms = cov or (default if default.exists() else None)
-    found, notes = read_drifts(table, cross_terms=terms, latest=latest)
-    print_notes(f"{table}: {note}" for note in notes)
-    return found
-
-
-def _single(table: Path, machines: list[Drifts]) -> Drifts:
-    if len(machines) > 1:
-        found = f"{len(machines)} machines ({', '.join(m.stage for m in machines)})"
-        raise BadTable(f"{table}: {found}; needed is a table of the one that shares a part")
-    return machines[0]
+def _machines(table: Path, given: dict[str, Any]) -> list[History]:
+    """Read the machines of a table of estimates, and print what it lacks."""
+    machines, notes = read_machines(table, given["stage"], **_reading(given))
+    print_notes(notes)
+    for history, refused in machines:
+        missing = missing_mode_notices(history, refused)
+        print_notes(f"{history.stage}: {notice.what}" for notice in missing)
+    return [history for history, _ in machines]
 
 
 @options.command(
@@ -261,15 +220,14 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
-    machines, notes = read_machines(table, stage, **_reading(given))
-    print_notes(notes)
-    for history, refused in machines:
-        missing = missing_mode_notices(history, refused)
-        print_notes(f"{history.stage}: {notice.what}" for notice in missing)
     with progress_bars(PATIENCE) as progress:
-        progress("prognosing", 0, len(machines))
-        found, lost = _prognose_machines([history for history, _ in machines], given, progress)
-    rows = []
+        machines, lost = _lives(_machines(table, given), given, progress)
+    found, rows = [], []
+    for history, posterior in machines:
+        try:
+            found.append((prognosis_of(posterior, history, stage), posterior))
+        except NotEnoughData as why:
+            lost.append(str(why))
     for prognosis, _ in found:
         life, service, before = summarise_life(prognosis, stage), decide(prognosis, decision), None
         last = prognosis.recorded_at.date()
@@ -292,25 +250,25 @@ def _decision(described: Decision, risk: float | None, ratio: float | None) -> D
     return replace(described, max_risk=risk, cost_ratio=ratio)
 
 
-def _prognose_machines(
+def _lives(
     histories: list[History], given: dict[str, Any], progress: Progress
-) -> tuple[list[tuple[Prognosis, LifePosterior | None]], list[str]]:
-    """Prognose all machines of a table; return results, and reasons of those that have none."""
+) -> tuple[list[tuple[History, LifePosterior]], list[str]]:
+    """Fit the lives of all machines; return them with accepted logs, and reasons of the others."""
     found, lost, stage = [], [], given["stage"]
     for k, history in enumerate(histories):
+        progress("sampling", k, len(histories))
         try:
             tracked = track_modes(history, stage)
             if doubt := doubt_of_names(stage, history, tracked):
                 raise NotEnoughData(f"{history.stage}: {doubt}")
             accepted = accepted_estimates(history, tracked)
             seed = seed_of(given["seed"], history.stage, stage.digest)
-            prognosis, posterior = prognose_with_posterior(accepted, stage, seed)
-            found.append((prognosis, posterior if given["posterior"] else None))
+            found.append((accepted, fit_life(accepted, stage, seed)))
         except NotEnoughData as why:
             lost.append(str(why))
         except (NotConverged, LinAlgError) as why:
             lost.append(f"{history.stage}: {why}; check the units of odometer and frequencies")
-        progress("prognosing", k + 1, len(histories))
+    progress("sampling", len(histories), len(histories))
     return found, lost
 
 

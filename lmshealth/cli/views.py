@@ -14,8 +14,8 @@ from lmshealth.cli.terminal import (
     print_view,
     short_names,
 )
-from lmshealth.health.results import Health
-from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
+from lmshealth.life.health import Health
+from lmshealth.life.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report import constants
 from lmshealth.report.assessment import Life, ParameterHealth, Summary
 from lmshealth.report.tables import events_rows, to_rows, track_rows
@@ -356,8 +356,6 @@ def print_health(health: Health) -> None:
     rows = to_rows(health.to_columns())[-len(health.parameters) :]
     for row in rows:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
-        if not row["converged"]:
-            row["interval"] = "not converged"
     when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
     print_view(title, "health", rows)
@@ -368,27 +366,18 @@ def print_health(health: Health) -> None:
         print_text(f"Correlation of {first} and {second}: {rho:+.2f}.")
     if not health.explained:
         print_text(
-            f"No state of the parameters on the map explains these drifts (p = {health.fit[-1]:.1g}"
-            "): no health is reported. Check for other causes of the drifts and errors of the map."
+            f"No life of the parameters on the map explains these logs (p = {health.fit[-1]:.1g}): "
+            "no health is reported. Check for other causes of the drifts and errors of the map."
         )
     for row, publishable in zip(rows, health.publishable_parameters(), strict=True):
         for doubt in _doubts(row, determined=publishable or not health.explained):
             print_text(f"{row['parameter']}: {doubt}")
-    for when, converged in zip(map(day, health.recorded_at), health.converged, strict=True):
-        if not converged:
-            print_text(f"The sampler did not converge at {when}.")
 
 
 def _doubts(row: Row, *, determined: bool) -> Iterator[str]:
     """Yield what limits the use of the posterior of a parameter."""
     if row["at_edge"]:
         yield "the posterior ends at the edge of the map; this is a bound. Extend the map."
-    shift, ratio = row["laplace_shift"], row["laplace_ratio"]
-    if abs(shift) > constants.LAPLACE_SHIFT or abs(math.log(ratio)) > constants.LAPLACE_LN_RATIO:
-        yield (
-            f"the posterior is not normal; Laplace's approximation lies {shift:+.1f} σ lower, and "
-            f"the posterior is {ratio:.2f} times as wide."
-        )
     if not row["identifiable"]:
         yield "not identifiable from the tracked modes; see `lmshealth stage`."
     elif not determined:

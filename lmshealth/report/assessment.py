@@ -1,27 +1,26 @@
 """Results of one machine (`Assessment`), and their summary in a few numbers (`Summary`)."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Literal
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
-from lmshealth.health.results import Health
-from lmshealth.health.verdict import (
+from lmshealth.io.log import Notice, Refusal
+from lmshealth.life.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
+from lmshealth.life.health import Health
+from lmshealth.life.maintenance_decision import Service, day_after, decide, remaining_days
+from lmshealth.life.prognosis import LawWeight, Prognosis
+from lmshealth.life.verdict import (
     NO_HEALTH,
+    OUTSIDE_MAP,
     Verdict,
-    degraded_below,
     degraded_words,
     undeclared_events,
 )
-from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.prognosis.fleet_prior import Calibration, EndedLife, FleetPrior, MachineEvidence
-from lmshealth.prognosis.maintenance_decision import Service, day_after, decide, remaining_days
-from lmshealth.prognosis.results import LawWeight, Prognosis
 from lmshealth.report import constants
 from lmshealth.report.text import (
     GAP,
@@ -82,18 +81,8 @@ class Assessment:
         return "\n".join(lines)
 
     def service(self) -> Service:
-        """Choose the day of the service by the rule of the description.
-
-        It is now where the health that is shown is below a limit with more than the accepted risk.
-        """
-        decision = self.stage.description.decision
-        found = decide(self.prognosis, decision)
-        below = max((own.below_limit for own in _parameters(self) if own.determined), default=0.0)
-        if found.kind in ("by", "later") and below > (decision.accepted or np.inf):
-            day = self.judgement.recorded_at.date()
-            now = replace(found, kind="now", by=day, wait=0.0, risk=max(found.risk, below))
-            return replace(now, inspect_by=day, earliest_end=day)
-        return found
+        """Choose the day of the service by the rule of the description."""
+        return decide(self.prognosis, self.stage.description.decision)
 
     @property
     def alarmed(self) -> tuple[str, ...]:
@@ -112,33 +101,7 @@ class Assessment:
     @property
     def latest_health(self) -> Health | None:
         """The health as fractions of the baseline, if it has an epoch and a parameter."""
-        return self._relative(self.health)
-
-    @property
-    def present(self) -> Health | None:
-        """The health that gauges and the verdict show.
-
-        Its last epoch is pooled in equal parts with health now by the laws where both disagree:
-        about an interval, or whether most draws are degraded.
-        """
-        health, prognosis = self.health, self.prognosis
-        both = list(_by_both_methods(self))
-        degraded = [
-            {np.median(draws) < degraded_below(spec) / spec.baseline for draws in own}
-            for spec, *own in both
-        ]
-        apart = any(disagreements(self)) or any(len(one) > 1 for one in degraded)
-        if health is None or prognosis is None or not apart:
-            return health
-        chains = np.array(health.chains)
-        pooled = chains[-1].reshape(-1, len(health.parameters))[::2]
-        rows = np.linspace(0, len(prognosis.health) - 1, len(pooled), dtype=int)
-        for j, name in enumerate(health.parameters):
-            if name in prognosis.parameters:
-                pooled[:, j] = prognosis.health[rows, prognosis.parameters.index(name)]
-        return replace(health, chains=chains)
-
-    def _relative(self, health: Health | None) -> Health | None:
+        health = self.health
         if health is None or not (health.recorded_at and health.parameters):
             return None
         return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
@@ -148,6 +111,8 @@ class Assessment:
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
+        if verdict == OUTSIDE_MAP:
+            return 1, 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
         days = service.wait
@@ -161,7 +126,6 @@ class ParameterHealth:
 
     name: str
     determined: bool  # whether the data determine it; else its interval is mostly the prior
-    converged: bool  # whether the sampler converged
     informed: float  # as `Health.informed`
     low: float  # low, median, high: 5, 50 and 95 % quantiles, as fractions of the baseline
     median: float
@@ -251,7 +215,8 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
-    states: dict[str, State] = {"healthy": "good", **dict.fromkeys(NO_HEALTH, "open")}
+    states: dict[str, State] = {"healthy": "good", OUTSIDE_MAP: "open"}
+    states |= dict.fromkeys(NO_HEALTH, "open")
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     return Summary(
         file=file,
@@ -339,6 +304,7 @@ def verdict_text(verdict: str, parameters: tuple[ParameterSpec, ...]) -> str:
         "no-alarm": "modes tracked, no alarm",
         "not-enough-data": "not enough data for a verdict",
         "step": "sudden change without a known cause",
+        OUTSIDE_MAP: "a mode moved alone, by a cause outside the map",
     }
     lost = degraded_words(verdict)
     names = [spell(spec.name) for spec in parameters if spec.word in lost]
@@ -364,6 +330,10 @@ def _next_step(assessment: Assessment, service: Service, state: State) -> str:
     if assessment.alarmed or verdict == "step":
         what = "Inspect guide and mount now, and look for work, loads or tunings that the logs lack"
         return f"{what}; then record a log."
+    if verdict == OUTSIDE_MAP:
+        return "Find out what moved the mode: " + (
+            "its sensor, cables, payload or attachments; then record a log."
+        )
     if prognosis is None or service.kind == "unknown":
         return "" if state == "good" else "Record further logs; the reasons are below."
     first = first_limit(prognosis)
@@ -388,7 +358,7 @@ def _often(days: float) -> str:
 
 
 def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
-    health = assessment._relative(assessment.present)
+    health = assessment.latest_health
     if health is None:
         return
     for k, spec in enumerate(assessment.stage.parameters):
@@ -397,7 +367,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         low, median, high = np.quantile(draws, constants.LEVELS).tolist()
         determined = bool(health.publishable_parameters()[k])
         rows = np.linspace(0, len(health.travel) - 1, constants.COURSE_POINTS).round().astype(int)
-        rows = np.unique(rows[health.converged[rows]])
+        rows = np.unique(rows)
         bands = np.quantile(health.samples[rows, :, k], constants.LEVELS, axis=1)
         # Without an odometer the epochs are at equal distances.
         at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
@@ -405,7 +375,6 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
         yield ParameterHealth(
             name=spec.name,
             determined=determined,
-            converged=bool(health.converged[-1]),
             informed=float(health.informed[-1, k]),
             low=low,
             median=median,
@@ -416,33 +385,6 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
             unit=spec.unit,
             course=tuple(map(tuple, course.tolist())) if determined else (),
         )
-
-
-def disagreements(assessment: Assessment) -> Iterator[tuple[str, FloatArray, FloatArray]]:
-    """Yield parameters whose 90 % intervals by the last epoch and by the laws do not overlap.
-
-    After the name draws of health now by either, as fractions of the baseline.
-    """
-    for spec, by_epoch, by_laws in _by_both_methods(assessment):
-        (low, high), (least, most) = (
-            np.quantile(draws, (0.05, 0.95)).tolist() for draws in (by_epoch, by_laws)
-        )
-        if low > most or least > high:
-            yield spec.name, by_epoch, by_laws
-
-
-def _by_both_methods(
-    assessment: Assessment,
-) -> Iterator[tuple[ParameterSpec, FloatArray, FloatArray]]:
-    """Yield the published parameters that have a limit, with draws as `disagreements` does."""
-    health, prognosis = assessment.latest_health, assessment.prognosis
-    if health is None or prognosis is None:
-        return
-    for k in np.flatnonzero(health.publishable_parameters()).tolist():
-        spec = assessment.stage.parameters[k]
-        if spec.name in prognosis.parameters:
-            by_laws = prognosis.health[:, prognosis.parameters.index(spec.name)] / spec.baseline
-            yield spec, health.samples[-1, :, k], by_laws
 
 
 # Changes since the last report

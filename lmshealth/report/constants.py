@@ -15,9 +15,6 @@ LEAST_PROBABILITY, LARGEST_PROBABILITY = 0.01, 0.99
 SCALE_SHOWN = 0.05
 # A law of degradation is named on a terminal from this probability on.
 LAW_SHOWN = 0.01
-# A posterior is called non-normal when Laplace's approximation differs by more than this:
-# shift of the mean in standard deviations, and |ln| of the ratio of standard deviations.
-LAPLACE_SHIFT, LAPLACE_LN_RATIO = 0.5, 0.3
 # The page warns that the random walk explains as much as the laws when its standard deviation
 # exceeds this share of the largest drift.
 WALK_SHARE = 0.5
@@ -48,6 +45,3 @@ TERMINAL_MACHINES, TERMINAL_ROWS = 3, 20
 # On a terminal: lines of a frequency response; harmonics per channel where several channels are
 # listed; velocities in one table.
 TERMINAL_LINES, TERMINAL_HARMONICS, TERMINAL_VELOCITIES = 12, 12, 7
-
-NAMED = 0.9
-"""Modes that disagree with the map are named until one of them is wrong with this probability."""

@@ -20,12 +20,12 @@ from scipy.special import gammaincinv
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.result import Result
 from lmshealth.errors import BadQuestion
-from lmshealth.health.results import Health
 from lmshealth.io.log import SI_UNITS, Log
+from lmshealth.life.health import Health
+from lmshealth.life.maintenance_decision import Service
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.prognosis.maintenance_decision import Service
-from lmshealth.prognosis.results import Prognosis
 from lmshealth.report import constants
 from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -210,7 +210,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
     informed = bool(health.publishable_parameters()[column])
-    name = "each epoch by itself" if informed else "mostly prior, not measured"
+    name = "health by all logs" if informed else "mostly prior, not measured"
     _bands(ax, health.travel / _KM, bands, name, informed=informed)
     if informed:  # else no values are published
         texts = [
@@ -219,10 +219,6 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
             for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
         ]
         hints(ax, health.travel / _KM, bands[2], texts)
-    failed = ~health.converged
-    if failed.any():
-        where = health.travel[failed] / _KM
-        ax.plot(where, bands[2, failed], "x", color=RED, ms=6, label="sampler not converged")
     _levels(ax, limit)
     # Show bands up to 250 %, baseline and limit.
     values = [100.0, float(np.nanmin(bands[0])), float(np.nanmax(bands[4]))]

@@ -14,12 +14,12 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lmshealth.health.results import Health
 from lmshealth.io.log import Refusal
-from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior, Pace
-from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
-from lmshealth.prognosis.maintenance_decision import Service, day_after, probability_before
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
+from lmshealth.life.health import Health
+from lmshealth.life.likelihood import expected_scatter, scatter_prior
+from lmshealth.life.maintenance_decision import Service, day_after, probability_before
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, Summary, changes, first_limit, limit_of
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size

@@ -5,11 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth.io.log import WARNINGS, Notice, Refusal
-from lmshealth.prognosis.constants import CALIBRATED_RISK, SURPRISE
-from lmshealth.prognosis.results import ModeError
-from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, disagreements
-from lmshealth.report.text import quantiles, signed, spell
+from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, SURPRISE
+from lmshealth.life.verdict import lone_sentence
+from lmshealth.report import figures
+from lmshealth.report.assessment import Assessment
+from lmshealth.report.text import spell
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -52,11 +52,8 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
     health = assessment.latest_health
     if health is None:
         return
-    if not health.converged[-1]:
-        what = "The sampler of health did not converge, so no value is published."
-        yield Notice("not-converged", "serious", "", what, "Record further logs.")
     if not health.explained:
-        what = f"No state on the map explains the drifts of the modes (p = {health.fit[-1]:.1g})."
+        what = f"No life of the parameters explains the modes (p = {health.fit[-1]:.1g})."
         to_do = "Check what else moved the modes, and the map."
         yield Notice("unexplained-drifts", "serious", "", what, to_do)
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
@@ -87,14 +84,14 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     for name in prognosis.unidentifiable:
         what = f"The limit of {spell(name)} is left out of the life: the modes do not show it."
         yield Notice("limit-not-included", "caution", name, what)
-    if prognosis.modes_off:
-        yield _of_map(prognosis.modes_off)
+    for lone in prognosis.modes_off:
+        if lone.probability >= LONE_NAMED:
+            what = lone_sentence(lone, assessment.stage)
+            yield Notice("mode-off-map", "caution", lone.mode, what)
     dof = prognosis.degrees_of_freedom
-    if dof > 0 and prognosis.chi_square > figures.chi_square_band(np.array(float(dof)))[1]:
-        what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof})."
-        to_do = (
-            "Do not rely on the remaining life; use the last epoch, and record further logs soon."
-        )
+    if dof > 0 and prognosis.chi_square > figures.chi_square_band(np.array(dof))[1]:
+        what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof:.0f})."
+        to_do = "Do not rely on the remaining life, and record further logs soon."
         yield Notice("laws-do-not-fit", "serious", "", what, to_do)
     fleet = assessment.calibration
     if fleet is not None and fleet.p_value < SURPRISE:
@@ -102,27 +99,3 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
         what += f"travel predicted for {CALIBRATED_RISK:.0%} of them (p = {fleet.p_value:.1g})."
         to_do = "Plan by the calibrated travel instead of the service date; add a law that fits."
         yield Notice("fleet-ends-early", "serious", "", what, to_do)
-    for name, by_epoch, by_laws in disagreements(assessment):
-        (least, _, most), (low, _, high) = quantiles(by_epoch), quantiles(by_laws)
-        what = f"{spell(name).capitalize()} is {100 * least:.0f} to {100 * most:.0f} % by the last "
-        what += f"epoch alone, and {100 * low:.0f} to {100 * high:.0f} % by the laws of all logs."
-        to_do = "Gauges and verdict pool both; allow for the lower, and record a log soon."
-        yield Notice("methods-disagree", "serious", name, what, to_do)
-
-
-def _of_map(errors: tuple[ModeError, ...]) -> Notice:
-    """Return the notice about the modes of which one disagrees with the map."""
-    upto = np.cumsum([one.probability for one in errors])
-    likely = errors[: int(np.searchsorted(upto, constants.NAMED)) + 1]
-    texts = [
-        f"{spell(one.mode)} drifts by {signed(100 * one.size, 0)} ± {100 * one.std:.0f} % of what "
-        f"the map predicts from the other modes (probability {one.probability:.0%})"
-        for one in likely
-    ]
-    what = " or ".join(texts)
-    to_do = (
-        "Check the name and the sensitivities of the mode; correct the map, or declare its error "
-        "(model_std). The intervals allow for three times the declared one."
-    )
-    where = " or ".join(one.mode for one in likely)
-    return Notice("mode-off-map", "caution", where, f"{what[0].upper()}{what[1:]}.", to_do)

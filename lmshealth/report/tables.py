@@ -13,11 +13,11 @@ import numpy as np
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
+from lmshealth.life.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.modal.frf.identification import FrfReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes
-from lmshealth.prognosis.maintenance_decision import ProbabilityBounds, Service
 from lmshealth.report.assessment import Assessment, Life, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.report.notices import notices

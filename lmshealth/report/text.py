@@ -13,7 +13,7 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.report import constants
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
-    from lmshealth.prognosis.maintenance_decision import Service
+    from lmshealth.life.maintenance_decision import Service
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands

@@ -35,7 +35,7 @@ MAX_RISK = 0.05
 # Words of verdict.csv for the parameters of lms-x and lms-y (every other parameter has its own
 # name), and those that name no parameter.
 VERDICT_WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
-RESERVED_WORDS = ("healthy", "both", "step", "alarm", "no-alarm", "not-enough-data")
+RESERVED_WORDS = ("healthy", "both", "step", "alarm", "no-alarm", "not-enough-data", "outside-map")
 
 # --- Error of the modal map ---------------------------------------------------------------------
 # Factors on the declared model_std, with prior probabilities: machines may differ from the one that

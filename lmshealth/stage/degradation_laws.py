@@ -1,6 +1,7 @@
 """Laws by which a health parameter degrades with travel (README.md, "Degradation laws")."""
 
-from typing import Annotated, ClassVar
+from importlib.metadata import entry_points
+from typing import TYPE_CHECKING, Annotated, ClassVar, Union
 
 import msgspec
 import numpy as np
@@ -294,4 +295,57 @@ class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind",
         return high
 
 
-AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging | Accelerating
+class Free(Law, frozen=True, tag="free", tag_field="kind", kw_only=True):
+    """A change of either direction without a physical model: ln h(s) = a (s / s_now)^b.
+
+    With a ~ N(0, `std`) and ln b ~ N(0, `exponent_sigma`): the change by now, whenever now is.
+    """
+
+    std: Annotated[float, within(*constants.EFFECT)] = 0.15
+    exponent_sigma: Annotated[float, within(*constants.SIGMA)] = 0.5
+    label: ClassVar[str] = "change of either direction without a law"
+    names: ClassVar[tuple[str, ...]] = ("per_power", "exponent")
+
+    def natural(self, y: FloatArray, now: float) -> FloatArray:
+        """Convert y1 = a / std and y2 = ln b / exponent_sigma to a / now^b and b."""
+        exponent = np.exp(np.clip(self.exponent_sigma * y[:, 1], -_LARGEST_LN, _LARGEST_LN))
+        with np.errstate(over="ignore", under="ignore"):
+            return np.column_stack([self.std * y[:, 0] / now**exponent, exponent])
+
+    def log_prior(self, y: FloatArray, now: float) -> FloatArray:
+        """Return the log prior density."""
+        return np.asarray(-0.5 * np.sum(y**2, axis=1) - np.log(2 * np.pi))
+
+    def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
+        """Draw coordinates from the prior."""
+        return rng.standard_normal((n, 2))
+
+    def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
+        """Return the health, which may be above 1."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            change = theta[:, :1] * np.maximum(travel, 0) ** theta[:, 1:]
+        return np.exp(np.minimum(change, _LARGEST_LN))
+
+    def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
+        """Return the travel at the limit, inf without a loss."""
+        per_power, exponent = theta.T
+        loss, losing = np.log(np.minimum(limit, 1.0)), per_power < 0
+        with np.errstate(over="ignore"):
+            travel = (loss / np.where(losing, per_power, -1.0)) ** (1 / exponent)
+        return np.where(losing | (loss == 0), travel, np.inf)
+
+
+def _laws_of_other_packages() -> tuple[type[Law], ...]:
+    """Load the laws that installed packages offer as entry points of the group `LAWS`."""
+    found = (one.load() for one in entry_points(group=LAWS))
+    return tuple(law for law in found if isinstance(law, type) and issubclass(law, Law))
+
+
+LAWS = "lmshealth.laws"
+"""Group of entry points: each names a subclass of `Law` with a tag of its own."""
+
+if TYPE_CHECKING:
+    AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging | Accelerating | Free
+else:
+    _SHIPPED = (HertzWear, Loosening, Power, Linear, Unchanging, Accelerating, Free)
+    AnyLaw = Union[(*_SHIPPED, *_laws_of_other_packages())]

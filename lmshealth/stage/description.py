@@ -9,7 +9,7 @@ from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 from msgspec import Meta, Struct
@@ -213,6 +213,19 @@ class Usage(_Part, frozen=True):
     horizon_km: Annotated[float, within(*constants.HORIZON_KM)] = 20000.0
 
 
+class LifeSpec(_Part, frozen=True):
+    """What the posterior of a life allows for beside the laws of the parameters, and its clock.
+
+    ``free`` is the share of a parameter's laws that a change without a law has, ``lone_mode`` the
+    prior probability that a mode moves alone, by a cause that the map does not have. The clock
+    ``days`` takes the time for travel, at ``[usage] km_per_day``.
+    """
+
+    free: Annotated[float, within(0, 0.9)] = 0.05
+    lone_mode: Annotated[float, within(0, 0.2)] = 0.03
+    clock: Literal["odometer", "days"] = "odometer"
+
+
 class Description(_Part, frozen=True):
     """The stage description as written; ``source`` and ``loop`` are accepted, not used."""
 
@@ -231,6 +244,7 @@ class Description(_Part, frozen=True):
     baseline: Baseline = Baseline()
     decision: Decision = Decision()
     usage: Usage = Usage()
+    life: LifeSpec = LifeSpec()
 
     def __post_init__(self) -> None:
         if self.health_band_hz is not None:
@@ -240,6 +254,11 @@ class Description(_Part, frozen=True):
                 raise ValueError(f"[[{kind}]] names must be unique, twice: {twice[0]!r}")
         if self.parameter and self.map is None:
             raise ValueError("[[parameter]] needs a [map] of its effect on the modes")
+        if self.life.clock == "days" and self.usage.km_per_day is None:
+            raise ValueError(
+                'clock = "days" takes the time for travel and needs [usage] km_per_day; with 1 '
+                "all lengths in km of the laws count days"
+            )
 
 
 @dataclass(frozen=True, slots=True)

@@ -136,6 +136,11 @@ def read_machines(
     return machines, notes
 
 
+def has_drifts(path: Path) -> bool:
+    """Return whether a table has drifts, as ``track.csv`` does, rather than estimates."""
+    return "drift" in read_rows(path, ()).columns
+
+
 def read_drifts(
     path: Path, *, cross_terms: Path | None = None, latest: datetime | None = None
 ) -> tuple[list[Drifts], list[str]]:

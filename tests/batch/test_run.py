@@ -37,18 +37,18 @@ from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NotConverged, NothingUsable
-from lmshealth.health.inference import epochs_to_infer, infer
+from lmshealth.life.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
 from lmshealth.io.reading import content_digest
 from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.prognosis import life_posterior
-from lmshealth.prognosis.fleet_prior import EndedLife, FleetPrior, LawPrior
-from lmshealth.prognosis.life_likelihood import scatter_prior
-from lmshealth.prognosis.life_posterior import fit_life
-from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.life import life_posterior
+from lmshealth.life.fleet_prior import EndedLife, FleetPrior, LawPrior
+from lmshealth.life.likelihood import scatter_prior
+from lmshealth.life.posterior import fit_life
+from lmshealth.life.remaining_life import prognose
 from lmshealth.report.assessment import Assessment, Summary
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import log_tables, machine_tables

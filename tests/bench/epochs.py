@@ -11,9 +11,9 @@ from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 
 from lmshealth._private.seeds import stream
-from lmshealth.health.ensemble_sampling import start_from_prior
+from lmshealth.life.ensemble_sampling import start_from_prior
 from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.health.inference import draw
+from lmshealth.life.inference import draw
 from lmshealth.stage.description import Stage
 from studies.harness.cost import cpu_s
 

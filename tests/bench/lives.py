@@ -10,9 +10,9 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lmshealth.health.ensemble_sampling import start_from_prior
-from lmshealth.prognosis.life_likelihood import LifeLikelihood, ln_health
-from lmshealth.prognosis.life_posterior import LifeDensity
+from lmshealth.life.ensemble_sampling import start_from_prior
+from lmshealth.life.likelihood import LifeLikelihood, ln_health
+from lmshealth.life.posterior import LifeDensity
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import make_history

@@ -13,8 +13,8 @@ from click.testing import CliRunner, Result
 from lmshealth._private.tables import TABLES
 from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
-from lmshealth.prognosis.remaining_life import prognose_with_posterior
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.remaining_life import prognose_with_posterior
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History

@@ -24,8 +24,8 @@ from lmshealth.cli.views import (
     print_track,
 )
 from lmshealth.modal.naming import Difference
-from lmshealth.prognosis.maintenance_decision import decide, probability_before
-from lmshealth.prognosis.results import LawWeight, Prognosis
+from lmshealth.life.maintenance_decision import decide, probability_before
+from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.report.assessment import Assessment, summarise, summarise_life
 from lmshealth.report.fleet_page import by_urgency
 from lmshealth.report.tables import prognosis_rows, stage_rows

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io.log import Refusal
-from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.life.maintenance_decision import Service
 from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, State, Summary
 
 TODAY = date(2026, 11, 20)

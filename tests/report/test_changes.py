@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lmshealth._private.serialize import pack, unpack
-from lmshealth.prognosis.maintenance_decision import Service
+from lmshealth.life.maintenance_decision import Service
 from lmshealth.report.assessment import (
     Life,
     LimitLife,

@@ -17,10 +17,10 @@ from matplotlib.collections import QuadMesh
 from matplotlib.figure import Figure
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.health.results import Health
+from lmshealth.life.health import Health
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.prognosis.maintenance_decision import decide
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.maintenance_decision import decide
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.text import plain
 from lmshealth.stage.description import Decision

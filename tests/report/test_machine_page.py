@@ -21,10 +21,10 @@ from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
-from lmshealth.prognosis.fleet_prior import FleetPrior, LawPrior
-from lmshealth.prognosis.life_likelihood import expected_scatter, scatter_prior
-from lmshealth.prognosis.maintenance_decision import Service, probability_before
-from lmshealth.prognosis.results import Prognosis
+from lmshealth.life.fleet_prior import FleetPrior, LawPrior
+from lmshealth.life.likelihood import expected_scatter, scatter_prior
+from lmshealth.life.maintenance_decision import Service, probability_before
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.report import figures as plots
 from lmshealth.report.assessment import Assessment
 from lmshealth.report.assessment import summarise as summarise_machine

@@ -10,7 +10,7 @@ import pytest
 from msgspec import structs
 
 from lmshealth._private.tables import TABLES
-from lmshealth.health.verdict import judge
+from lmshealth.life.verdict import judge
 from lmshealth.io.log import Refusal
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices

@@ -15,7 +15,7 @@ from scipy import stats
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.seeds import stream
 from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.health.inference import draw, infer_together
+from lmshealth.life.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.data.histories import map_std
 from studies.harness.metrics import place

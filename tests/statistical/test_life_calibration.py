@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.prognosis import constants
-from lmshealth.prognosis.fleet_prior import machine_evidence, needs_fleet_prior
-from lmshealth.prognosis.life_likelihood import LifeLikelihood
-from lmshealth.prognosis.life_posterior import LifeDensity, fit_life
-from lmshealth.prognosis.remaining_life import _usage, passages
+from lmshealth.life import constants
+from lmshealth.life.fleet_prior import machine_evidence, needs_fleet_prior
+from lmshealth.life.likelihood import LifeLikelihood
+from lmshealth.life.posterior import LifeDensity, fit_life
+from lmshealth.life.remaining_life import _usage, passages
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import map_std

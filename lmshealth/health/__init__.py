@@ -1,1 +1,0 @@
-"""Posterior of the health parameters at single epochs, and the verdict."""

@@ -1,0 +1,221 @@
+"""Data of a life: ln frequencies of the informative modes since the baseline, condensed."""
+
+from dataclasses import dataclass, replace
+from datetime import UTC, datetime
+from typing import Self
+
+import numpy as np
+
+from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.life import constants
+from lmshealth.life.scenarios import Scenario, list_scenarios
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import History
+
+_SECONDS_PER_DAY, _KM, _FEW = 86_400.0, 1000.0, 3
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeData(ReadOnly):
+    """Data of a life, ordered by series, and those of a series by log."""
+
+    stage: Stage
+    history: History  # all logs, condensed
+    # columns, modes, mode_of_series: series of the history that are used, their modes, and
+    # the mode of each, ``(n_series,)``.
+    columns: list[int]
+    modes: tuple[str, ...]
+    mode_of_series: np.ndarray
+    # clock, steps: travel since the baseline in m of each log, shape ``(n_logs,)``, and step
+    # of the modes.
+    clock: FloatArray
+    steps: tuple[float, ...]
+    # rows, y: index of each datum among all series and logs, and its ln f minus the mean of
+    # its mode, shape ``(n_data,)``.
+    rows: np.ndarray
+    y: FloatArray
+
+    @classmethod
+    def select(cls, history: History, stage: Stage, min_logs: int = constants.MIN_LOGS) -> Self:
+        """Select the data of a life; raise `NotEnoughData` as `fit_life` describes it."""
+        if not stage.parameters:
+            raise BadStage(f"{stage.name}: no [[parameter]] to infer")
+        history = condense(with_clock(history, stage), constants.MAX_LOGS)
+        if not history.has_odometer:
+            missing = "not every log has travel_km, and degradation laws count by the odometer"
+            todo = (
+                "add it to manifest.csv, or to every row of the table, or state in the stage "
+                'description [life] clock = "days" with [usage] km_per_day'
+            )
+            raise NotEnoughData(f"{history.stage}: {missing}; {todo}")
+        observed = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
+        names = [name for name in stage.informative if name in history.modes]
+        columns = [i for name in names for i in history.columns(name) if observed[i]]
+        of_series = [history.series[i].mode for i in columns]
+        modes = tuple(dict.fromkeys(of_series))
+        ln_f = history.ln_frequency[history.baseline :, columns]
+        all_clock, steps = clock_and_steps(history)
+        clock = all_clock[history.baseline :]
+        now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
+        if n_logs < min_logs or now <= 0:
+            raise NotEnoughData(
+                f"{history.stage}: {n_logs} logs with a mode of the map over {now / 1000:.4g} km; "
+                f"a life needs at least {min_logs} logs and some travel"
+            )
+        flat = ln_f.T.ravel()
+        rows = np.flatnonzero(np.isfinite(flat))
+        mode_of_series = np.array([modes.index(name) for name in of_series])
+        means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
+        y = flat[rows] - means[mode_of_series[rows // clock.size]]
+        return cls(stage, history, columns, modes, mode_of_series, clock, steps, rows, y)
+
+    @property
+    def now(self) -> float:
+        """Travel since the baseline at the last log in m."""
+        return float(self.clock.max())
+
+    def change(self) -> FloatArray:
+        """Return the change of ln f of each mode from its first logs to its last, ``(n_modes,)``."""
+        found = np.zeros(len(self.modes))
+        for i in range(len(self.modes)):
+            own = self.mode_of == i
+            order = np.argsort(self.clock[self.log_of[own]], kind="stable")
+            y = self.y[own][order]
+            n = max(1, min(_FEW, y.size // 2))
+            found[i] = y[-n:].mean() - y[:n].mean()
+        return found
+
+    @property
+    def log_of(self) -> np.ndarray:
+        """Index of the log of each datum, shape ``(n_data,)``."""
+        return np.asarray(self.rows % self.clock.size)
+
+    @property
+    def mode_of(self) -> np.ndarray:
+        """Index of the mode of each datum, shape ``(n_data,)``."""
+        return np.asarray(self.mode_of_series[self.rows // self.clock.size])
+
+    @property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """Scenarios that the laws and the steps allow."""
+        free = self.stage.description.life.free
+        return list_scenarios(self.stage.parameters, self.steps, self.now, free)
+
+    @property
+    def free(self) -> FloatArray:
+        """1 for a parameter that may change and 0 for one that keeps its value, by parameter."""
+        parameters = self.stage.parameters
+        return np.array([float(any(law.names for law in one.laws)) for one in parameters])
+
+    @property
+    def sensitivity(self) -> FloatArray:
+        """D ln f / d ln parameter at the baseline, 0 if not free, ``(n_modes, n_parameters)``."""
+        assert self.stage.modal_map is not None  # select() has checked
+        rows = [self.stage.modal_map.modes.index(name) for name in self.modes]
+        gradient = self.stage.modal_map.gradient(self.stage.baseline_point[None])
+        return np.asarray(gradient[0, rows] * self.free)
+
+
+def with_clock(history: History, stage: Stage) -> History:
+    """Return a history with the odometer that the clock of its description asks for."""
+    if stage.description.life.clock == "odometer":
+        return history
+    per_day = stage.description.usage.km_per_day
+    assert per_day is not None  # the description has been checked
+    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
+    return replace(history, travel=(seconds - seconds[:1]) / _SECONDS_PER_DAY * per_day * _KM)
+
+
+def condense(history: History, most: int) -> History:
+    """Average neighbouring logs until there are about so many; return a short history as it is.
+
+    Estimates are averaged by generalised least squares over the logs, series and cross terms of a
+    group; moments, odometer and covariates are plain means. A group has the name of its last log.
+    The first log of a baseline and the last log stay alone, and no group reaches across a step.
+    """
+    n = len(history.logs)
+    if n <= most:
+        return history
+    begins = _group_begins(history, -(-n // most))
+    ends = np.append(begins[1:], n)
+    group_of = np.repeat(np.arange(begins.size), ends - begins)
+    parts = [slice(begin, end) for begin, end in zip(begins, ends, strict=True)]
+    found = [_average(history, part) for part in parts]
+    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
+    r = len(history.series)
+    return replace(
+        history,
+        logs=tuple(history.logs[end - 1] for end in ends),
+        recorded_at=tuple(datetime.fromtimestamp(seconds[part].mean(), UTC) for part in parts),
+        travel=_means(history.travel, parts),
+        covariates={name: _means(own, parts) for name, own in history.covariates.items()},
+        ln_frequency=np.array([mean[:r] for mean, _ in found]),
+        ln_damping=np.array([mean[r:] for mean, _ in found]),
+        cov=np.array([cov for _, cov in found]),
+        loop_error=_means(history.loop_error, parts),
+        baselines=tuple(int(group_of[k]) for k in history.baselines),
+        steps=tuple(
+            replace(step, first=int(group_of[step.first]), there=step.there[begins])
+            for step in history.steps
+        ),
+    )
+
+
+def _group_begins(history: History, size: int) -> np.ndarray:
+    """Return the index of the first log of each group of at most so many."""
+    n = len(history.logs)
+    begins = np.zeros(n, dtype=bool)
+    begins[[0, n - 1]] = True
+    for k in history.baselines:
+        begins[[k, min(k + 1, n - 1)]] = True
+    for step in history.steps:
+        begins[step.first] = True
+        begins[1:] |= np.diff(step.there.astype(int)) != 0
+    lengths = np.diff(np.flatnonzero(begins), append=n)
+    within = np.concatenate([np.arange(length) for length in lengths])
+    return np.flatnonzero(within % size == 0)
+
+
+def _means(values: FloatArray, parts: list[slice]) -> FloatArray:
+    """Return the mean of each group without missing values, NaN if all are missing."""
+    known = np.isfinite(values)
+    filled = np.where(known, values, 0.0)
+    counts = np.array([known[part].sum() for part in parts])
+    sums = np.array([filled[part].sum() for part in parts])
+    return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
+
+
+def _average(history: History, part: slice) -> tuple[FloatArray, FloatArray]:
+    """Average ln f and ln ζ of a group: mean ``(2 n_series,)`` and covariance, NaN if missing."""
+    values = np.hstack([history.ln_frequency[part], history.ln_damping[part]])
+    precision, weighted = np.zeros((values.shape[1],) * 2), np.zeros(values.shape[1])
+    for own, cov in zip(values, history.cov[part], strict=True):
+        present = np.flatnonzero(np.isfinite(own))
+        if present.size:
+            block = np.linalg.inv(cov[np.ix_(present, present)])
+            precision[np.ix_(present, present)] += block
+            weighted[present] += block @ own[present]
+    observed = np.flatnonzero(np.isfinite(values).any(axis=0))
+    mean, total = np.full(values.shape[1], np.nan), np.full_like(precision, np.nan)
+    if observed.size:
+        cov = np.linalg.inv(precision[np.ix_(observed, observed)])
+        mean[observed] = cov @ weighted[observed]
+        total[np.ix_(observed, observed)] = (cov + cov.T) / 2
+    return mean, total
+
+
+def clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
+    """Return the travel in m since the baseline of each log, and of each step between two logs."""
+    steps = {s.first for s in history.steps if s.kind == "step" and s.first > history.baseline}
+    first = sorted(steps)
+    clock = history.clock()
+    for k in reversed(first):  # at least 1 m is between the logs before and after a step
+        before = clock[:k]
+        before[before >= clock[k]] = clock[k] - 1.0
+    if len(first) > constants.MAX_STEPS:
+        raise NotEnoughData(
+            f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
+            "a life holds over so many; maintenance.csv can declare a new baseline"
+        )
+    return clock, tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)

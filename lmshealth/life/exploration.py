@@ -1,0 +1,212 @@
+"""Evidences of the scenarios of a life, and weighted draws of them, by importance sampling."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth.errors import NotConverged
+from lmshealth.life import constants
+from lmshealth.life.density import LifeDensity, kept_weights
+from lmshealth.life.importance_sampling import (
+    WeightedDraws,
+    importance_sample,
+    importance_sample_again,
+    importance_sample_to_ess,
+)
+from lmshealth.life.likelihood import Grid, LifeLikelihood
+from lmshealth.life.scenarios import DegradationPath, Scenario
+from lmshealth.stage.degradation_laws import Free
+
+_N_ROUGH, _N_FINE = 300, 2000
+# Draws of an update, and those of each scenario that are kept for the next one.
+_N_UPDATE, _N_START = 3000, 300
+# Effective draws below which an evidence may miss most of its integral.
+_LEAST_ESS = 20.0
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeStart(ReadOnly):
+    """Draws of a posterior from which that with further logs is sampled.
+
+    `points`, ``(n_scenarios, n_draws, n_dim)``, are coordinates of the scenarios called `names`,
+    with zeros after the last coordinate of each.
+    """
+
+    names: tuple[str, ...]
+    points: FloatArray
+
+    def of(self, scenario: Scenario) -> FloatArray:
+        """Return the draws of a scenario, ``(n_draws, n_dim)``; none of one that is new."""
+        if scenario.name not in self.names:
+            return np.empty((0, scenario.n_dim))
+        return self.points[self.names.index(scenario.name), :, : scenario.n_dim]
+
+
+Explored = tuple[LifeDensity, WeightedDraws]
+
+
+def log_probability(found: Explored) -> float:
+    """Return the log posterior probability of a scenario up to a constant."""
+    return float(np.log(found[0].scenario.weight) + found[1].log_evidence)
+
+
+@dataclass(eq=False)
+class _Exploration:
+    """Rough draws of scenarios, made one after the other from what is known by then.
+
+    `known` are, of each parameter, draws of each path in the best scenario so far that has it: good
+    ones to begin with, whatever the other parameters do.
+    """
+
+    likelihood: LifeLikelihood
+    generators: list[np.random.Generator]
+    before: LifeStart | None
+    grid: Grid
+    found: dict[int, Explored]
+    known: list[dict[DegradationPath, tuple[float, FloatArray]]]
+
+    @property
+    def scenarios(self) -> tuple[Scenario, ...]:
+        """All scenarios of the life."""
+        return self.likelihood.data.scenarios
+
+    def add(self, which: Iterable[int]) -> None:
+        """Draw from scenarios that have not been drawn from."""
+        for k in which:
+            if k not in self.found:
+                self._draw(k)
+
+    def _draw(self, k: int) -> None:
+        scenario, rng = self.scenarios[k], self.generators[k]
+        density = LifeDensity(self.likelihood, scenario, self.grid)
+        if scenario.n_dim == 0:  # exact
+            point = np.empty((1, 0))
+            value = float(density.log_probability(point)[0])
+            self.found[k] = density, WeightedDraws(point, np.ones(1), value)
+            return
+        start = self._start(scenario, rng)
+        draws = importance_sample(density.log_probability, start, rng, _N_ROUGH)
+        self.found[k] = density, draws
+        value = log_probability(self.found[k])
+        parts = scenario.split(draws.resampled(rng, _N_ROUGH))
+        for own, path, part in zip(self.known, scenario.paths, parts, strict=True):
+            if path not in own or own[path][0] < value:
+                own[path] = value, part
+
+    def _start(self, scenario: Scenario, rng: np.random.Generator) -> FloatArray:
+        """Return points to begin with: draws of the prior, and others where there are any.
+
+        These are draws of the posterior with fewer logs, else of the same paths elsewhere.
+        """
+        start, earlier = scenario.draw(rng, _N_ROUGH), np.empty((0, 0))
+        if self.before is not None:
+            earlier = self.before.of(scenario)
+        pairs = list(zip(self.known, scenario.paths, strict=True))
+        if not earlier.shape[0] and all(path in own or not path.names for own, path in pairs):
+            empty = np.empty((_N_ROUGH, 0))
+            parts = [own[path][1] if path in own else empty for own, path in pairs]
+            earlier = np.hstack([rng.permutation(part) for part in parts])
+        if earlier.shape[0]:
+            # Draws of the prior stay among them, for a mode that the others did not show.
+            start = np.concatenate([earlier, start[: _N_START // 4]])
+        return start
+
+    def narrow(self, which: Iterable[int]) -> None:
+        """Leave out grid points that some scenarios do without."""
+        kept = np.zeros(self.grid.walk.size, dtype=bool)
+        for k in which:
+            density, draws = self.found[k]
+            weight = density.weights(draws.resampled(self.generators[k], _N_ROUGH // 4))
+            kept |= kept_weights(weight, constants.MAX_GRID_LOSS)
+        self.grid = self.grid[kept]
+
+    def likely(self) -> list[int]:
+        """Return the scenarios that are not much less probable than the best, in order."""
+        value = {k: log_probability(one) for k, one in self.found.items()}
+        least = max(value.values()) - constants.MAX_LOG_ODDS
+        return sorted(k for k in value if value[k] > least)
+
+    def refine(self, k: int, n: int) -> None:
+        """Draw n times from a scenario again, with the grid points that it needs."""
+        (density, draws), rng = self.found[k], self.generators[k]
+        density = density.narrowed(draws.resampled(rng, _N_ROUGH // 3))
+        draws = importance_sample_again(density.log_probability, draws, rng, n)
+        self.found[k] = density, draws
+
+    def ensure(self, k: int, n: int, min_ess: float, *, updated: bool) -> None:
+        """Draw from a scenario again, more often, unless enough draws are effective.
+
+        Of a probable one of an update the weights must be reliable too.
+        """
+        density, draws = self.found[k]
+        if draws.ess < min_ess or (updated and draws.pareto_k >= constants.MAX_PARETO_K):
+            start = draws.resampled(self.generators[k], _N_ROUGH)
+            how = start, self.generators[k], 3 * n, min_ess
+            self.found[k] = density, importance_sample_to_ess(density.log_probability, *how)
+
+    def next_start(self) -> LifeStart:
+        """Return draws of all scenarios: one that is improbable now may return."""
+        widest = max(density.scenario.n_dim for density, _ in self.found.values())
+        points = np.zeros((len(self.found), _N_START, widest))
+        for row, (k, (density, draws)) in zip(points, self.found.items(), strict=True):
+            row[:, : density.scenario.n_dim] = draws.resampled(self.generators[k], _N_START)
+        names = tuple(density.scenario.name for density, _ in self.found.values())
+        return LifeStart(names, points)
+
+
+def explore(
+    likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None = None
+) -> tuple[list[Explored], LifeStart]:
+    """Return weighted draws and evidences of the scenarios that a rough evidence does not drop.
+
+    `NotConverged` is raised where the weights of an update are unreliable: they are those of the
+    posterior with all logs, so that errors of one update do not reach the next.
+    """
+    scenarios = likelihood.data.scenarios
+    generators = [np.random.default_rng(own) for own in seed.spawn(len(scenarios))]
+    known: list[dict[DegradationPath, tuple[float, FloatArray]]] = [{} for _ in scenarios[0].paths]
+    all_ = _Exploration(likelihood, generators, before, likelihood.grid, {}, known)
+    # Grid points that the least and the most flexible scenarios do without, all do without.
+    all_.add(_anchors(scenarios))
+    all_.narrow(all_.likely())
+    all_.add(k for k, one in enumerate(scenarios) if not one.restarts)
+    # A law may restart at a step where it may have gone on.
+    going_on = {scenarios[k].name for k in all_.likely()}
+    all_.add(k for k, one in enumerate(scenarios) if one.from_start() in going_on)
+    likely = all_.likely()
+    n = _N_FINE if before is None else _N_UPDATE
+    log_share = np.array([log_probability(all_.found[k]) for k in likely])
+    # Errors of a mixture are those of a single scenario if draws follow the root of the share.
+    sizes = np.maximum(_N_ROUGH, n * np.exp((log_share - log_share.max()) / 2)).astype(int)
+    drawn = [(k, int(m)) for k, m in zip(likely, sizes, strict=True) if scenarios[k].n_dim]
+    for k, m in drawn:
+        all_.refine(k, m)
+    largest = max(log_probability(all_.found[k]) for k in likely)
+    for k, m in drawn:
+        share = float(np.exp(log_probability(all_.found[k]) - largest))
+        updated = before is not None and share >= constants.MIN_CHAIN_PROBABILITY
+        min_ess = max(_LEAST_ESS, constants.MIN_ESS * float(np.sqrt(share)))
+        all_.ensure(k, m, min_ess, updated=updated)
+        draws = all_.found[k][1]
+        if updated and not draws.pareto_k < constants.MAX_PARETO_K:
+            raise NotConverged(f"Pareto k of an update is {draws.pareto_k:.2f}", draws.points)
+    return [all_.found[k] for k in likely], all_.next_start()
+
+
+def _anchors(scenarios: Sequence[Scenario]) -> list[int]:
+    """Return the scenarios of the fewest coordinates, and the freest that begin at the baseline."""
+    found = {min(range(len(scenarios)), key=lambda k: scenarios[k].n_dim)}
+    for with_steps in (False, True):
+        own = [
+            k
+            for k, one in enumerate(scenarios)
+            if bool(one.paths[0].steps) == with_steps and not one.restarts
+        ]
+        if own:
+            free = (k for k in own if all(isinstance(p.law, Free) for p in scenarios[k].paths))
+            found.add(next(free, max(own, key=lambda k: scenarios[k].n_dim)))
+    return sorted(found)

@@ -1,0 +1,216 @@
+"""Adaptive importance sampling of a posterior of few dimensions, with its evidence."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import gammaln
+
+from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth.errors import NotConverged
+from lmshealth.life import constants
+
+LogProbability = Callable[[FloatArray], FloatArray]
+"""Log density of many points at once: ``(n_points, n_dim)`` to ``(n_points,)``."""
+
+# Degrees of freedom of the proposal's Student's t: heavier tails than a posterior has.
+_FREEDOM = 5
+_N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
+# Effective share of the draws at which the proposal is good enough for the last round.
+_GOOD_SHARE = 0.3
+# Effective draws per dimension from which a proposal is made.
+_LEAST_PER_DIMENSION = 20.0
+# Share of a wide component about all draws, which covers tails between and beyond the kernels, and
+# its width in standard deviations [Hesterberg1995].
+_WHOLE_SHARE, _WHOLE_WIDTH = 0.2, 1.5
+# Variance added in each direction, of that of the draws, where the draws span fewer dimensions.
+_RIDGE = 0.05
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WeightedDraws(ReadOnly):
+    """Draws of a density ``(n, n_dim)``, normalised weights ``(n,)``, and log of its integral."""
+
+    points: FloatArray
+    weight: FloatArray
+    log_evidence: float
+
+    @property
+    def ess(self) -> float:
+        """Effective sample size; its inverse bounds the relative variance of the evidence."""
+        return float(1 / np.sum(self.weight**2))
+
+    @property
+    def pareto_k(self) -> float:
+        """Shape of the Pareto distribution of the largest weights [Vehtari2024]."""
+        from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
+
+        diagnostic: Any = array_stats  # the library has no types
+        # A weight may be too small for a float.
+        weight = np.maximum(self.weight, np.finfo(float).tiny)
+        return float(diagnostic.psislw(-np.log(weight))[1])
+
+    def resampled(self, rng: np.random.Generator, n: int) -> FloatArray:
+        """Draw points of equal weight, shape ``(n, n_dim)``."""
+        return np.asarray(self.points[rng.choice(self.weight.size, n, p=self.weight)])
+
+
+def importance_sample(
+    log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    """Draw from a density by importance sampling from a mixture adapted in rounds [Cappe2008].
+
+    The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
+    number of draws of the last round. `NotConverged` is raised if no point has a density above 0.
+    """
+    points, proposal = start, np.zeros(start.shape[0])
+    few = max(200, n // 4)
+    for _ in range(_MAX_ROUNDS):
+        log_weight = log_probability(points) - proposal
+        if _weighted(points, log_weight).ess >= _GOOD_SHARE * few and points is not start:
+            break
+        points, proposal = _propose(_adapted(points, log_weight), rng, few)
+    return _drawn_near(log_probability, _adapted(points, log_weight), rng, n)
+
+
+def importance_sample_again(
+    log_probability: LogProbability, before: WeightedDraws, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    """Draw n times from a density, given draws of nearly the same: without rounds if they suffice.
+
+    `NotConverged` is raised as by `importance_sample`.
+    """
+    if before.ess >= _LEAST_PER_DIMENSION * before.points.shape[1]:
+        return _drawn_near(log_probability, before, rng, n)
+    start = before.resampled(rng, before.points.shape[0])
+    return importance_sample(log_probability, start, rng, n)
+
+
+def _drawn_near(
+    log_probability: LogProbability, draws: WeightedDraws, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    points, proposal = _propose(draws, rng, n)
+    return _weighted(points, log_probability(points) - proposal)
+
+
+def importance_sample_to_ess(
+    log_probability: LogProbability,
+    start: FloatArray,
+    rng: np.random.Generator,
+    n: int,
+    min_ess: float = constants.MIN_ESS,
+) -> WeightedDraws:
+    """Repeat `importance_sample` with three times the draws until enough of them are effective.
+
+    Raises `NotConverged`, with the points, if the fourth attempt has fewer.
+    """
+    for _ in range(_MAX_ATTEMPTS):
+        found = importance_sample(log_probability, start, rng, n)
+        if found.ess >= min_ess:
+            return found
+        start, n = found.resampled(rng, 500), 3 * n
+    raise NotConverged(
+        f"{found.ess:.0f} effective draws of {found.weight.size} by importance sampling; needed "
+        f"are {min_ess:.0f}: the posterior may have several modes far apart",
+        found.points,
+    )
+
+
+def tempered(points: FloatArray, log_weight: FloatArray, min_ess: float) -> WeightedDraws:
+    """Raise weights ``(n,)`` of points ``(n, n_dim)`` to a power that leaves an effective size.
+
+    The power is at most 1; a log weight of -inf drops its point.
+    """
+    draws = _weighted(points, log_weight)
+    low, high = 0.0, 1.0
+    for _ in range(25 if draws.ess < min_ess else 0):
+        middle = (low + high) / 2
+        draws = _weighted(points, middle * log_weight)
+        low, high = (middle, high) if draws.ess >= min_ess else (low, middle)
+    return draws
+
+
+def _adapted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
+    n_inside = np.isfinite(log_weight).sum()
+    wanted = _LEAST_PER_DIMENSION * points.shape[1]
+    return tempered(points, log_weight, min(wanted, 0.3 * n_inside))
+
+
+def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
+    inside = np.isfinite(log_weight)
+    if not inside.any():
+        raise NotConverged(
+            "no draw of the prior lies inside the modal map: widen the map or the prior", points
+        )
+    kept = log_weight[inside]
+    total = float(np.logaddexp.reduce(kept))
+    return WeightedDraws(points[inside], np.exp(kept - total), total - np.log(log_weight.size))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Proposal(ReadOnly):
+    """Mixture of Student's t at draws of a density, and about all of them, as a proposal.
+
+    `centres` of the kernels, ``(n_kernels, n_dim)``; mean and Cholesky factor of the covariance of
+    all draws; `width` of a kernel as a share of it.
+    """
+
+    centres: FloatArray
+    mean: FloatArray
+    factor: FloatArray
+    width: float
+
+    @classmethod
+    def near(cls, draws: WeightedDraws, rng: np.random.Generator) -> Self:
+        """Make a proposal for the density of which these are draws."""
+        d = draws.points.shape[1]
+        mean = draws.weight @ draws.points
+        off = draws.points - mean
+        cov = (draws.weight[:, None] * off).T @ off + 1e-18 * np.eye(d)
+        try:
+            factor = np.linalg.cholesky(cov)
+        except np.linalg.LinAlgError:  # fewer effective draws than dimensions
+            factor = np.linalg.cholesky(cov + _RIDGE * np.diag(draws.points.var(axis=0) + 1e-18))
+        # Silverman's width, of the effective number of kernels.
+        width = (4 / (d + 2)) ** (1 / (d + 4)) * min(_N_KERNELS, draws.ess) ** (-1 / (d + 4))
+        centres = draws.resampled(rng, _N_KERNELS)
+        return cls(centres, mean, np.asarray(factor, dtype=float), float(width))
+
+    def draw(self, rng: Any, n: int) -> FloatArray:
+        """Draw points, ``(n, n_dim)``; `rng` is a Generator, or the RandomState of emcee."""
+        d = self.mean.size
+        t = rng.standard_normal((n, d)) / np.sqrt(rng.chisquare(_FREEDOM, (n, 1)) / _FREEDOM)
+        chosen = (rng.uniform(size=n) * _N_KERNELS).astype(int)
+        near = self.centres[chosen] + self.width * t @ self.factor.T
+        whole = (rng.uniform(size=n) < _WHOLE_SHARE)[:, None]
+        return np.asarray(np.where(whole, self.mean + _WHOLE_WIDTH * t @ self.factor.T, near))
+
+    def log_density(self, points: FloatArray) -> FloatArray:
+        """Return the log density of points, ``(n,)``."""
+        d = self.mean.size
+        unit, whitened = (
+            np.linalg.solve(self.factor, (x - self.mean).T).T for x in (points, self.centres)
+        )
+        square = (unit**2).sum(1)[:, None] + (whitened**2).sum(1) - 2 * unit @ whitened.T
+        of_kernel = _log_t(np.maximum(square, 0), self.width, d)
+        kernels = np.logaddexp.reduce(of_kernel, axis=1) - np.log(_N_KERNELS)
+        about_all = _log_t((unit**2).sum(1), _WHOLE_WIDTH, d)
+        total = np.logaddexp(kernels + np.log1p(-_WHOLE_SHARE), about_all + np.log(_WHOLE_SHARE))
+        return np.asarray(total - np.sum(np.log(np.diag(self.factor))))
+
+
+def _propose(
+    draws: WeightedDraws, rng: np.random.Generator, n: int
+) -> tuple[FloatArray, FloatArray]:
+    """Draw from a proposal near draws: ``(n, n_dim)``, and log density ``(n,)``."""
+    proposal = Proposal.near(draws, rng)
+    points = proposal.draw(rng, n)
+    return points, proposal.log_density(points)
+
+
+def _log_t(square: FloatArray, width: float, d: int) -> FloatArray:
+    """Return the log density of Student's t of a width in d dimensions at squared distances."""
+    scale = gammaln((_FREEDOM + d) / 2) - gammaln(_FREEDOM / 2) - d / 2 * np.log(np.pi * _FREEDOM)
+    tail = np.log1p(square / (_FREEDOM * width**2))
+    return np.asarray(scale - d * np.log(width) - 0.5 * (_FREEDOM + d) * tail)

@@ -1,0 +1,411 @@
+"""Likelihood of a life: health by the laws of a scenario against the ln frequencies of all logs.
+
+README.md has the model. Four values follow one from the other: `LifeData` (selection of the data),
+`LifeCovariance` (their covariance Σ), `NodeBasis` (nodes from which smooth drifts follow at all
+logs), and `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters).
+"""
+
+from dataclasses import dataclass
+from itertools import product
+from typing import Self
+
+import numpy as np
+from scipy.linalg import qr, solve_triangular
+
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
+from lmshealth.errors import NotEnoughData
+from lmshealth.life import constants
+from lmshealth.life.data import LifeData
+from lmshealth.life.scenarios import Scenario
+from lmshealth.stage.description import ScatterPrior, Stage
+from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.history import History
+
+# Lives of the prior per scenario that the nodes are chosen by, and the drift in ln f that the QR
+# decomposition may leave in the norm of all of them: of 99 % of other lives the drifts are met
+# within 3e-6, a thirtieth of the error of the best estimates.
+_N_EXAMPLES, _RESIDUAL = 300, 1e-4
+# Distance in ln f of the last drift of a life from that of the logs from which it counts less.
+_NEAR = 0.003
+_AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed at a time
+_CACHED = 2_000_000  # whitened drifts that are computed at a time
+
+NO_MODE = -1
+"""Index in place of that of a mode that moves alone: none does."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeCovariance(ReadOnly):
+    """Parts of the covariance Σ of the data, each of shape ``(n_data, n_data)``.
+
+    `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
+    of the estimates; `walk` the random walk of ln f with variance 1 at the last log; `deviation`
+    that of ln health, likewise; `smooth` the drift of a mode by a cause of its own, of all modes as
+    if each had one.
+    """
+
+    fixed: FloatArray
+    noise: FloatArray
+    walk: FloatArray
+    deviation: FloatArray
+    smooth: FloatArray
+    mode_of: np.ndarray  # index of the mode of each datum, ``(n_data,)``
+
+    @classmethod
+    def of(cls, data: LifeData) -> Self:
+        """Compute the parts from data."""
+        history, clock = data.history, data.clock
+        n_logs, n_series = clock.size, len(data.columns)
+        cov = history.cov[history.baseline :][:, data.columns][:, :, data.columns]
+        noise = np.zeros((n_series, n_logs, n_series, n_logs))
+        for k in range(n_logs):
+            noise[:, k, :, k] = np.nan_to_num(cov[k])
+        same = np.equal.outer(data.mode_of_series, data.mode_of_series)
+        common = np.full((n_logs, n_logs), constants.INTERCEPT_STD**2)
+        for regressor in regressors(history.covariates, data.stage):
+            values = regressor.values[history.baseline :]
+            common += regressor.prior_std**2 * np.outer(values, values)
+            common += np.diag(regressor.unknown[history.baseline :])
+        shared = np.maximum(np.minimum.outer(clock, clock), 0.0)
+        sensitivity = data.sensitivity[data.mode_of_series]
+        size, own = n_series * n_logs, np.ix_(data.rows, data.rows)
+        return cls(
+            fixed=(np.kron(same, common) + _offsets(data, same))[own],
+            noise=noise.reshape(size, size)[own],
+            walk=np.kron(same, shared / data.now)[own],
+            deviation=np.kron(sensitivity @ sensitivity.T, shared / data.now)[own],
+            smooth=np.kron(same, lone_kernel(clock, clock, data.now))[own],
+            mode_of=data.mode_of,
+        )
+
+    def factor(
+        self, walk: float, noise_scale: float, deviation: float, lone: int = NO_MODE
+    ) -> FloatArray:
+        """Return the Cholesky factor of Σ, shape ``(n_data, n_data)``."""
+        total = self.fixed + noise_scale**2 * self.noise + walk**2 * self.walk
+        if lone != NO_MODE:
+            own = (self.mode_of == lone).astype(float)
+            total += constants.LONE_STD**2 * np.outer(own, own) * self.smooth
+        return np.asarray(np.linalg.cholesky(total + deviation**2 * self.deviation))
+
+
+def lone_kernel(moments: FloatArray, clock: FloatArray, now: float) -> FloatArray:
+    """Return the covariance of the smooth drift of a mode that moves alone, of variance 1 now.
+
+    Between moments ``(n,)`` and ``(m,)`` in m since the baseline: ``(n, m)``.
+    """
+    a, b = (np.maximum(one, 0.0) / now for one in (moments, clock))
+    return np.asarray(np.mean([np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS], axis=0))
+
+
+def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
+    """Return the covariance of offsets without wear: sources, retunings, changed sensors."""
+    # The intercept is that of a mode's first series; each further one has its own bias.
+    further = np.tril(same, -1).any(axis=1).astype(float)
+    total = np.kron(np.diag(further), np.full((data.clock.size,) * 2, BIAS_STD[0] ** 2))
+    for step in data.history.steps:
+        if step.changes_modes:
+            continue
+        there = step.there[data.history.baseline :].astype(float)
+        moved = [step.source in ("", data.history.series[i].source) for i in data.columns]
+        variance = JUMP_STD[step.kind][0] ** 2
+        total += np.kron(same * np.outer(moved, moved), variance * np.outer(there, there))
+    return total
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class NodeBasis(ReadOnly):
+    """Nodes: logs ``(n_nodes,)`` whose drifts determine those of all logs linearly.
+
+    `weights` are W, shape ``(n_logs, n_nodes)``. `moments` are the travel in m since the baseline
+    of nodes, ends of the life and both sides of each step, shape ``(n_nodes + 2 + 2 n_steps,)``: as
+    laws are monotonic, a life inside the map at all of them is inside at all logs.
+    """
+
+    nodes: np.ndarray
+    weights: FloatArray
+    moments: FloatArray
+
+    @classmethod
+    def of(cls, data: LifeData) -> Self:
+        """Choose the nodes by a pivoted QR decomposition of the drifts of lives of the prior."""
+        rng, n_logs = np.random.default_rng(0), data.clock.size
+        seen = data.change()
+        joined = np.empty((0, n_logs))
+        for scenario in data.scenarios:
+            y = scenario.draw(rng, _N_EXAMPLES if scenario.n_dim else 1)
+            x, inside = ln_health(data.stage, scenario, y, data.clock)
+            # A few lives at a time, for the memory: R has the columns' geometry of all before.
+            for some in np.array_split(x[inside], inside.sum() * n_logs // _AT_A_TIME + 1):
+                part = drifts(data, some)
+                off = np.abs(part[:, 0, :, -1] - seen[:, None]).max(axis=0)
+                # Lives that end far from the logs count less: what is left of them may be larger.
+                part = part / np.maximum(off / _NEAR, 1.0)[:, None]
+                rows = [joined, part.reshape(-1, n_logs)]
+                joined = qr(np.concatenate(rows), mode="r")[0][:n_logs]
+        if not joined.size:
+            raise NotEnoughData(f"{data.stage.name}: no life of the prior stays inside the map")
+        _, r, order = qr(joined, mode="economic", pivoting=True)
+        n = max(int(np.sum(np.abs(np.diag(r)) > _RESIDUAL)), 1)
+        nodes, weights = order[:n], np.zeros((n_logs, n))
+        weights[nodes, np.arange(n)] = 1.0
+        if np.abs(r[0, 0]) > 0:
+            weights[order[n:]] = solve_triangular(r[:n, :n], r[:n, n:]).T
+        steps = [*data.steps, *np.nextafter(data.steps, 0)]
+        ends = [data.clock.min(), data.clock.max(), *steps]
+        return cls(nodes, weights, np.append(data.clock[nodes], ends))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Grid(Rows):
+    """Data whitened at the points of a grid of walk, noise scale, deviation and lone mode.
+
+    `lone` is the index of a mode that moves alone, or `NO_MODE`. `design` is R of each mode, shape
+    ``(n_points, n_modes, n_nodes, n_rows)``; `target` is Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest`
+    the χ² that no life explains, `log_weight` the log prior minus ln |L|, and `freedom` the data
+    less the intercepts and coefficients that they determine, all ``(n_points,)``.
+    """
+
+    walk: FloatArray
+    noise_scale: FloatArray
+    deviation: FloatArray
+    lone: np.ndarray
+    design: FloatArray
+    target: FloatArray
+    rest: FloatArray
+    log_weight: FloatArray
+    freedom: FloatArray
+
+    @classmethod
+    def of(cls, data: LifeData, covariance: LifeCovariance, basis: NodeBasis) -> Self:
+        """Whiten data at all points of the grid."""
+        points, prior = [], scatter_prior(data.stage)
+        n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
+        # A mode that moves alone needs others that do not.
+        alone *= n_modes > 1
+        total = np.sum(prior.walk)
+        ways = [
+            *((q, p / total * (1 - n_modes * alone), NO_MODE) for q, p in _walks(prior)),
+            *((constants.LONE_WALK, alone, mode) for mode in range(n_modes) if alone),
+        ]
+        for (walk, p, lone), (scale, q), (deviation, r) in product(
+            ways,
+            zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
+            zip(constants.DEVIATION_STDS, prior.deviation, strict=True),
+        ):
+            factor = covariance.factor(walk, scale, deviation, lone)
+            u, basis_q, basis_r = _reduced(data, basis, factor)
+            target = basis_q.T @ u
+            log_weight = np.log(p * q * r) - np.sum(np.log(np.diag(factor)))
+            design = basis_r.T.reshape(n_modes, -1, target.size)
+            rest = np.sum(u**2) - np.sum(target**2)
+            known = solve_triangular(factor, covariance.fixed, lower=True)
+            fixed = np.trace(solve_triangular(factor, known, lower=True, trans=1))
+            values = (design, target, rest, log_weight, data.y.size - fixed)
+            points.append((walk, scale, deviation, lone, *values))
+        return cls(*(np.array(column) for column in zip(*points, strict=True)))
+
+
+def _walks(prior: ScatterPrior) -> list[tuple[float, float]]:
+    return list(zip(constants.WALK_STDS, prior.walk, strict=True))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeLikelihood:
+    """Likelihood of a life under any scenario, vectorised over walkers.
+
+    Ln parameters at the nodes, `x`, are of shape ``(n, n_nodes, n_parameters)``.
+    """
+
+    data: LifeData
+    covariance: LifeCovariance
+    basis: NodeBasis
+    grid: Grid
+
+    @classmethod
+    def of(cls, history: History, stage: Stage, min_logs: int = constants.MIN_LOGS) -> Self:
+        """Make the likelihood of a history; raises what `LifeData.select` raises."""
+        data = LifeData.select(history, stage, min_logs)
+        covariance, basis = LifeCovariance.of(data), NodeBasis.of(data)
+        return cls(data, covariance, basis, Grid.of(data, covariance, basis))
+
+    def path(self, scenario: Scenario, y: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Return ln parameters at the nodes of the lives inside the map, and which are inside.
+
+        Shapes ``(n_inside, n_nodes, n_parameters)`` and ``(n,)`` for coordinates ``(n, n_dim)``.
+        """
+        x, inside = ln_health(self.data.stage, scenario, y, self.basis.moments)
+        return x[inside, : self.basis.nodes.size], inside
+
+    def terms(self, grid: Grid, x: FloatArray) -> FloatArray:
+        """Return the log likelihood plus log prior, ``(n_map_errors, n_points, n)``.
+
+        At the points of a grid, for each possible error of the map.
+        """
+        chi_square, log_det = self.quadratic(grid, x)
+        log_prior = np.log([weight for _, weight in self.data.stage.map_errors])
+        log_weight = log_prior[:, None, None] + grid.log_weight[:, None]
+        return np.asarray(log_weight - 0.5 * (chi_square + log_det))
+
+    def quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return χ² with the errors of the map marginalised, and ln |M|, as `terms`."""
+        # A few lives at a time: intermediate results stay in the processor's cache.
+        size = x.shape[0] * (1 + x.shape[2]) * grid.design.size // x.shape[1]
+        parts = [self._quadratic(grid, one) for one in np.array_split(x, size // _CACHED + 1)]
+        chi_square, log_det = (np.concatenate(one, axis=2) for one in zip(*parts, strict=True))
+        return chi_square, log_det
+
+    def _quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
+        rows = self._residuals(grid, x)
+        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of map errors of 1.
+        gram = rows @ np.swapaxes(rows, 2, 3)
+        n_rows = gram.shape[2]
+        shape = (len(self.data.stage.map_errors), *gram.shape[:2])
+        chi_square, log_det = np.empty(shape), np.empty(shape)
+        for i, (map_std, _) in enumerate(self.data.stage.map_errors):
+            scale = np.r_[np.full(n_rows - 1, map_std), 1.0]
+            # One Cholesky factor has both: its last element is that of χ², plus 1.
+            scaled = gram * np.outer(scale, scale)
+            diagonal(scaled)[:] += 1.0
+            root = diagonal(np.linalg.cholesky(scaled))
+            chi_square[i] = grid.rest[:, None] + root[..., -1] ** 2 - 1
+            log_det[i] = 2 * np.log(np.prod(root[..., :-1], axis=2))
+        return chi_square, log_det
+
+    def conditional(
+        self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return the mean of Gaussian quantities given a life and all data, and their information.
+
+        That is by how much the data reduce their covariance. At the k-th point of a grid; `cross`
+        are their covariances with the data, ``(n_values, n_data)``. Shapes ``(n, n_values)`` and
+        ``(n, n_values, n_values)`` for x ``(n, ...)``.
+        """
+        point = grid[np.arange(grid.walk.size) == k]
+        settings = (float(grid.walk[k]), float(grid.noise_scale[k]), float(grid.deviation[k]))
+        factor = self.covariance.factor(*settings, int(grid.lone[k]))
+        a = solve_triangular(factor, cross.T, lower=True)
+        u, q, _ = _reduced(self.data, self.basis, factor)
+        b = a.T @ q
+        rows = self._residuals(point, x)[0]
+        r, v = rows[:, -1], map_std * rows[:, :-1]
+        solved = np.linalg.solve(np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2), v)  # M⁻¹ V
+        explained = np.einsum("nvr,nr->nv", solved, r)
+        fitted = point.target[0] - r + np.einsum("nv,nvr->nr", explained, v)
+        mean = a.T @ u - fitted @ b.T
+        return mean, a.T @ a - (b @ np.swapaxes(v, 1, 2)) @ (solved @ b.T)
+
+    def deviation(
+        self, grid: Grid, k: int, map_std: float, x: FloatArray, moments: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of ln health about its law, given a life and all data.
+
+        For the k-th point of a grid and moments ``(n_moments,)`` in m since the baseline: ``(n,
+        n_moments, n_parameters)``, and between the parameters ``(…, n_parameters, n_parameters)``.
+        """
+        data = self.data
+        unit = float(grid.deviation[k]) ** 2 / data.now
+        shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)
+        cross = shared[:, None] * data.sensitivity[data.mode_of].T
+        n, (n_moments, p, _) = x.shape[0], cross.shape
+        means, covs = np.empty((n, n_moments, p)), np.empty((n, n_moments, p, p))
+        for i, own in enumerate(cross):
+            means[:, i], known = self.conditional(grid, k, map_std, x, own)
+            covs[:, i] = unit * max(moments[i], 0.0) * np.diag(data.free) - known
+        return means, covs
+
+    def lone_drift(
+        self, grid: Grid, k: int, map_std: float, x: FloatArray
+    ) -> tuple[FloatArray, FloatArray]:
+        """Return mean and variance of the drift now of the mode that moves alone, ``(n,)`` each.
+
+        Of the k-th point of a grid, given a life and all data.
+        """
+        data, variance = self.data, constants.LONE_STD**2
+        kernel = lone_kernel(np.array([data.now]), data.clock[data.log_of], data.now)
+        cross = variance * kernel * (data.mode_of == grid.lone[k])
+        mean, known = self.conditional(grid, k, map_std, x, cross)
+        return mean[:, 0], np.maximum(variance - known[:, 0, 0], 0.0)
+
+    def _residuals(self, grid: Grid, x: FloatArray) -> FloatArray:
+        """Return the rows V of map errors of 1, and last the whitened residuals r.
+
+        Shape ``(n_points, n, n_errors + 1, n_rows)``, with an error per parameter and mode.
+        """
+        drift = np.moveaxis(drifts(self.data, x), 1, 2)
+        n_modes, n, n_paths, n_nodes = drift.shape
+        white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
+        white = white.reshape(-1, n_modes, n, n_paths, grid.target.shape[1])
+        p = n_paths - 1
+        rows = np.empty((white.shape[0], n, n_modes * p + 1, white.shape[4]))
+        rows[:, :, -1] = grid.target[:, None]
+        for k in range(n_modes):
+            rows[:, :, k * p : (k + 1) * p] = white[:, k, :, 1:]
+            rows[:, :, -1] -= white[:, k, :, 0]
+        return rows
+
+
+def diagonal(matrices: FloatArray) -> FloatArray:
+    """Return the diagonals of ``(..., n, n)`` matrices as a writeable view."""
+    view: FloatArray = np.einsum("...ii->...i", matrices)
+    return view
+
+
+def ln_health(
+    stage: Stage, scenario: Scenario, y: FloatArray, clock: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Return ln parameters of lives at moments, and which lives stay inside the map.
+
+    Shapes ``(n, n_moments, n_parameters)`` and ``(n,)`` for coordinates ``(n, n_dim)`` and travels
+    ``(n_moments,)`` in m.
+    """
+    assert stage.modal_map is not None  # prognose() has checked
+    health = scenario.health(scenario.natural(y), clock)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = np.log(health * [p.baseline for p in stage.parameters])
+    return x, np.asarray(stage.modal_map.inside(x).all(axis=1))
+
+
+def drifts(data: LifeData, x: FloatArray) -> FloatArray:
+    """Return the drifts along lives, then of each parameter alone, at ln parameters of `ln_health`.
+
+    Shape ``(n_modes, 1 + n_parameters, n, n_moments)``.
+    """
+    n, n_moments, n_parameters = x.shape
+    drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
+    return np.moveaxis(drift.reshape(1 + n_parameters, n, n_moments, len(data.modes)), 3, 0)
+
+
+def _reduced(
+    data: LifeData, basis: NodeBasis, factor: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return L⁻¹ y, and Q and R of L⁻¹ W for the nodes of all modes."""
+    own = data.mode_of[:, None] == np.arange(len(data.modes))
+    shapes = own[:, :, None] * basis.weights[data.log_of][:, None]
+    columns = np.column_stack([shapes.reshape(data.rows.size, -1), data.y])
+    both = solve_triangular(factor, columns, lower=True)
+    q, r = np.linalg.qr(both[:, :-1])
+    return both[:, -1], q, r
+
+
+def scatter_prior(stage: Stage) -> ScatterPrior:
+    """Return the prior of walk, noise scale and deviation: the fleet's, or the default."""
+    if stage.scatter is not None:
+        return stage.scatter
+    values = (constants.WALK_PRIOR, constants.NOISE_SCALE_PRIOR, constants.DEVIATION_PRIOR)
+    return ScatterPrior(*values)
+
+
+def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
+    """Return the prior means of walk, noise scale and deviation."""
+    return (
+        float(np.average(constants.WALK_STDS, weights=scatter.walk)),
+        float(np.average(constants.NOISE_SCALES, weights=scatter.noise_scale)),
+        float(np.average(constants.DEVIATION_STDS, weights=scatter.deviation)),
+    )
+
+
+def expected_squares(weights: tuple[float, ...]) -> float:
+    """Return the prior mean of the variance of the deviation from a law over the history."""
+    return float(np.average(np.square(constants.DEVIATION_STDS), weights=weights))

@@ -1,0 +1,426 @@
+"""Posterior of a life: probabilities of its scenarios, their laws' parameters, and nuisances."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from scipy.special import chdtrc, softmax
+from threadpoolctl import threadpool_limits
+
+from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.seeds import stream
+from lmshealth.errors import NotConverged
+from lmshealth.life import constants
+from lmshealth.life.data import LifeData
+from lmshealth.life.density import LifeDensity, Nuisances
+from lmshealth.life.ensemble_sampling import Sample, sample, thin
+from lmshealth.life.exploration import Explored, LifeStart, explore, log_probability
+from lmshealth.life.likelihood import (
+    NO_MODE,
+    LifeLikelihood,
+    expected_squares,
+    ln_health,
+    scatter_prior,
+)
+from lmshealth.life.scenarios import Scenario
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import History
+
+if TYPE_CHECKING:
+    from xarray import DataTree
+
+_STEP = 1 << 20  # of the random stream: beyond the epochs of health
+_N_SETTINGS, _N_LONE, _N_PRIOR = 500, 50, 2000
+_NONE = np.zeros(0, dtype=int)
+_CHECKS = ("ess_bulk", "ess_tail", "r_hat")
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ScenarioPosterior:
+    """Posterior under one scenario."""
+
+    density: LifeDensity
+    probability: float  # posterior probability of the scenario
+    evidence_std: float  # relative standard deviation of its evidence
+    # Draws of the coordinates, ``(n_ensembles, n_draws, n_dim)``, with the checks of the chains;
+    # after importance sampling the effective sample size, and NaN for R-hat.
+    sample: Sample
+    # Draws of each ensemble that represent this scenario in the mixture of all, and their nuisances.
+    n_mixture_draws: int
+    nuisances: Nuisances
+
+    @property
+    def scenario(self) -> Scenario:
+        """The scenario."""
+        return self.density.scenario
+
+    @property
+    def chains(self) -> FloatArray:
+        """Draws of the natural parameters (lengths in m), ``(n_ensembles, n_draws, n_dim)``."""
+        natural = self.scenario.natural(np.concatenate(self.sample.draws))
+        return natural.reshape(self.sample.draws.shape)
+
+    @property
+    def mixture_draws(self) -> FloatArray:
+        """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
+        return np.concatenate(thin(self.sample.draws, self.n_mixture_draws))
+
+
+@dataclass(frozen=True, slots=True)
+class LoneMode:
+    """A mode that moved alone, by a cause that the map does not have.
+
+    `size` and `std` are of the change of its ln f since the baseline beyond that by the map, if it
+    is this mode, which has the probability.
+    """
+
+    mode: str
+    size: float
+    std: float
+    probability: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifePosterior:
+    """Posterior of a life, a mixture over its scenarios."""
+
+    data: LifeData
+    parameters: tuple[str, ...]
+    scenarios: tuple[ScenarioPosterior, ...]  # above the least probability, in descending order
+    # Draws of the health parameters now, as fractions of baseline; deviation of ln health from its
+    # law now; its variance per m of future travel. Those of the first scenario first, shape
+    # ``(n_ensembles, n_draws, n_parameters)``.
+    health: FloatArray
+    off: FloatArray
+    rate: FloatArray
+    lone: np.ndarray  # index of the mode that moves alone in each draw, or `NO_MODE`, ``(..., n)``
+    lone_modes: tuple[LoneMode, ...]  # the most probable first
+    chi_square: float  # of the residuals at the posterior mean of each scenario, averaged
+    degrees_of_freedom: float  # data less all that they determine
+    walk: float  # walk, noise_scale, deviation: as in `Prognosis`
+    noise_scale: float
+    deviation: float
+    sampler: Literal["emcee", "importance"]  # that drew the probable scenarios
+    # Change of the median of ln health now from importance sampling to emcee, in posterior standard
+    # deviations, and ratio of the 90 % intervals, ``(n_parameters,)``; NaN without chains.
+    judge_shift: FloatArray
+    judge_ratio: FloatArray
+    start: LifeStart  # of the next posterior
+    seed: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        shape, p = self.health.shape, len(self.parameters)
+        freeze(self, ("health off rate", *shape[:2], p), ("lone", *shape[:2]))
+        if sum(one.n_mixture_draws for one in self.scenarios) != shape[1]:
+            raise ValueError("the draws of the scenarios do not add up to those of health")
+
+    @property
+    def stage(self) -> str:
+        """Identity of the machine."""
+        return self.data.history.stage
+
+    @property
+    def modes(self) -> tuple[str, ...]:
+        """Modes that were used."""
+        return self.data.modes
+
+    @property
+    def fit(self) -> float:
+        """Probability of a χ² above that of the residuals."""
+        return float(chdtrc(self.degrees_of_freedom, self.chi_square))
+
+    def by_scenario(self) -> Iterator[tuple[ScenarioPosterior, FloatArray, FloatArray]]:
+        """Yield each scenario with `off` and `rate` of its draws, ``(n, n_parameters)``."""
+        first = 0
+        for one in self.scenarios:
+            part = slice(first, first + one.n_mixture_draws)
+            first = part.stop
+            off, rate = (x[:, part].reshape(-1, x.shape[-1]) for x in (self.off, self.rate))
+            yield one, off, rate
+
+    def health_at(self, moments: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw health as fractions of baseline at moments in m since the baseline.
+
+        In the order of `health`: ``(n_moments, n_ensembles, n_draws, n_parameters)``, with the
+        scenario and the nuisances of each draw, and deviations independent from moment to moment.
+        """
+        parts = []
+        for one in self.scenarios:
+            y = one.mixture_draws
+            off = one.density.deviations(y, one.nuisances, moments, rng)
+            health = one.scenario.health(one.scenario.natural(y), moments) * np.exp(off)
+            shape = (self.health.shape[0], one.n_mixture_draws, *health.shape[1:])
+            parts.append(health.reshape(shape))
+        return np.moveaxis(np.concatenate(parts, axis=1), 2, 0)
+
+    def prior_at(self, moments: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """Draw ln health at moments from the prior, ``(n_moments, n, n_parameters)``.
+
+        Of lives that stay inside the map, with deviations from their laws.
+        """
+        data = self.data
+        spread = np.array(expected_squares(scatter_prior(data.stage).deviation))
+        scenarios = data.scenarios
+        weights = np.array([one.weight for one in scenarios])
+        sizes = np.ceil(_N_PRIOR * weights / weights.sum()).astype(int).tolist()
+        parts = []
+        for scenario, n in zip(scenarios, sizes, strict=True):
+            x, inside = ln_health(data.stage, scenario, scenario.draw(rng, n), moments)
+            parts.append(x[inside] - data.stage.baseline_point)
+        x = np.moveaxis(np.concatenate(parts), 1, 0)
+        share = np.sqrt(np.maximum(moments, 0.0) / data.now * spread)[:, None, None]
+        return np.asarray(x + share * data.free * rng.standard_normal(x.shape))
+
+    def laws(self, parameter: str) -> dict[tuple[str, float], float]:
+        """Return the probability of each law of a parameter by its kind and begin in m."""
+        j, found = self.parameters.index(parameter), dict[tuple[str, float], float]()
+        for one in self.scenarios:
+            path = one.scenario.paths[j]
+            key = (path.law.kind, path.begin)
+            found[key] = found.get(key, 0.0) + one.probability
+        return dict(sorted(found.items(), key=lambda item: -item[1]))
+
+    @property
+    def ess(self) -> float:
+        """Smallest effective sample size of the scenarios that chains sample; infinite without any.
+
+        After an update by importance sampling it is that of the weights.
+        """
+        least = constants.MIN_CHAIN_PROBABILITY
+        by_chains = [one.sample for one in self.scenarios if one.probability >= least]
+        sizes = [size for one in by_chains for size in (*one.ess_bulk, *one.ess_tail)]
+        return float(min(sizes, default=np.inf))
+
+    @property
+    def worst_r_hat(self) -> float:
+        """Largest R-hat of any scenario."""
+        return float(np.nanmax([1.0, *(x for one in self.scenarios for x in one.sample.r_hat)]))
+
+    def to_arviz(self) -> DataTree:
+        """Return health now and the natural parameters of each scenario for ArviZ; see `Health`."""
+        import arviz_base  # late: its import takes a second
+
+        posterior = {name: self.health[..., j] for j, name in enumerate(self.parameters)}
+        groups: dict[str, dict[str, FloatArray]] = {"posterior": posterior}
+        scalars = ("chi_square", "degrees_of_freedom", "walk", "noise_scale", "deviation")
+        checks = {name: np.array(getattr(self, name)) for name in scalars}
+        for k, one in enumerate(self.scenarios, start=1):
+            names, chains = self._names(one), one.chains
+            if names:
+                groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
+            checks[f"probability_{k}"] = np.array(one.probability)
+            for what in _CHECKS:
+                values = zip(names, getattr(one.sample, what), strict=True)
+                checks |= {f"{what}_{k}_{name}": value for name, value in values}
+        attrs = {"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}}
+        return arviz_base.from_dict(groups | {"checks_data": checks}, attrs=attrs)
+
+    def _names(self, one: ScenarioPosterior) -> list[str]:
+        """Name natural parameters by health parameter, law, and begin if not at the baseline."""
+        names = []
+        for parameter, path in zip(self.parameters, one.scenario.paths, strict=True):
+            since = f"@{path.begin / 1000:.0f}km" if path.begin else ""
+            names += [f"{parameter}.{path.law.kind}{since}.{own}" for own in path.names]
+        return names
+
+
+def fit_life(
+    history: History,
+    stage: Stage,
+    seed: int | Sequence[int],
+    *,
+    chains: bool = True,
+    before: LifeStart | None = None,
+    min_logs: int = constants.MIN_LOGS,
+) -> LifePosterior:
+    """Fit the degradation laws of a stage to all logs since its baseline.
+
+    Scenarios are weighted by their evidence; the probable ones are sampled, and their draws are
+    mixed by probability.
+
+    Parameters
+    ----------
+    history, stage : History, Stage
+        Modal estimates of all logs; laws, priors, covariates and modal map.
+    seed : int or sequence of int
+        Seed of all random numbers.
+    chains : bool
+        Whether emcee samples the probable scenarios; otherwise importance sampling draws them (at
+        least 400 effective draws of the most probable), in a fraction of the time.
+    before : LifeStart, optional
+        `start` of the posterior with fewer logs, from whose draws importance sampling begins. Where
+        its weights fail, the life is fitted from nothing.
+    min_logs : int
+        Logs with an informative mode that are enough.
+
+    Raises
+    ------
+    BadStage
+        If the description has no health parameter.
+    NotEnoughData
+        If fewer than three logs since the baseline have an informative mode, the odometer is
+        missing or has not moved, or the modes stepped more than three times.
+    NotConverged
+        If the sampler did not converge; carries the chains.
+
+    Examples
+    --------
+    Health of a simulated machine now, and the laws by which it degraded:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> life = lmshealth.fit_life(examples.history(), stage, seed=0, chains=False)
+    >>> [path.law.kind for path in life.scenarios[0].scenario.paths]
+    ['hertz-wear', 'loosening']
+    >>> for name, median in zip(life.parameters, np.median(life.health, axis=(0, 1))):
+    ...     print(f"{name}: {median:.0%}")
+    guide_preload: 72%
+    mount_stiffness: 87%
+    """
+    likelihood = LifeLikelihood.of(history, stage, min_logs)
+    n_kept = constants.N_DRAWS // constants.N_ENSEMBLES
+    # Arrays are small: threads inside linear algebra would only wait for one another.
+    with threadpool_limits(1, user_api="blas"):
+        # Updates one after the other must not repeat their random numbers.
+        steps = () if before is None else (len(history.logs),)
+        *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
+        try:
+            weighted, start = explore(likelihood, seeds[0], before)
+        except NotConverged:
+            if before is None:
+                raise
+            return fit_life(history, stage, seed, chains=chains, min_logs=min_logs)
+        drawn = _sampled_scenarios(weighted, seeds[1], n_kept, np.inf)
+        scenarios, judge = drawn, np.full((2, len(stage.parameters)), np.nan)
+        if chains:
+            least = constants.MIN_CHAIN_PROBABILITY
+            scenarios = _sampled_scenarios(weighted, seeds[1], n_kept, least)
+            judge = _change(likelihood, drawn, scenarios)
+        rng, now = np.random.default_rng(off_seed), np.array([likelihood.data.now])
+        draws, settings = [], []
+        for one in scenarios:
+            y, density, (_, point) = one.mixture_draws, one.density, one.nuisances
+            off = density.deviations(y, one.nuisances, now, rng)[:, 0]
+            by_law = one.scenario.health(one.scenario.natural(y), now)[:, 0]
+            rate = density.grid.deviation[point, None] ** 2 / now * likelihood.data.free
+            columns = (by_law * np.exp(off), off, rate, density.grid.lone[point, None])
+            shape = (constants.N_ENSEMBLES, one.n_mixture_draws, -1)
+            draws.append([part.reshape(shape) for part in columns])
+            settings.append(density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
+        lone_modes = _lone_modes(likelihood, scenarios)
+    health, off, rate, lone = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
+    share = np.array([one.n_mixture_draws for one in scenarios]) / n_kept
+    means = (float(value) for value in share @ np.array(settings))
+    walk, noise_scale, deviation, chi_square, freedom = means
+    return LifePosterior(
+        data=likelihood.data,
+        parameters=tuple(parameter.name for parameter in stage.parameters),
+        scenarios=scenarios,
+        health=health,
+        off=off,
+        rate=rate,
+        lone=lone[..., 0].astype(int),
+        lone_modes=lone_modes,
+        chi_square=chi_square,
+        degrees_of_freedom=freedom,
+        walk=walk,
+        noise_scale=noise_scale,
+        deviation=deviation,
+        sampler="emcee" if chains else "importance",
+        judge_shift=judge[0],
+        judge_ratio=judge[1],
+        start=start,
+        seed=tuple(np.atleast_1d(seed).tolist()),
+    )
+
+
+def _change(
+    likelihood: LifeLikelihood,
+    before: Sequence[ScenarioPosterior],
+    after: Sequence[ScenarioPosterior],
+) -> FloatArray:
+    """Return shift and ratio of ln health now, by the laws, as in `LifePosterior`, ``(2, p)``."""
+    now, quantiles = np.array([likelihood.data.now]), []
+    for scenarios in (before, after):
+        health = [
+            one.scenario.health(one.scenario.natural(one.mixture_draws), now)[:, 0]
+            for one in scenarios
+        ]
+        with np.errstate(divide="ignore"):
+            x = np.log(np.concatenate(health))
+        quantiles.append(np.quantile(x, (0.05, 0.5, 0.95), axis=0))
+    (low, middle, high), other = quantiles
+    width = np.where(high > low, high - low, np.nan)
+    # The width of a 90 % interval is 3.29 standard deviations.
+    return np.array([(other[1] - middle) / width * 3.29, (other[2] - other[0]) / width])
+
+
+def _lone_modes(
+    likelihood: LifeLikelihood, scenarios: Sequence[ScenarioPosterior]
+) -> tuple[LoneMode, ...]:
+    """Return the modes that move alone in some draws, the most probable first."""
+    data, sums = likelihood.data, np.zeros((len(likelihood.data.modes), 3))
+    total = sum(one.nuisances[1].size for one in scenarios)
+    for one in scenarios:
+        y, grid = one.mixture_draws, one.density.grid
+        for error, k in np.unique(np.column_stack(one.nuisances), axis=0).tolist():
+            own = np.flatnonzero((one.nuisances[0] == error) & (one.nuisances[1] == k))
+            if grid.lone[k] == NO_MODE:
+                continue
+            some = y[own[:: own.size // _N_LONE + 1]] if one.scenario.n_dim else y[:1]
+            x, _ = likelihood.path(one.scenario, some)
+            mean, variance = likelihood.lone_drift(grid, k, data.stage.map_errors[error][0], x)
+            moments = 1.0, mean.mean(), np.mean(variance + mean**2)
+            sums[grid.lone[k]] += own.size / total * np.array(moments)
+    found = []
+    for mode, (share, first, second) in zip(data.modes, sums, strict=True):
+        if share:
+            size = first / share
+            std = float(np.sqrt(max(second / share - size**2, 0.0)))
+            found.append(LoneMode(mode, float(size), std, float(share)))
+    return tuple(sorted(found, key=lambda one: -one.probability))
+
+
+def _sampled_scenarios(
+    found: Sequence[Explored],
+    seed: np.random.SeedSequence,
+    n_kept: int,
+    min_chain_probability: float,
+) -> tuple[ScenarioPosterior, ...]:
+    """Sample the probable scenarios, and divide the draws of the mixture among them."""
+    probability = softmax([log_probability(one) for one in found])
+    least = constants.MIN_PROBABILITY
+    order = [k for k in np.argsort(-probability) if probability[k] >= least]
+    kept = probability[order] / probability[order].sum()
+    # Rounded so that they add up.
+    shares = np.diff(np.round(np.cumsum(kept) * n_kept), prepend=0).astype(int)
+    seeds = seed.spawn(len(found))
+    sampled = []
+    for k, share, own in zip(order, shares, kept, strict=True):
+        density, weighted = found[k]
+        n_dim = density.scenario.n_dim
+        chain_seed, draw_seed = seeds[k].spawn(2)
+        rng = np.random.default_rng(draw_seed)
+        if n_dim and own >= min_chain_probability:
+            draws = sample(density.log_probability, weighted, chain_seed)
+        else:
+            y = weighted.resampled(rng, constants.N_ENSEMBLES * n_kept)
+            ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
+            draws = Sample(y.reshape(constants.N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown)
+        kept_draws = thin(draws.draws, n_kept)
+        mixed = np.concatenate(thin(kept_draws, int(share)))
+        one = ScenarioPosterior(
+            density=density,
+            probability=float(own),
+            evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
+            sample=replace(draws, draws=kept_draws),
+            n_mixture_draws=int(share),
+            nuisances=density.draw_nuisances(mixed, rng) if share else (_NONE, _NONE),
+        )
+        sampled.append(one)
+    return tuple(sampled)

@@ -1,0 +1,288 @@
+"""Verdict on a stage: its most probable state at the last epoch."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from datetime import datetime
+from itertools import compress
+from typing import Literal
+
+import numpy as np
+from scipy.special import expit, logit
+
+from lmshealth._private.arrays import BoolArray
+from lmshealth.life import constants
+from lmshealth.life.health import Health
+from lmshealth.life.likelihood import NO_MODE
+from lmshealth.life.posterior import LoneMode
+from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.naming import off_description
+from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import Event, Track
+
+# Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.
+NO_HEALTH = ("alarm", "no-alarm", "not-enough-data")
+OUTSIDE_MAP = "outside-map"
+"""Verdict on a mode that moved alone, by a cause that the map does not have."""
+_WITHOUT_LOSS = ("healthy", "step", OUTSIDE_MAP, *NO_HEALTH)
+
+
+def verdict_of(words: tuple[str, ...]) -> str:
+    """Return the verdict for the words of the degraded parameters.
+
+    ``healthy`` without any, ``both`` for preload and mount, else the words joined by ``+``.
+    """
+    if set(words) == {"preload", "mount"}:
+        return "both"
+    return "+".join(words) or "healthy"
+
+
+def degraded_words(verdict: str) -> tuple[str, ...]:
+    """Return the words of the parameters that a verdict reports as degraded."""
+    if verdict == "both":
+        return "preload", "mount"
+    return () if verdict in _WITHOUT_LOSS else tuple(verdict.split("+"))
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """State of a stage at its last log with its probability, and sentences that explain it.
+
+    The verdict is ``healthy``, ``step``, `OUTSIDE_MAP`, one of `NO_HEALTH`, whose probability is
+    NaN, or what `verdict_of` returns for the degraded parameters.
+    """
+
+    stage: str
+    recorded_at: datetime
+    verdict: str
+    probability: float
+    why: str
+
+
+def degraded_below(parameter: ParameterSpec) -> float:
+    """Return the value below which a parameter is degraded."""
+    own, without = parameter.limit, parameter.baseline * (1 - constants.LOSS_WITHOUT_LIMIT)
+    limit = own.below if own else without
+    return parameter.baseline - constants.DEGRADED_SHARE * (parameter.baseline - limit)
+
+
+def judge(
+    stage: Stage,
+    history: History,
+    health: Health | None,
+    track: Track | None = None,
+    *,
+    doubt: str = "",
+) -> Verdict:
+    """Return the most probable state of the stage at the last epoch, with its probability.
+
+    Parameters
+    ----------
+    stage, history : Stage, History
+        Parameters with their limits and words, and all logs.
+    health, track : Health or None, Track, optional
+        Posterior of the parameters, None if they could not be inferred; steps and alarms.
+    doubt : str
+        Why the names of the modes are in doubt, from `doubt_of_names`; then there is no health.
+
+    Returns
+    -------
+    Verdict
+        ``step`` after an undeclared step of the modes since the baseline. ``not-enough-data``
+        if there are fewer logs than a baseline needs, if no life of the parameters explains the
+        logs, or if no parameter is informed; ``why`` then reports alarms. ``alarm`` or ``no-alarm``
+        of tracked modes if the description has no parameter. Otherwise what most draws say: a set
+        of degraded parameters; without any, ``outside-map`` if a mode moved alone, or ``healthy``.
+
+    Examples
+    --------
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage, history = lmshealth.load_stage("lms-y"), examples.history()
+    >>> health = lmshealth.infer(history, stage, seed=1, chains=False)
+    >>> judgement = lmshealth.judge(stage, history, health)
+    >>> print(f"{judgement.verdict}, {judgement.probability:.0%}")
+    both, 95%
+    >>> judgement.why.split(".")[0]
+    'Guide preload is at 71 % of its baseline value (90 %: 67 to 75 %)'
+    >>> lmshealth.judge(stage, history, None).why
+    'The logs do not contain enough information for the health parameters.'
+    """
+    jumps = undeclared_events(track, history.baseline, "step")
+    if jumps:
+        found = _judge_step(stage, history, health, jumps)
+        return replace(found, why=f"{found.why} {doubt}".rstrip())
+    reason = doubt or _reason_for_no_verdict(stage, history, health)
+    if reason or health is None:
+        alarms = [*_alarm_sentences(track, history.baseline)]
+        word, why = "not-enough-data", " ".join((*alarms, reason))
+        enough = len(history.logs) - history.baseline >= stage.description.baseline.logs
+        if track is not None and not stage.parameters and (alarms or enough):
+            word = "alarm" if alarms else "no-alarm"
+        return Verdict(history.stage, history.recorded_at[-1], word, float("nan"), why)
+    return _judge_posterior(stage, history, health)
+
+
+def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
+    n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
+    if not stage.parameters:
+        return (
+            "The stage description has no [[parameter]]: the modes are tracked, and no health "
+            "parameter is inferred."
+        )
+    if n_logs < needed:
+        logs = "log" if n_logs == 1 else "logs"
+        return f"{n_logs} usable {logs} since the baseline began; it needs {needed}."
+    if health is None:
+        return "The logs do not contain enough information for the health parameters."
+    if not health.explained:
+        p = f"{health.fit[-1]:.1g}"
+        found = f"No life of the parameters on the map explains the logs (p = {p})"
+        return f"{found}: something else moved the modes, or the map is wrong."
+    if not health.publishable_parameters().any():
+        return "The data do not constrain any health parameter."
+    return ""
+
+
+def doubt_of_names(
+    stage: Stage, history: History, track: Track, readings: Sequence[LogEstimates] = ()
+) -> str:
+    """Return why health that depends on the names of modes is not published; empty if it may be.
+
+    Modes move with wear, and a repair need not restore them: those of the first baseline are
+    compared with the description, as all logs until the next baseline estimate it.
+    ``readings`` are the estimates of the logs of the history, in its order, for their flags.
+    """
+    specs = {mode.name: mode for mode in stage.modes}
+    last = [*history.baselines[1:], len(history.logs)][0] - 1
+    early = min(history.baselines[0] + stage.description.baseline.logs - 1, last)
+    ln_f = track.ln_frequency[last] - track.drift[last]
+    estimate = np.array([ln_f, track.ln_damping[early]])
+    std = np.array([track.ln_frequency_std[last], track.ln_damping_std[early]])
+    known = [k for k, m in enumerate(track.modes) if m in specs and np.isfinite(ln_f[k])]
+    names = [track.modes[k] for k in known]
+    off = off_description(stage, names, estimate[:, known], std[:, known])
+    if off:
+        values = "; ".join(
+            f"{one.mode} {one.declared_hz:.5g} Hz and {one.found_hz:.5g} Hz, damping "
+            f"{100 * one.declared_damping_ratio:.2g} % and {100 * one.found_damping_ratio:.2g} %"
+            for one in off
+        )
+        return (
+            "The names of the modes are in doubt, so that no health is published. Declared and "
+            f"found at the baseline: {values}. Plausible are differences up to "
+            f"{100 * OFF_FREQUENCY:.0f} % (damping: a factor of {OFF_DAMPING:g}): correct the "
+            "description, or describe the modes that it lacks."
+        )
+    flags = Counter(
+        name
+        for reading in readings[history.baseline :]
+        for name, own in zip(reading.modes.names, reading.modes.flags, strict=True)
+        if "doubtful-name" in own.split()
+    )
+    n_logs = len(readings) - history.baseline
+    often = [f"{name} in {k} of {n_logs} logs" for name, k in flags.items() if 2 * k > n_logs]
+    if not often:
+        return ""
+    return (
+        "The names of the modes are in doubt, so that no health is published: another mode may "
+        f"have the name {', '.join(often)} since the baseline (flag doubtful-name). Describe the "
+        "modes that refused.csv lists as undescribed."
+    )
+
+
+def undeclared_events(
+    track: Track | None, baseline: int, kind: Literal["step", "alarm"]
+) -> list[Event]:
+    """Return the events of a kind after a log that no maintenance declares, one per mode."""
+    events = () if track is None else track.events
+    undeclared = (one for one in events if one.kind == kind and not one.declared)
+    return [one for one in undeclared if one.epoch > baseline]
+
+
+def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
+    """Yield a sentence per mode with an alarm: its drift by now."""
+    if track is None:
+        return
+    alarms = {event.mode: event for event in undeclared_events(track, baseline, "alarm")}
+    for mode, event in alarms.items():
+        k = track.modes.index(mode)
+        moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
+        size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
+        when, name = track.recorded_at[event.epoch].date().isoformat(), mode.replace("_", " ")
+        size = size.replace("-", "−")
+        yield f"Alarm since {when}: {name} has moved by {size} since the baseline."
+
+
+def _judge_step(
+    stage: Stage, history: History, health: Health | None, jumps: list[Event]
+) -> Verdict:
+    last = max(event.epoch for event in jumps)
+    latest = (event for event in jumps if event.epoch == last)
+    sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in latest)
+    when, moved = history.recorded_at[last].date().isoformat(), sizes.replace("-", "−")
+    why = f"The frequencies jumped before the log of {when} ({moved}), and no declared maintenance "
+    why += "explains it."
+    if health is not None and health.publishable_parameters().any():
+        why += " " + _parameter_sentences(stage, health)
+    # The evidence is against all that is harmless: wander, outliers, running-in.
+    evidence = max(event.evidence for event in jumps) + logit(constants.STEP_PROBABILITY)
+    return Verdict(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
+
+
+def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
+    lost: dict[str, BoolArray] = {}
+    for j in np.flatnonzero(health.publishable_parameters()).tolist():
+        parameter = stage.parameters[j]
+        below = health.samples[-1, :, j] < degraded_below(parameter)
+        lost[parameter.word] = lost.get(parameter.word, False) | below
+    # A mode that moved alone counts in draws without a loss.
+    lone = health.lone.ravel() if lost else np.empty(0, dtype=int)
+    degraded = np.column_stack(list(lost.values()))
+    modes = np.where(degraded.any(axis=1), NO_MODE, lone)
+    draws = Counter(zip(map(tuple, degraded.tolist()), modes.tolist(), strict=True))
+    # Of equally probable verdicts the one with more degraded parameters: it allows for more.
+    chosen = max(draws, key=lambda one: (draws[one], sum(one[0]), one))
+    verdict, mode = verdict_of(tuple(compress(lost, chosen[0]))), chosen[1]
+    why = _parameter_sentences(stage, health)
+    if mode != NO_MODE:
+        verdict = OUTSIDE_MAP
+        name = health.modes[mode]
+        why = f"{lone_sentence(next(m for m in health.lone_modes if m.mode == name), stage)} {why}"
+    probability = draws[chosen] / draws.total()
+    return Verdict(history.stage, history.recorded_at[-1], verdict, probability, why)
+
+
+def lone_sentence(lone: LoneMode, stage: Stage) -> str:
+    """Return a sentence about a mode that moved alone, and what to check."""
+    moved, std = 100 * np.expm1(lone.size), 100 * np.exp(lone.size) * lone.std
+    name = lone.mode.replace("_", " ").capitalize()
+    states = " and ".join(one.name.replace("_", " ") for one in stage.parameters)
+    size = f"{moved:+.1f}".replace("-", "−")
+    return (
+        f"{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check its "
+        "sensor and cables, and what the platform carries."
+    )
+
+
+def _parameter_sentences(stage: Stage, health: Health) -> str:
+    quantiles = health.latest(np.array([0.05, 0.5, 0.95]))
+    informed = health.publishable_parameters()
+    sentences = []
+    for j, parameter in enumerate(stage.parameters):
+        name = parameter.name.replace("_", " ").capitalize()
+        low, middle, high = quantiles[:, j]
+        if not health.identifiable[-1, j]:
+            text = f"{name}: not identifiable from the tracked modes."
+        elif not informed[j]:
+            text = f"{name}: not constrained by these logs."
+        elif parameter.unit:
+            text = f"{name} is {middle:.4g} {parameter.unit} (90 %: {low:.4g} to {high:.4g})."
+        else:
+            low, middle, high = (100 * q / parameter.baseline for q in (low, middle, high))
+            text = f"{name} is at {middle:.0f} % of its baseline value "
+            text += f"(90 %: {low:.0f} to {high:.0f} %)."
+        sentences.append(text)
+    return " ".join(sentences)
