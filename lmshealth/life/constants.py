@@ -41,8 +41,8 @@ LONE_STD = 0.02
 LONE_EXPONENTS = (0.5, 1.0, 2.0)
 """Powers of the travel by which it may grow, equally probable: smooth, from early to late. Under a
 Brownian path a smooth drift is improbable."""
-LONE_WALK = 5e-4
-"""Random walk of all modes beside it."""
+LONE_WALKS = ((5e-4, 0.6), (1.5e-3, 0.4))
+"""Random walks of all modes beside it, with probabilities."""
 LONE_NAMED = 0.5
 """Probability from which such a mode is named beside another verdict."""
 

@@ -93,10 +93,14 @@ class LifeCovariance(ReadOnly):
 def lone_kernel(moments: FloatArray, clock: FloatArray, now: float) -> FloatArray:
     """Return the covariance of the smooth drift of a mode that moves alone, of variance 1 now.
 
-    Between moments ``(n,)`` and ``(m,)`` in m since the baseline: ``(n, m)``.
+    Between moments ``(n,)`` and ``(m,)`` in m since the baseline: ``(n, m)``. It is a sum of powers
+    of the travel and of an integrated random walk, which begins and ends where it likes.
     """
     a, b = (np.maximum(one, 0.0) / now for one in (moments, clock))
-    return np.asarray(np.mean([np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS], axis=0))
+    least, most = np.minimum.outer(a, b), np.maximum.outer(a, b)
+    parts = [np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS]
+    parts.append(1.5 * least**2 * (most - least / 3))
+    return np.asarray(np.mean(parts, axis=0))
 
 
 def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
@@ -187,7 +191,12 @@ class Grid(Rows):
         total = np.sum(prior.walk)
         ways = [
             *((q, p / total * (1 - n_modes * alone), NO_MODE) for q, p in _walks(prior)),
-            *((constants.LONE_WALK, alone, mode) for mode in range(n_modes) if alone),
+            *(
+                (walk, alone * p, mode)
+                for mode in range(n_modes)
+                for walk, p in constants.LONE_WALKS
+                if alone
+            ),
         ]
         for (walk, p, lone), (scale, q), (deviation, r) in product(
             ways,
