@@ -116,7 +116,7 @@ MAX_EPOCHS = 40
 N_ENSEMBLES = 4
 MIN_AUTOCORRELATION_TIMES = 50
 MAX_R_HAT = 1.01
-MAX_STEPS = 20_000
+MAX_CHAIN_STEPS = 20_000
 MIN_ESS = 400
 """Effective draws of a posterior by importance sampling: as many as [Vehtari2021] asks of chains.
 The relative standard deviation of the evidence is then at most 5 %."""

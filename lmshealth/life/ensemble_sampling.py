@@ -22,7 +22,7 @@ from lmshealth.life.importance_sampling import (
 if TYPE_CHECKING:
     import emcee
 
-_FIRST_STEPS = 250
+_FIRST_STEPS = 200
 # Vectorised, many walkers cost little more than few.
 _MIN_WALKERS, _WALKERS_PER_DIMENSION = 32, 8
 
@@ -58,7 +58,7 @@ def sample(
 ) -> Sample:
     """Sample a posterior by independent ensembles [ForemanMackey2013], [Vehtari2021].
 
-    They start from weighted draws of it, about which half of their moves are proposed. Its log
+    They start from weighted draws of it, about which most of their moves are proposed. Its log
     density is -inf outside its support. Every ensemble has its own start and random stream: walkers
     of one ensemble depend on each other, so that R-hat over them is no diagnostic. `NotConverged`,
     with the chains, is raised if 50 autocorrelation times or R-hat below 1.01 are not reached.
@@ -76,7 +76,7 @@ def sample(
         # Gaussian of six dimensions by 9 %.
         independent = emcee.moves.MHMove(_independent(Proposal.near(draws, rng)))
         moves = [independent, emcee.moves.DEMove(), emcee.moves.DEMove(gamma0=1.0)]
-        weighted = list(zip(moves, (0.5, 0.35, 0.15), strict=True))
+        weighted = list(zip(moves, (0.8, 0.15, 0.05), strict=True))
         options = {"vectorize": True, "moves": weighted}
         sampler = emcee.EnsembleSampler(*points.shape, log_probability, **options)
         # emcee ignores a Generator; without a state all samplers of a process draw the same.
@@ -131,7 +131,7 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
         r_hat = _diagnose("rhat", kept)
         if enough and (r_hat < constants.MAX_R_HAT).all():
             break
-        if n_steps >= constants.MAX_STEPS:
+        if n_steps >= constants.MAX_CHAIN_STEPS:
             raise NotConverged(
                 f"after {n_steps} steps the autocorrelation time is {tau.max():.0f} and R-hat "
                 f"{r_hat.max():.3f}; needed are {constants.MIN_AUTOCORRELATION_TIMES} "
@@ -140,7 +140,7 @@ def _run(samplers: list[tuple[emcee.EnsembleSampler, emcee.State]]) -> Sample:
                 chains,
             )
         wanted = int(1.1 * (constants.MIN_AUTOCORRELATION_TIMES + 10) * tau.max())
-        target = min(max(wanted, n_steps + n_steps // 2), constants.MAX_STEPS)
+        target = min(max(wanted, n_steps + n_steps // 2), constants.MAX_CHAIN_STEPS)
     # Effective sample sizes need each walker as a chain in time.
     walkers = np.swapaxes(kept, 1, 2)
     ess_bulk = _diagnose("ess", walkers, method="bulk")

@@ -24,6 +24,9 @@ from lmshealth.stage.degradation_laws import Free
 _N_ROUGH, _N_FINE = 300, 2000
 # Draws of an update, and those of each scenario that are kept for the next one.
 _N_UPDATE, _N_START = 3000, 300
+# Log odds from which a scenario is left out of updates, until chains sample the life again; and
+# those that a scenario may gain over a more flexible one by being simpler.
+_NO_RETURN, _SIMPLER = 13.0, 6.0
 # Effective draws below which an evidence may miss most of its integral.
 _LEAST_ESS = 20.0
 
@@ -33,17 +36,25 @@ class LifeStart(ReadOnly):
     """Draws of a posterior from which that with further logs is sampled.
 
     `points`, ``(n_scenarios, n_draws, n_dim)``, are coordinates of the scenarios called `names`,
-    with zeros after the last coordinate of each.
+    with zeros after the last coordinate of each; `log_share` are their log probabilities, relative
+    to the largest, ``(n_scenarios,)``.
     """
 
     names: tuple[str, ...]
     points: FloatArray
+    log_share: FloatArray
 
     def of(self, scenario: Scenario) -> FloatArray:
         """Return the draws of a scenario, ``(n_draws, n_dim)``; none of one that is new."""
         if scenario.name not in self.names:
             return np.empty((0, scenario.n_dim))
         return self.points[self.names.index(scenario.name), :, : scenario.n_dim]
+
+    def excludes(self, scenario: Scenario) -> bool:
+        """Return whether a scenario was too improbable to become probable by a log."""
+        if scenario.name not in self.names:
+            return False
+        return bool(self.log_share[self.names.index(scenario.name)] < -_NO_RETURN)
 
 
 Explored = tuple[LifeDensity, WeightedDraws]
@@ -130,6 +141,19 @@ class _Exploration:
         least = max(value.values()) - constants.MAX_LOG_ODDS
         return sorted(k for k in value if value[k] > least)
 
+    def may_be_likely(self, group: Sequence[int], anchors: Sequence[int]) -> bool:
+        """Return whether a group of scenarios may have one that is not much less probable.
+
+        None is expected to be much better than the most flexible one of its own, for their priors.
+        """
+        own = [self.found[k][1].log_evidence for k in anchors if k in group]
+        if not own:
+            return bool(group)
+        weight = max(self.scenarios[k].weight for k in group)
+        best = max(log_probability(one) for one in self.found.values())
+        possible = max(own) + float(np.log(weight)) + _SIMPLER
+        return possible > best - constants.MAX_LOG_ODDS
+
     def refine(self, k: int, n: int) -> None:
         """Draw n times from a scenario again, with the grid points that it needs."""
         (density, draws), rng = self.found[k], self.generators[k]
@@ -149,19 +173,35 @@ class _Exploration:
             self.found[k] = density, importance_sample_to_ess(density.log_probability, *how)
 
     def next_start(self) -> LifeStart:
-        """Return draws of all scenarios: one that is improbable now may return."""
-        widest = max(density.scenario.n_dim for density, _ in self.found.values())
-        points = np.zeros((len(self.found), _N_START, widest))
-        for row, (k, (density, draws)) in zip(points, self.found.items(), strict=True):
-            row[:, : density.scenario.n_dim] = draws.resampled(self.generators[k], _N_START)
-        names = tuple(density.scenario.name for density, _ in self.found.values())
-        return LifeStart(names, points)
+        """Return draws of all scenarios, with those that an update has left out."""
+        draws = {
+            density.scenario.name: own.resampled(self.generators[k], _N_START)
+            for k, (density, own) in self.found.items()
+        }
+        value = np.array([log_probability(one) for one in self.found.values()])
+        share = dict(zip(draws, (value - value.max()).tolist(), strict=True))
+        if self.before is not None:
+            known = {one.name: one for one in self.scenarios}
+            for name, own in zip(self.before.names, self.before.log_share.tolist(), strict=True):
+                if name in known and name not in draws:
+                    draws[name], share[name] = self.before.of(known[name]), own
+        points = np.zeros((len(draws), _N_START, max(own.shape[1] for own in draws.values())))
+        for row, own in zip(points, draws.values(), strict=True):
+            row[:, : own.shape[1]] = own
+        return LifeStart(tuple(draws), points, np.array(list(share.values())))
 
 
 def explore(
-    likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None = None
+    likelihood: LifeLikelihood,
+    seed: np.random.SeedSequence,
+    before: LifeStart | None = None,
+    *,
+    update: bool = False,
 ) -> tuple[list[Explored], LifeStart]:
     """Return weighted draws and evidences of the scenarios that a rough evidence does not drop.
+
+    They begin with draws from before, if there are any; an update leaves out the scenarios that
+    were improbable then.
 
     `NotConverged` is raised where the weights of an update are unreliable: they are those of the
     posterior with all logs, so that errors of one update do not reach the next.
@@ -171,14 +211,23 @@ def explore(
     known: list[dict[DegradationPath, tuple[float, FloatArray]]] = [{} for _ in scenarios[0].paths]
     all_ = _Exploration(likelihood, generators, before, likelihood.grid, {}, known)
     # Grid points that the least and the most flexible scenarios do without, all do without.
-    all_.add(_anchors(scenarios))
+    anchors = _anchors(scenarios)
+    all_.add(anchors)
     all_.narrow(all_.likely())
-    all_.add(k for k, one in enumerate(scenarios) if not one.restarts)
-    # A law may restart at a step where it may have gone on.
-    going_on = {scenarios[k].name for k in all_.likely()}
-    all_.add(k for k, one in enumerate(scenarios) if one.from_start() in going_on)
+    left = {
+        k
+        for k, one in enumerate(scenarios)
+        if not (update and before is not None and before.excludes(one))
+    }
+    for with_steps in (False, True):
+        group = [k for k in left if bool(scenarios[k].paths[0].steps) == with_steps]
+        if all_.may_be_likely(group, anchors):
+            all_.add(k for k in group if not scenarios[k].restarts)
+            # A law may restart at a step where it may have gone on.
+            going_on = {scenarios[k].name for k in all_.likely()}
+            all_.add(k for k in group if scenarios[k].from_start() in going_on)
     likely = all_.likely()
-    n = _N_FINE if before is None else _N_UPDATE
+    n = _N_UPDATE if update else _N_FINE
     log_share = np.array([log_probability(all_.found[k]) for k in likely])
     # Errors of a mixture are those of a single scenario if draws follow the root of the share.
     sizes = np.maximum(_N_ROUGH, n * np.exp((log_share - log_share.max()) / 2)).astype(int)
@@ -188,7 +237,7 @@ def explore(
     largest = max(log_probability(all_.found[k]) for k in likely)
     for k, m in drawn:
         share = float(np.exp(log_probability(all_.found[k]) - largest))
-        updated = before is not None and share >= constants.MIN_CHAIN_PROBABILITY
+        updated = update and share >= constants.MIN_CHAIN_PROBABILITY
         min_ess = max(_LEAST_ESS, constants.MIN_ESS * float(np.sqrt(share)))
         all_.ensure(k, m, min_ess, updated=updated)
         draws = all_.found[k][1]

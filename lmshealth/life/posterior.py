@@ -290,7 +290,8 @@ def fit_life(
         steps = () if before is None else (len(history.logs),)
         *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
         try:
-            weighted, start = explore(likelihood, seeds[0], before)
+            update = before is not None and not chains
+            weighted, start = explore(likelihood, seeds[0], before, update=update)
         except NotConverged:
             if before is None:
                 raise
