@@ -19,11 +19,11 @@ from msgspec.structs import asdict
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_text
 from lmshealth.batch.status import coming_states, make_status
-from lmshealth.life.health import Health
-from lmshealth.life.verdict import Verdict
 from lmshealth.io.log import Notice, Refusal
-from lmshealth.modal.spectra_summary import Waterfall
+from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.life.verdict import Verdict
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.machine_page import make_page
@@ -138,7 +138,6 @@ def make_health(
         recorded_at=history.recorded_at,
         travel=history.travel,
         parameters=PARAMETERS,
-        converged=np.ones(n, dtype=bool),
         informed=np.tile(np.array(informed), (n, 1)),
     )
 

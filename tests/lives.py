@@ -16,12 +16,14 @@ from pathlib import Path
 import numpy as np
 from threadpoolctl import threadpool_info
 
-from lmshealth._private.arrays import BoolArray, FloatArray
-from lmshealth.life.health import Health
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Metadata
+from lmshealth.life.health import Health
+from lmshealth.life.likelihood import NO_MODE
+from lmshealth.life.posterior import LoneMode
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
-from lmshealth.life.prognosis import Prognosis
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History, Series, Step, StepKind
 from lmshealth.tracking.track import Track
@@ -73,6 +75,12 @@ TEMPERATURE = """
 name = "temperature_c"
 reference = 21.0
 prior_std = 0.001
+"""
+# No change without a law, and no mode that moves alone.
+LAWS_ALONE = """
+[life]
+free = 0
+lone_mode = 0
 """
 # Temperature with a curvature, and payload.
 TWO = """
@@ -327,17 +335,24 @@ def make_health(
     samples: FloatArray,
     *,
     parameters: Sequence[str] = ("guide_preload", "mount_stiffness"),
-    converged: bool = True,
     informed: Sequence[float] = (0.9, 0.9),
+    fit: float = 0.4,
+    lone: np.ndarray | None = None,
+    lone_modes: tuple[LoneMode, ...] = (),
 ) -> Health:
-    """Make the health of one epoch from draws, shape ``(n_draws, n_parameters)``."""
+    """Make the health of one epoch from draws, shape ``(n_draws, n_parameters)``.
+
+    `lone` is the index of the mode that moves alone in each draw, by default none.
+    """
     return health_of(
         np.array(samples)[None],
         recorded_at=(START,),
         travel=np.array([1e6]),
         parameters=tuple(parameters),
-        converged=np.array([converged]),
         informed=np.array([informed], dtype=float),
+        fit=fit,
+        lone=lone,
+        lone_modes=lone_modes,
     )
 
 
@@ -347,9 +362,11 @@ def health_of(
     recorded_at: tuple[datetime, ...],
     travel: FloatArray,
     parameters: tuple[str, ...],
-    converged: BoolArray,
     informed: FloatArray,
     stage: str = "AX-1",
+    fit: float = 0.4,
+    lone: np.ndarray | None = None,
+    lone_modes: tuple[LoneMode, ...] = (),
 ) -> Health:
     """Make a health of draws, ``(n_epochs, n_draws, n_parameters)``; the rest is unremarkable."""
     n, n_draws, p = samples.shape
@@ -361,21 +378,20 @@ def health_of(
         travel=travel,
         parameters=parameters,
         chains=samples.reshape(n, 2, n_draws // 2, p),
+        modes=MODES,
+        lone=(np.full(n_draws, NO_MODE) if lone is None else lone).reshape(2, n_draws // 2),
+        lone_modes=lone_modes,
+        sampler=("emcee",) * n,
         ess_bulk=np.full((n, p), 2150.0),
         ess_tail=np.full((n, p), 1000.0),
         r_hat=np.full((n, p), 1.001),
-        converged=converged,
         informed=informed,
-        prior_width=np.ones(p),
+        prior_width=np.ones((n, p)),
         identifiable=np.ones((n, p), dtype=bool),
         correlation=np.stack(rho),
-        laplace_shift=np.full((n, p), 0.02),
-        laplace_ratio=np.full((n, p), 1.01),
-        prior_shift=np.full((n, p), 0.01),
-        prior_ratio=np.full((n, p), 1.02),
         judge_shift=np.full((n, p), 0.01),
         judge_ratio=np.full((n, p), 1.01),
-        fit=np.full(n, 0.4),
+        fit=np.full(n, fit),
         at_edge=np.zeros((n, p), dtype=bool),
         seed=(0,),
     )

@@ -459,32 +459,6 @@ def _solve(matrix: np.ndarray, right: np.ndarray) -> tuple[np.ndarray, float]:
     return solved, 2 * float(np.log(np.diag(factor[0])).sum())
 
 
-def epoch_log_posterior(
-    x: FloatArray,
-    drift: FloatArray,
-    cov: FloatArray,
-    *,
-    predicted: FloatArray,
-    alone: FloatArray,
-    model_std: float,
-    medians: Sequence[float],
-    sigmas: Sequence[float],
-) -> float:
-    """Log posterior of ln parameters at one point, lognormal priors, up to a constant.
-
-    ``predicted`` is the drift of the modes there, ``alone`` (n_parameters, n_modes) the drift with
-    one parameter at a time away from its baseline.
-    """
-    error = np.zeros(drift.size)
-    for i in range(drift.size):
-        for j in range(x.size):
-            error[i] += (model_std * alone[j, i]) ** 2
-    value = stats.multivariate_normal.logpdf(drift, mean=predicted, cov=cov + np.diag(error))
-    for j in range(x.size):
-        value += stats.norm.logpdf(x[j], loc=np.log(medians[j]), scale=sigmas[j])
-    return float(value)
-
-
 @dataclass(frozen=True)
 class LifeBelief:
     """What is believed of a whole life: errors that do not depend on its course.
@@ -501,12 +475,27 @@ class LifeBelief:
 
 @dataclass(frozen=True)
 class LifeSetting:
-    """A point of the grid: walk, factor on standard deviations, deviation over the history."""
+    """A point of the grid: walk, factor on standard deviations, deviation over the history.
+
+    And the index of a mode that moves alone, if one does.
+    """
 
     walk: float
     scale: float
     deviation: float
     prior: float = 1.0
+    lone: int | None = None
+
+
+def lone_drift(t: float, u: float, now: float) -> float:
+    """Covariance of the drift of a mode that moves alone, between two travels.
+
+    A quarter each: powers ½, 1 and 2 of the travel, and an integrated random walk.
+    """
+    t, u = t / now, u / now
+    low, high = min(t, u), max(t, u)
+    parts = [(t * u) ** 0.5, t * u, (t * u) ** 2, low**2 * (3 * high - low) / 2]
+    return 0.02**2 * sum(parts) / 4
 
 
 def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, FloatArray]:
@@ -547,6 +536,8 @@ def life_covariance(
             if i == j:
                 cov[a, c] += belief.intercept_std**2 + belief.b_std**2 * offset[k] * offset[o]
                 cov[a, c] += setting.walk**2 * shared / clock.max()
+                if i == setting.lone:
+                    cov[a, c] += lone_drift(clock[k], clock[o], clock.max())
                 for own in alone:
                     cov[a, c] += belief.model_std**2 * own[k, i] * own[o, i]
     return cov
@@ -593,6 +584,25 @@ def life_deviation(
         for c, (k, i) in enumerate(where):
             cross[j, c] = unit * min(moment, clock[k]) * belief.slopes[j, i]
     return cross @ inverse @ r, unit * moment * np.eye(p) - cross @ inverse @ cross.T
+
+
+def life_lone_drift(
+    history: History,
+    predicted: FloatArray,
+    alone: FloatArray,
+    belief: LifeBelief,
+    setting: LifeSetting,
+) -> tuple[float, float]:
+    """Mean and variance of the drift now of the mode that moves alone, by conditioning."""
+    where, values, clock = _life_data(history)
+    r = values - np.array([predicted[k, i] for k, i in where])
+    inverse = np.linalg.inv(life_covariance(history, alone, belief, setting))
+    now = clock.max()
+    cross = np.zeros(len(where))
+    for c, (k, i) in enumerate(where):
+        if i == setting.lone:
+            cross[c] = lone_drift(now, clock[k], now)
+    return float(cross @ inverse @ r), float(lone_drift(now, now, now) - cross @ inverse @ cross)
 
 
 def binomial_band(hits: int, n: int, level: float = 0.999) -> tuple[float, float]:

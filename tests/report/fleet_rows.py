@@ -69,7 +69,7 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
 
 def _parameter(name: str, level: float, std: float) -> ParameterHealth:
     return ParameterHealth(
-        name=name, determined=True, converged=True, informed=0.96,
+        name=name, determined=True, informed=0.96,
         low=level - 1.6 * std, median=level, high=level + 1.6 * std,
         limit=LIMITS[name], below_limit=0.0,
     )  # fmt: skip
