@@ -103,7 +103,8 @@ INSPECTION_RISK = 0.2
 as the service date uses the risk that is accepted."""
 
 MIN_SAVING = 0.01
-"""A service that saves a smaller share of the long-run costs gets no date: draws do not resolve it."""
+"""A service that saves a smaller share of the long-run costs gets no date: draws do not resolve
+it."""
 
 # Sampling.
 N_DRAWS = 4000

@@ -51,8 +51,8 @@ class Health(Result):
     parameters: tuple[str, ...]
     chains: FloatArray  # draws, ``(n_epochs, n_ensembles, n_draws, n_parameters)``
     modes: tuple[str, ...]  # from which health is inferred
-    # Index of the mode that moves alone in each draw of the last epoch, by a cause that the map does
-    # not have, or -1, ``(n_ensembles, n_draws)``; these modes, the most probable first.
+    # Index of the mode that moves alone in each draw of the last epoch, by a cause that the map
+    # does not have, or -1, ``(n_ensembles, n_draws)``; these modes, the most probable first.
     lone: np.ndarray
     lone_modes: tuple[LoneMode, ...]
     # What drew the probable scenarios: ``emcee``, or ``importance`` in an update, ``(n_epochs,)``.

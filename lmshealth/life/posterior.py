@@ -48,7 +48,7 @@ class ScenarioPosterior:
     # Draws of the coordinates, ``(n_ensembles, n_draws, n_dim)``, with the checks of the chains;
     # after importance sampling the effective sample size, and NaN for R-hat.
     sample: Sample
-    # Draws of each ensemble that represent this scenario in the mixture of all, and their nuisances.
+    # Draws of each ensemble that represent this scenario in the mixture, and their nuisances.
     n_mixture_draws: int
     nuisances: Nuisances
 

@@ -43,8 +43,8 @@ def prognose(
     Returns
     -------
     Prognosis
-        Draws of the remaining travel, infinite where a limit is never reached. Parameters that the modes do not
-        identify are left out and named.
+        Draws of the remaining travel, infinite where a limit is never reached. Parameters that the
+        modes do not identify are left out and named.
 
     Raises
     ------

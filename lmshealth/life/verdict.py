@@ -262,8 +262,8 @@ def lone_sentence(lone: LoneMode, stage: Stage) -> str:
     states = " and ".join(one.name.replace("_", " ") for one in stage.parameters)
     size = f"{moved:+.1f}".replace("-", "−")
     return (
-        f"{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check its "
-        "sensor and cables, and what the platform carries."
+        f"{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check "
+        "its sensor and cables, and what the platform carries."
     )
 
 

@@ -1,5 +1,6 @@
 """Laws by which a health parameter degrades with travel (README.md, "Degradation laws")."""
 
+import logging
 from importlib.metadata import entry_points
 from typing import TYPE_CHECKING, Annotated, ClassVar, Union
 
@@ -12,6 +13,7 @@ from lmshealth._private.toml import within
 from lmshealth.stage import constants
 from lmshealth.stage.priors import Lognormal, Prior, Uniform
 
+_log = logging.getLogger(__name__)
 _KM = 1000.0
 # ln of ratios of lengths is cut here: a distant walker may ask for a length outside the range of
 # floats, where its prior is 0 anyway.
@@ -335,10 +337,25 @@ class Free(Law, frozen=True, tag="free", tag_field="kind", kw_only=True):
         return np.where(losing | (loss == 0), travel, np.inf)
 
 
-def _laws_of_other_packages() -> tuple[type[Law], ...]:
-    """Load the laws that installed packages offer as entry points of the group `LAWS`."""
-    found = (one.load() for one in entry_points(group=LAWS))
-    return tuple(law for law in found if isinstance(law, type) and issubclass(law, Law))
+def _laws_of_other_packages(known: tuple[type[Law], ...]) -> tuple[type[Law], ...]:
+    """Load the laws of entry points; one that cannot be used is logged as an error."""
+    found = list(known)
+    for point in entry_points(group=LAWS):
+        try:
+            law = point.load()
+            if not (isinstance(law, type) and issubclass(law, Law)):
+                raise TypeError(f"it is {law!r}, needed a subclass of Law")
+            kind = law.__struct_config__.tag
+            if not isinstance(kind, str) or kind in [own.__struct_config__.tag for own in found]:
+                raise ValueError(f"its tag is {kind!r}, needed one that no other law has")
+            found.append(law)
+        except Exception as error:
+            # A broken package must not keep descriptions without its law from being read.
+            source = point.dist.name if point.dist else "an unknown distribution"
+            what = f"{type(error).__name__}: {error}"
+            _log.error("law %r of %s is not used: %s; update or uninstall it",
+                       point.name, source, what)  # fmt: skip
+    return tuple(found)
 
 
 LAWS = "lmshealth.laws"
@@ -348,4 +365,4 @@ if TYPE_CHECKING:
     AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging | Accelerating | Free
 else:
     _SHIPPED = (HertzWear, Loosening, Power, Linear, Unchanging, Accelerating, Free)
-    AnyLaw = Union[(*_SHIPPED, *_laws_of_other_packages())]
+    AnyLaw = Union[_laws_of_other_packages(_SHIPPED)]  # noqa: UP007
