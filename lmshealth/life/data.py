@@ -76,7 +76,7 @@ class LifeData(ReadOnly):
         return float(self.clock.max())
 
     def change(self) -> FloatArray:
-        """Return the change of ln f from the first logs to the last of each mode, ``(n_modes,)``."""
+        """Return the change of ln f from first to last logs, ``(n_modes,)``."""
         found = np.zeros(len(self.modes))
         for i in range(len(self.modes)):
             own = self.mode_of == i

@@ -122,7 +122,7 @@ class Assessment:
 
 @dataclass(frozen=True, slots=True)
 class ParameterHealth:
-    """A health parameter at the last epoch."""
+    """A health parameter now."""
 
     name: str
     determined: bool  # whether the data determine it; else its interval is mostly the prior
@@ -151,9 +151,6 @@ class LimitLife:
     dates: tuple[date | None, ...]  # days of the calendar; None beyond the horizon or the calendar
     already_past: float  # already_past, beyond_horizon: probabilities
     beyond_horizon: float
-    # 5, 50 and 95 % quantiles of the parameter now by its laws, as fractions of the baseline;
-    # empty for ``any``.
-    health: tuple[float, ...] = ()
 
     @property
     def name(self) -> str:
@@ -260,7 +257,6 @@ def summarise_life(
                 already_past=float(past[k]),
                 beyond_horizon=float(beyond[k]),
                 baseline=baseline,
-                health=() if name == "any" else quantiles(prognosis.health[:, k] / baseline),
             )
         )
     return Life(

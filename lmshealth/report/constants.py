@@ -38,8 +38,6 @@ COURSE_POINTS = 24
 CALENDAR_MONTHS = 12
 # Points per figure, of logs spaced evenly up to the last: more would cover each other.
 POINTS = 300
-# Epochs with an interval drawn next to a life curve.
-EPOCHS_SHOWN = 20
 # A terminal describes so many machines one by one, and lists so many in a table.
 TERMINAL_MACHINES, TERMINAL_ROWS = 3, 20
 # On a terminal: lines of a frequency response; harmonics per channel where several channels are

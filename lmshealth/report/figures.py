@@ -186,7 +186,7 @@ def _thinned(n: int) -> slice:
 
 
 def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axes:
-    """Plot the joint posterior of the last epoch.
+    """Plot the joint posterior of health now.
 
     For two parameters: highest-density regions of 50 and 90 %, baseline, medians and marginal 90 %
     intervals (bars along the axes). For one parameter: its density.
@@ -234,30 +234,18 @@ def plot_life(
     prognosis: Prognosis,
     parameter: str,
     *,
-    health: Health | None = None,
     baseline: float = 1.0,
 ) -> Axes:
-    """Plot the degradation of a parameter up to the horizon, by its laws.
+    """Plot a parameter since the baseline and up to the horizon, by its laws.
 
-    With `health`, 90 % intervals of epochs without a law are drawn too, if the data determine the
-    parameter. The bar on the limit is the 90 % interval of its first passage. `baseline` is the
-    value of the parameter at 100 %.
+    The bar on the limit is the 90 % interval of its first passage. `baseline` is the value of the
+    parameter at 100 %.
     """
     column = prognosis.parameters.index(parameter)
     limit = float(prognosis.limits[column]) / baseline
     now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
     bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
     _bands(ax, travel, bands, "law", informed=True)
-    top = 108.0
-    if health is not None:
-        own = health.parameters.index(parameter)
-        if health.publishable_parameters()[own]:
-            bounds = 100 * health.quantile(_LEVELS[::2])[:, :, own]
-            # The last epoch is always among them.
-            step = max(1, bounds.shape[1] // constants.EPOCHS_SHOWN)
-            some = np.arange(bounds.shape[1])[::-step]
-            bars(ax, health.travel[some], bounds[:, some], "epochs, 90 %", 2.5)
-            top = max(top, 1.04 * min(float(bounds[2].max()), 160.0))
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
     end = now + prognosis.horizon / _KM
@@ -270,10 +258,8 @@ def plot_life(
         right = end
         ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label="horizon")
     left = min(float(travel.min()), now)
-    if health is not None:
-        left = min(left, float(health.travel.min()) / _KM)
     ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
-    ax.set_ylim(0, max(top, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
+    ax.set_ylim(0, max(108.0, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
     ax.set_ylabel("% of baseline")
     odometer(ax)
     if not shown:

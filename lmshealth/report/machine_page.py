@@ -168,8 +168,6 @@ def _health_content(assessment: Assessment) -> dict[str, Any]:
         "scatter": list(_scatter(assessment.fleet, assessment.stage)),
         "pace": _pace,
         "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
-        # Laws without parameters to sample, and improbable ones, have no chains.
-        "chains": prognosis is not None and bool(np.isfinite(prognosis.ess)),
     }
 
 
@@ -311,7 +309,7 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
         for name in health.parameters:
             draw["health", name] = partial(drawn, parameter=name, limit=limit_of(specs[name]))
     if prognosis is not None:
-        drawn = partial(figures.plot_life, prognosis=prognosis, health=health)
+        drawn = partial(figures.plot_life, prognosis=prognosis)
         for name in prognosis.parameters[:-1]:
             draw["life", name] = partial(drawn, parameter=name, baseline=specs[name].baseline)
         draw["survival", "any"] = partial(

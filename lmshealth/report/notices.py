@@ -48,7 +48,7 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
 
 
 def _of_health(assessment: Assessment) -> Iterator[Notice]:
-    """Yield notices about the posterior of the last epoch."""
+    """Yield notices about health now."""
     health = assessment.latest_health
     if health is None:
         return
@@ -77,7 +77,7 @@ def _of_channels(assessment: Assessment) -> Iterator[Notice]:
 
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:
-    """Yield notices about the laws: their fit, and whether they agree with the last epoch."""
+    """Yield notices about the laws, their fit, and modes that moved alone."""
     prognosis = assessment.prognosis
     if prognosis is None:
         return
