@@ -59,7 +59,7 @@ MAX_LOG_ODDS = 9.0
 """Scenarios so much less probable than the best by a rough evidence are dropped (1 : 8100)."""
 
 # Beyond the laws, see README.md.
-RATE_STD, ACCELERATION_STD = 0.075, 1.0
+RATE_STD, ACCELERATION_STD = 0.075, 0.7
 """Standard deviation of ln of the travel left by a law for a future as long as the travel seen;
 intervals open with distance. The second is of a loss that accelerates: logs up to now determine
 neither its exponent nor whether the acceleration lasts."""

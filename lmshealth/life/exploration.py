@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -27,6 +27,8 @@ _N_UPDATE, _N_START = 3000, 300
 # Log odds from which a scenario is left out of updates, until chains sample the life again; and
 # those that a scenario may gain over a more flexible one by being simpler.
 _NO_RETURN, _SIMPLER = 13.0, 6.0
+# Log odds beyond those of a dropped scenario at which no more is spent on one.
+_HOPELESS = 6.0
 # Effective draws below which an evidence may miss most of its integral.
 _LEAST_ESS = 20.0
 
@@ -99,8 +101,11 @@ class _Exploration:
             value = float(density.log_probability(point)[0])
             self.found[k] = density, WeightedDraws(point, np.ones(1), value)
             return
-        start = self._start(scenario, rng)
-        draws = importance_sample(density.log_probability, start, rng, _N_ROUGH)
+        start, best = self._start(scenario, rng), -np.inf
+        if self.found:
+            best = max(log_probability(one) for one in self.found.values())
+        least = best - constants.MAX_LOG_ODDS - _HOPELESS - float(np.log(scenario.weight))
+        draws = importance_sample(density.log_probability, start, rng, _N_ROUGH, least)
         self.found[k] = density, draws
         value = log_probability(self.found[k])
         parts = scenario.split(draws.resampled(rng, _N_ROUGH))
@@ -126,14 +131,23 @@ class _Exploration:
             start = np.concatenate([earlier, start[: _N_START // 4]])
         return start
 
-    def narrow(self, which: Iterable[int]) -> None:
-        """Leave out grid points that some scenarios do without."""
-        kept = np.zeros(self.grid.walk.size, dtype=bool)
-        for k in which:
+    def narrow(self, anchors: Sequence[int]) -> None:
+        """Leave out grid points that the anchors do without, as far as they are likely.
+
+        They are drawn from with a few grid points first, which is enough to place their draws.
+        """
+        whole = self.grid
+        self.grid = whole[(whole.noise_scale == 1) & (whole.deviation == 0)]
+        self.add(anchors)
+        kept = np.zeros(whole.walk.size, dtype=bool)
+        for k in self.likely():
             density, draws = self.found[k]
-            weight = density.weights(draws.resampled(self.generators[k], _N_ROUGH // 4))
+            some = draws.resampled(self.generators[k], _N_ROUGH // 2)
+            weight = replace(density, grid=whole).weights(some)
             kept |= kept_weights(weight, constants.MAX_GRID_LOSS)
-        self.grid = self.grid[kept]
+        self.grid = whole[kept]
+        self.found.clear()
+        self.add(anchors)
 
     def likely(self) -> list[int]:
         """Return the scenarios that are not much less probable than the best, in order."""
@@ -212,8 +226,7 @@ def explore(
     all_ = _Exploration(likelihood, generators, before, likelihood.grid, {}, known)
     # Grid points that the least and the most flexible scenarios do without, all do without.
     anchors = _anchors(scenarios)
-    all_.add(anchors)
-    all_.narrow(all_.likely())
+    all_.narrow(anchors)
     left = {
         k
         for k, one in enumerate(scenarios)

@@ -17,6 +17,8 @@ LogProbability = Callable[[FloatArray], FloatArray]
 # Degrees of freedom of the proposal's Student's t: heavier tails than a posterior has.
 _FREEDOM = 5
 _N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
+# Rounds after which a density that integrates to too little is not adapted to any more.
+_HOPELESS = 4
 # Effective share of the draws at which the proposal is good enough for the last round.
 _GOOD_SHARE = 0.3
 # Effective draws per dimension from which a proposal is made.
@@ -57,17 +59,24 @@ class WeightedDraws(ReadOnly):
 
 
 def importance_sample(
-    log_probability: LogProbability, start: FloatArray, rng: np.random.Generator, n: int
+    log_probability: LogProbability,
+    start: FloatArray,
+    rng: np.random.Generator,
+    n: int,
+    least: float = -np.inf,
 ) -> WeightedDraws:
     """Draw from a density by importance sampling from a mixture adapted in rounds [Cappe2008].
 
     The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
-    number of draws of the last round. `NotConverged` is raised if no point has a density above 0.
+    number of draws of the last round. Adaptation ends early where no draw contributes as much as
+    `least` to the log integral. `NotConverged` is raised if no point has a density above 0.
     """
     points, proposal = start, np.zeros(start.shape[0])
     few = max(200, n // 4)
-    for _ in range(_MAX_ROUNDS):
+    for k in range(_MAX_ROUNDS):
         log_weight = log_probability(points) - proposal
+        if k >= _HOPELESS and log_weight.max() < least:
+            break
         if _weighted(points, log_weight).ess >= _GOOD_SHARE * few and points is not start:
             break
         points, proposal = _propose(_adapted(points, log_weight), rng, few)

@@ -40,7 +40,7 @@ RESERVED_WORDS = ("healthy", "both", "step", "alarm", "no-alarm", "not-enough-da
 # --- Error of the modal map ---------------------------------------------------------------------
 # Factors on the declared model_std, with prior probabilities: machines may differ from the one that
 # a map was made from by more than its maker knows. The modes of each machine weigh them.
-MAP_ERRORS = ((1.0, 0.75), (3.0, 0.25))
+MAP_ERRORS = ((1.0, 0.75), (2.0, 0.25))
 
 # --- Identification, as the Cramér-Rao bound assumes it -----------------------------------------
 # Half-width of the band that a mode is fitted in, in damping ratios times its frequency. Beyond it
