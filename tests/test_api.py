@@ -24,6 +24,7 @@ CLIENT = """
 from pathlib import Path
 
 import lmshealth
+from lmshealth.tracking.read_tables import Drifts
 
 
 def assessed(folder: Path) -> str:
@@ -41,8 +42,9 @@ def assessed(folder: Path) -> str:
             readings.append(lmshealth.LogEstimates(log.name, log.digest, log.metadata, one))
     history, refused = lmshealth.build_history(readings, stage)
     track = lmshealth.track(history, stage)
-    health = lmshealth.infer(track, stage, seed=0)
-    both = lmshealth.infer_together([(track, stage), (track, stage)], ["guide_preload"], 0)
+    health = lmshealth.infer(history, stage, seed=0)
+    shown = Drifts("AX", track.recorded_at, track.travel, track.modes, track.drift, track.drift_cov)
+    alone = lmshealth.infer_drifts(shown, stage, seed=0)
     laws = lmshealth.fit_life(history, stage, seed=0, chains=False)
     prognosis = lmshealth.prognose(history, stage, seed=0)
     day = lmshealth.decide(prognosis, stage.description.decision).by
@@ -52,7 +54,7 @@ def assessed(folder: Path) -> str:
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
     reveal_type(  # noqa: F821
-        (refused, both, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
+        (refused, alone, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
     )
     return told
 """

@@ -28,13 +28,14 @@ COLUMNS = {
     "track_cov": "stage recorded_at mode_a mode_b cov_drift",
     "effects": "stage mode covariate coefficient std",
     "events": "stage recorded_at travel_km kind mode source size std evidence",
-    "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged",
+    "health": "stage recorded_at travel_km parameter median q05 q25 q75 q95 ess r_hat converged "
+    "sampler",
     "prognosis": "stage parameter limit censored_from probability_beyond_horizon service_by "
     + " ".join(f"rul_{unit}_{q}" for unit in ("km", "hours", "days") for q in QUANTILES),
     "verdict": "stage recorded_at verdict probability",
     "refused": "log channel mode source reason detail",
 }
-VERDICTS = {"healthy", "preload", "mount", "both", "step", "not-enough-data"}
+VERDICTS = {"healthy", "preload", "mount", "both", "step", "outside-map", "not-enough-data"}
 SOURCES = {"acc", "delta_e", "frf", "joint"}
 NOT_NUMBERS = re.compile(r"^[+-]?(nan|inf|infinity|none|null)$", re.IGNORECASE)
 Row = dict[str, str]
@@ -133,8 +134,10 @@ def _health(tables: dict[str, list[Row]]) -> list[str]:
         values = [float(row[key]) for key in ("q05", "q25", "median", "q75", "q95")]
         if values != sorted(values):
             found.append(f"health quantiles of {row['parameter']} are out of order")
-        if row["converged"] not in ("True", "False"):
+        if row["converged"] != "True":
             found.append(f"converged is {row['converged']!r}")
+        if row["sampler"] not in ("emcee", "importance"):
+            found.append(f"sampler is {row['sampler']!r}")
     return found
 
 

@@ -37,19 +37,19 @@ from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
 from lmshealth.cli.main import main
 from lmshealth.errors import LmshealthError, NotConverged, NothingUsable
-from lmshealth.life.inference import epochs_to_infer, infer
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
 from lmshealth.io.reading import content_digest
-from lmshealth.modal.identification import AmbientReading, read_ambient
-from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.life import life_posterior
+from lmshealth.life import posterior as life_posterior
 from lmshealth.life.fleet_prior import EndedLife, FleetPrior, LawPrior
+from lmshealth.life.health import epochs_to_publish, infer
 from lmshealth.life.likelihood import scatter_prior
 from lmshealth.life.posterior import fit_life
 from lmshealth.life.remaining_life import prognose
-from lmshealth.report.assessment import Assessment, Summary
+from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import Stage, load_stage
@@ -139,7 +139,7 @@ def test_the_truth_is_found_in_the_tables(done: Done) -> None:
     low, high = float(last["q05"]), float(last["q95"])
     assert low - (high - low) < 0.90 < high + (high - low)
     assert high - low < 0.05
-    assert last["converged"] == "True"
+    assert (last["converged"], last["sampler"]) == ("True", "emcee")
     assert {row["mode"] for row in rows(done.out / "modes.csv")} == {"roll", "pitch"}
 
 
@@ -147,9 +147,47 @@ def test_the_truth_is_found_in_the_tables(done: Done) -> None:
 def test_the_only_epoch_asked_for_is_the_last(done: Done) -> None:
     """However few epochs are inferred, the last one, which the verdict is about, is among them."""
     (assessment,) = assessments(done.out)
-    assert assessment.track is not None
+    assert assessment.health is not None
+    assert len(assessment.health.recorded_at) == 2
+    assert assessment.health.recorded_at[-1] == assessment.history.recorded_at[-1]
     for most in (1, 2, 3):
-        assert epochs_to_infer(assessment.track, done.stage, most)[-1] == N_LOGS - 1
+        assert epochs_to_publish(assessment.history, done.stage, most)[-1] == N_LOGS - 1
+
+
+@pytest.mark.slow
+def test_one_question_has_one_answer_wherever_it_is_read(done: Done) -> None:
+    """Health now, and the probability of a limit: tables, status, summary and Python agree."""
+    (assessment,) = assessments(done.out)
+    health, prognosis = assessment.health, assessment.prognosis
+    assert health is not None and prognosis is not None
+    levels = {"q05": 0.05, "median": 0.5, "q95": 0.95}
+    (machine,) = json.loads((done.out / "status.json").read_text())["machines"]
+    summary = summarise(assessment, assessment.service())
+    last = rows(done.out / "health.csv")[-len(health.parameters) :]
+    remaining = {row["parameter"]: row for row in rows(done.out / "prognosis.csv")}
+    for k, (row, gauge) in enumerate(zip(last, summary.health, strict=True)):
+        shown = next(one for one in machine["health"] if one["parameter"] == gauge.name)
+        j = prognosis.parameters.index(gauge.name)
+        assert row["parameter"] == gauge.name == health.parameters[k]
+        assert row["recorded_at"] == prognosis.recorded_at.isoformat()
+        for (name, level), own in zip(
+            levels.items(), (gauge.low, gauge.median, gauge.high), strict=True
+        ):
+            known = health.latest(level)[k]
+            assert float(row[name]) == pytest.approx(known, rel=1e-6)
+            assert own * gauge.baseline == shown[name] * gauge.baseline == known
+            assert np.quantile(prognosis.health[:, j], level) == known
+        below = np.mean(health.samples[-1, :, k] < prognosis.limits[j])
+        assert gauge.below_limit == shown["probability_below_limit"] == below
+        assert prognosis.already_past()[j] == below
+        assert float(remaining[gauge.name]["probability_already_past"]) == below
+        by_laws = next(one for one in summary.life.limits if one.parameter == gauge.name)
+        assert by_laws.health[1] == gauge.median
+        # The curve of the life passes through it.
+        at = np.searchsorted(prognosis.curve_travel, prognosis.travel)
+        around = prognosis.curve_quantiles[2, at - 1 : at + 1, j]
+        std = health.samples[-1, :, k].std()
+        assert around.min() - 0.1 * std < gauge.median * gauge.baseline < around.max() + 0.1 * std
 
 
 @pytest.mark.slow
@@ -489,8 +527,9 @@ def test_unchanged_files_are_not_hashed_again(
 def test_another_seed_gives_other_draws(done: Done) -> None:
     """Negative control for the comparisons of bytes: a new seed changes the draws of health."""
     (assessment,) = assessments(done.out)
-    assert assessment.track is not None
-    one, other = (infer(assessment.track, done.stage, seed, epochs=(5,)) for seed in (1, 2))
+    one, other = (
+        infer(assessment.history, done.stage, seed, epochs=(5,), chains=False) for seed in (1, 2)
+    )
     assert one.samples.tobytes() != other.samples.tobytes()
 
 
@@ -643,8 +682,9 @@ def test_a_fleet_update_that_cannot_be_read_is_repeated(
         "_machines_to_update",
         lambda machines, store: ((machine, learned, ()) for machine in machines),
     )
-    # Without parameters there is nothing to forecast.
-    monkeypatch.setattr(assessing, "prognose_with_posterior", lambda *_, before: (None, None))
+    # Without parameters there is nothing to fit.
+    monkeypatch.setattr(assessing, "fit_life", lambda *_, **__: None)
+    monkeypatch.setattr(assessing, "_with_life", lambda made, *_: made)
     run(logs, [modes_only], tmp_path / "out")
     before = pages(tmp_path / "out")
     with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
@@ -946,10 +986,13 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
-    job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(start), prior, ())
+    stored = assessing.StoredLife(start, 15, "healthy", "", ())
+    job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(stored), 40, prior, ())
     made = assessing._update(job)
     assert isinstance(made, PackedAssessment)
-    found = unpack(made.content, Assessment).prognosis
+    whole = unpack(made.content, Assessment)
+    assert whole.health is not None and set(whole.health.sampler) == {"importance"}
+    found = whole.prognosis
     assert apart(found, fresh) < 4 < apart(found, alone)
     assert not chains.called
     assessing._update(job._replace(life=None))
@@ -961,7 +1004,7 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     own = make()
     assert own.prognosis is not None
     lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
-    made = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives))
+    made = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, 40, None, lives))
     assert isinstance(made, PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
     tables = machine_tables(found)
@@ -971,6 +1014,7 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
     assert "fleet-ends-early" in {one["code"] for one in tables["warnings"]}
     assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
-    few = assessing._update(assessing._UpdateJob("M7-Y", "key", pack(own), None, None, lives[:8]))
+    job = assessing._UpdateJob("M7-Y", "key", pack(own), None, 40, None, lives[:8])
+    few = assessing._update(job)
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

@@ -12,8 +12,12 @@ import pytest
 import xarray
 from click.testing import CliRunner, Result
 
+from lmshealth._private.seeds import seed_of
 from lmshealth._private.tables import TABLES
 from lmshealth.cli.main import main
+from lmshealth.life import health as api
+from lmshealth.tracking.read_tables import read_machines
+from lmshealth.tracking.track import accepted_estimates, track
 from tests.lives import FADING, FOOT, MOUNT, make_stage, true_drift
 
 N = 30
@@ -181,6 +185,8 @@ def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     table = pd.read_csv(out)
     assert tuple(table.columns[:11]) == TABLES["health"].names[:11]
+    sampler = table.groupby("recorded_at")["sampler"].unique()
+    assert [list(one) for one in sampler] == [["importance"], ["emcee"]]
     last = table[table["recorded_at"].str.startswith("2026-03-03")].set_index(
         ["stage", "parameter"]
     )
@@ -205,29 +211,35 @@ def test_the_seed_alone_decides(drifts: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_machines_that_share_a_guide_are_inferred_together(drifts: Path, tmp_path: Path) -> None:
-    """One table for both; the shared preload once, the mounts under the names of the machines."""
-    toml = tmp_path / "stage" / "small.toml"
-    table = pd.read_csv(drifts)
-    paths = []
-    for stage in ("AX-1", "AX-2"):
-        paths.append(tmp_path / stage / "track.csv")
-        paths[-1].parent.mkdir()
-        table[table["stage"] == stage].to_csv(paths[-1], index=False)
-    out = tmp_path / "health.csv"
-    words = [paths[0], "--stage", toml, "--with", paths[1], toml, "--out", out, "--epochs", 1]
-    result = infer(*words, "--shared", "guide_preload")
+def test_estimates_become_the_health_of_their_lives(estimates: Path, tmp_path: Path) -> None:
+    """A table of estimates is tracked, and health is that of `infer` on what was accepted."""
+    stage = make_stage(tmp_path / "stage", (FADING,))
+    toml, out = tmp_path / "stage" / "small.toml", tmp_path / "health.csv"
+    table = pd.read_csv(estimates)
+    table[table["recorded_at"] < "2026-03-21"].to_csv(estimates, index=False)
+    result = infer(estimates, "--stage", toml, "--out", out, "--epochs", 5, "--seed", 3)
     assert result.exit_code == 0, result.output
-    assert set(pd.read_csv(out)["parameter"]) == {
-        "guide_preload",
-        "AX-1:mount_stiffness",
-        "AX-2:mount_stiffness",
-    }
-    assert infer(*words).exit_code == 2
-    words[0] = drifts
-    result = infer(*words, "--shared", "guide_preload")
-    assert result.exit_code == 1
-    assert "2 machines (AX-1, AX-2); needed is a table of the one" in result.stderr
+    found = pd.read_csv(out)
+    assert found["recorded_at"].iloc[-1] == "2026-03-20T06:00:00+00:00"
+    assert len(found) == 5
+    assert set(found["sampler"]) == {"emcee"}
+    ((history, _),), _ = read_machines(estimates, stage)
+    accepted = accepted_estimates(history, track(history, stage))
+    known = api.infer(accepted, stage, seed_of(3, "AX-1", stage.digest), epochs=5)
+    assert found["median"].iloc[-1] == pytest.approx(known.latest(0.5)[0], rel=1e-5)
+    assert found["q05"].iloc[-1] < 1 < found["q95"].iloc[-1]
+    assert "AX-1: health at 2026-03-20" in result.stdout
+
+
+def test_maintenance_is_no_part_of_drifts(drifts: Path, tmp_path: Path) -> None:
+    """Drifts are since a baseline that their table knows: status 2."""
+    actions = tmp_path / "maintenance.csv"
+    actions.write_text("stage,recorded_at,action\nAX-1,2026-03-02T00:00:00Z,servo\n")
+    toml = tmp_path / "stage" / "small.toml"
+    words = ("--stage", toml, "--out", tmp_path / "h.csv", "--maintenance", actions)
+    result = infer(drifts, *words)
+    assert result.exit_code == 2
+    assert "--maintenance belongs to a table of estimates" in result.stderr
 
 
 @pytest.mark.slow
@@ -242,7 +254,7 @@ def test_a_machine_without_drifts_is_reported_and_the_others_are_inferred(
     out = tmp_path / "health.csv"
     result = infer(drifts, "--stage", toml, "--out", out)
     assert result.exit_code == 3
-    assert "AX-2: none of the modes ['roll', 'pitch'] was tracked" in result.stderr
+    assert "AX-2: no epoch has a drift of any of the modes ['roll', 'pitch']" in result.stderr
     assert set(pd.read_csv(out)["stage"]) == {"AX-1"}
     table[table["stage"] == "AX-2"].to_csv(drifts, index=False)
     result = infer(drifts, "--stage", toml, "--out", tmp_path / "none.csv")

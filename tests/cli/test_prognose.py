@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from lmshealth._private.tables import TABLES
 from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
-from lmshealth.life.remaining_life import prognose_with_posterior
+from lmshealth.life.posterior import fit_life
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage
@@ -72,14 +72,16 @@ def table(tmp_path: Path) -> Path:
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     """Put a life with a known end in the place of the inference."""
 
-    def prognose(history: History, stage: Stage, seed: int) -> tuple[Prognosis, object]:
-        if not history.has_odometer:
-            return prognose_with_posterior(history, stage, seed)
+    def fit(history: History, stage: Stage, seed: int) -> object:
+        return None if history.has_odometer else fit_life(history, stage, seed)
+
+    def prognose(_: object, history: History, __: Stage) -> Prognosis:
         made = make_prognosis(np.linspace(1e5, 1e6, 1000), np.full(1000, 1e4))
         object.__setattr__(made, "stage", history.stage)
-        return made, None
+        return made
 
-    monkeypatch.setattr(machine_commands, "prognose_with_posterior", prognose)
+    monkeypatch.setattr(machine_commands, "fit_life", fit)
+    monkeypatch.setattr(machine_commands, "prognosis_of", prognose)
 
 
 def call(*words: object) -> Result:

@@ -382,7 +382,7 @@ def test_a_too_cautious_filter_is_not_widened(capsys: pytest.CaptureFixture[str]
     assert "multiplied" not in shown
 
 
-def test_health_that_did_not_converge_shows_no_interval(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doubts_about_health_are_printed(capsys: pytest.CaptureFixture[str]) -> None:
     """Missing values are no numbers; edges of the map and a bad fit are reported."""
     sure = make_health(np.random.default_rng(1).lognormal(-0.2, 0.02, (40, 2)))
     print_health(sure)
@@ -391,27 +391,18 @@ def test_health_that_did_not_converge_shows_no_interval(capsys: pytest.CaptureFi
     assert "Correlation of guide_preload and mount_stiffness" in text_
     nothing = np.full((1, 2), np.nan)
     lost = replace(
-        sure, converged=np.array([False]), ess_bulk=nothing, ess_tail=nothing, r_hat=nothing,
-        prior_shift=nothing, prior_ratio=nothing, laplace_shift=nothing, laplace_ratio=nothing,
+        sure, judge_shift=nothing, judge_ratio=nothing,
         fit=np.array([1e-9]), at_edge=np.array([[True, False]]),
     )  # fmt: skip
     print_health(lost)
     text_ = capsys.readouterr().out
     assert "nan" not in text_
-    assert text_.count("not converged") == 2
     assert max(map(len, text_.splitlines())) <= 80
     assert "p = 1e-09): no health is reported" in " ".join(text_.split())
     assert "guide_preload: the posterior ends at the edge" in text_
     assert "mount_stiffness: the posterior ends" not in text_
-    odd = replace(
-        sure, laplace_shift=np.array([[0.9, 0.0]]), identifiable=np.array([[True, False]])
-    )
-    print_health(odd)
+    print_health(replace(sure, identifiable=np.array([[True, False]])))
     text_ = " ".join(capsys.readouterr().out.split())
-    assert (
-        "guide_preload: the posterior is not normal; Laplace's approximation lies +0.9 σ lower"
-        in text_
-    )
     assert "mount_stiffness: not identifiable" in text_
 
 

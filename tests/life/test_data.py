@@ -12,7 +12,15 @@ from lmshealth.life.data import condense
 from lmshealth.life.likelihood import LifeLikelihood
 from lmshealth.life.posterior import fit_life
 from lmshealth.tracking.history import Step
-from tests.lives import FREQUENCY, SENSITIVITY, awkward_history, make_history, make_stage, since
+from tests.lives import (
+    FREQUENCY,
+    LAWS_ALONE,
+    SENSITIVITY,
+    awkward_history,
+    make_history,
+    make_stage,
+    since,
+)
 
 
 def test_few_logs_are_left_as_they_are() -> None:
@@ -80,7 +88,7 @@ def test_baseline_last_log_and_steps_are_not_mixed() -> None:
 @pytest.fixture(scope="module")
 def lives(tmp_path_factory: pytest.TempPathFactory) -> tuple:
     """Return a stage and a worn life of 240 logs in two modes."""
-    stage = make_stage(tmp_path_factory.mktemp("stage"))
+    stage = make_stage(tmp_path_factory.mktemp("stage"), tail=LAWS_ALONE)
     rng = np.random.default_rng(5)
     travel = np.linspace(0.0, 3.0e6, 240)
     loss = np.column_stack([1 - 0.30 * travel / travel[-1], 1 - 0.12 * travel / travel[-1]])

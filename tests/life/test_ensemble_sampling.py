@@ -13,17 +13,11 @@ from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life import ensemble_sampling as sampling
-from lmshealth.life.ensemble_sampling import (
-    Sample,
-    Start,
-    sample,
-    start_among,
-    start_from_prior,
-    start_near,
-)
+from lmshealth.life.ensemble_sampling import Sample, _start, sample
+from lmshealth.life.importance_sampling import WeightedDraws
 
 MEAN = np.array([0.3, -1.2])
-WALKERS = 64
+WALKERS = 32
 COV = np.array([[0.04, 0.018], [0.018, 0.01]])
 
 
@@ -33,20 +27,24 @@ def gaussian(x: FloatArray) -> FloatArray:
     return -0.5 * np.einsum("ni,ij,nj->n", off, np.linalg.inv(COV), off)
 
 
-def wide(rng: np.random.Generator, n: int) -> FloatArray:
+def even(points: FloatArray) -> WeightedDraws:
+    """Make draws of equal weight."""
+    n = points.shape[0]
+    return WeightedDraws(points, np.full(n, 1 / n), 0.0)
+
+
+def wide(n_dim: int = 2, *, scale: float = 3.0) -> WeightedDraws:
     """Draw from a prior much wider than the posteriors here."""
-    return 3 * rng.standard_normal((n, 2))
+    return even(scale * np.random.default_rng(0).standard_normal((800, n_dim)))
 
 
-def begin(rng: np.random.Generator) -> FloatArray:
-    """Begin an ensemble with draws of the wide prior."""
-    return wide(rng, WALKERS)
+BEGIN = wide()
 
 
 @pytest.fixture(scope="module")
 def drawn() -> Sample:
     """One sample of the Gaussian."""
-    return sample(gaussian, begin, stream(7, 1))
+    return sample(gaussian, BEGIN, stream(7, 1))
 
 
 def agree(values: FloatArray, known: float, ess: float) -> None:
@@ -84,14 +82,14 @@ def test_a_wrong_mean_is_noticed(drawn: Sample) -> None:
 @pytest.mark.slow
 def test_the_same_seed_gives_the_same_draws(drawn: Sample) -> None:
     """Two calls with one seed agree to the bit."""
-    np.testing.assert_array_equal(sample(gaussian, begin, stream(7, 1)).draws, drawn.draws)
+    np.testing.assert_array_equal(sample(gaussian, BEGIN, stream(7, 1)).draws, drawn.draws)
 
 
 @pytest.mark.slow
 def test_another_seed_gives_other_draws(drawn: Sample) -> None:
     """Another user's seed, or another step of the computation, gives other draws."""
     for seed in (stream(8, 1), stream(7, 2)):
-        other = sample(gaussian, begin, seed).draws
+        other = sample(gaussian, BEGIN, seed).draws
         n = min(other.shape[1], drawn.draws.shape[1])
         assert not np.any(np.all(other[:, :n] == drawn.draws[:, :n], axis=2))
 
@@ -101,7 +99,7 @@ def test_the_global_random_state_plays_no_part(drawn: Sample) -> None:
     """Draws do not depend on numpy's global state, and leave it alone."""
     np.random.seed(3)  # noqa: NPY002 - the legacy state is the point
     before = np.random.get_state(legacy=False)["state"]["key"].copy()  # noqa: NPY002
-    np.testing.assert_array_equal(sample(gaussian, begin, stream(7, 1)).draws, drawn.draws)
+    np.testing.assert_array_equal(sample(gaussian, BEGIN, stream(7, 1)).draws, drawn.draws)
     after = np.random.get_state(legacy=False)["state"]["key"]  # noqa: NPY002
     np.testing.assert_array_equal(after, before)
 
@@ -118,7 +116,7 @@ def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
 @pytest.mark.slow
 def test_sample_sizes_are_honest() -> None:
     """Means of independent samples scatter by as much as for their effective sample size."""
-    found = [sample(gaussian, begin, stream(7, 20 + k)) for k in range(24)]
+    found = [sample(gaussian, BEGIN, stream(7, 20 + k)) for k in range(24)]
     means = np.array([one.flat.mean(axis=0) for one in found])
     ess = np.mean([one.ess_bulk for one in found], axis=0)
     ratio = np.var(means, axis=0, ddof=1) / (np.diag(COV) / ess)
@@ -140,7 +138,7 @@ def test_moments_of_a_banana() -> None:
     def banana(x: FloatArray) -> FloatArray:
         return -0.5 * x[:, 0] ** 2 - 0.5 * (x[:, 1] - x[:, 0] ** 2) ** 2
 
-    found = sample(banana, begin, stream(11))
+    found = sample(banana, BEGIN, stream(11))
     x, y = found.flat.T
     ess = found.ess_bulk.min()
     agree(x, 0.0, ess)
@@ -156,7 +154,7 @@ def test_more_dimensions_keep_their_width() -> None:
     def ball(x: FloatArray) -> FloatArray:
         return -0.5 * np.sum(x**2, axis=1)
 
-    found = sample(ball, lambda rng: 2 * rng.standard_normal((96, 6)), stream(15))
+    found = sample(ball, wide(6, scale=2.0), stream(15))
     agree(np.mean(found.flat**2, axis=1), 1.0, found.ess_bulk.min())
 
 
@@ -167,44 +165,78 @@ def test_one_dimension_with_an_edge() -> None:
     def half(x: FloatArray) -> FloatArray:
         return np.where(x[:, 0] > 0, -0.5 * x[:, 0] ** 2, -np.inf)
 
-    found = sample(half, lambda rng: 3 * np.abs(rng.standard_normal((WALKERS, 1))), stream(12))
+    found = sample(half, even(np.abs(wide(1).points)), stream(12))
     assert (found.draws > 0).all()
     agree(found.flat[:, 0], np.sqrt(2 / np.pi), found.ess_bulk.min())
 
 
 @pytest.mark.slow
-def test_modes_far_apart_are_refused_with_their_chains(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Ensembles that stay in their own mixture of two far modes do not converge."""
-    monkeypatch.setattr(constants, "MAX_STEPS", 1200)
+def test_modes_far_apart_have_their_share() -> None:
+    """Independent proposals reach both of two far modes, by their integrals."""
+
+    def two(x: FloatArray) -> FloatArray:
+        parts = [np.log(p) - 0.5 * np.sum(((x - c) / 0.05) ** 2, axis=1)
+                 for p, c in ((0.3, -4.0), (0.7, 4.0))]  # fmt: skip
+        return np.logaddexp(*parts)
+
+    side = np.random.default_rng(13).choice([-4.0, 4.0], size=(800, 1))
+    start = even(side + 0.1 * np.random.default_rng(14).standard_normal((800, 2)))
+    found = sample(two, start, stream(13))
+    right = (found.flat[:, 0] > 0).astype(float)
+    agree(right, 0.7, found.ess_bulk.min())
+    with pytest.raises(AssertionError):
+        agree(right, 0.5, found.ess_bulk.min())
+
+
+@pytest.mark.slow
+def test_modes_that_no_proposal_joins_are_refused_with_their_chains(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Ensembles of which each begins in its own mode do not converge."""
+    monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", 1200)
 
     def two(x: FloatArray) -> FloatArray:
         return np.logaddexp(*(-0.5 * np.sum(((x - c) / 0.05) ** 2, axis=1) for c in (-40.0, 40.0)))
 
-    def sides(rng: np.random.Generator) -> FloatArray:
-        side = rng.choice([-40.0, 40.0], size=(18, 1))
-        return side + 0.1 * rng.standard_normal((18, 3))
+    sides = iter((-40.0, 40.0, -40.0, 40.0))
 
+    def near(_: WeightedDraws, rng: np.random.Generator) -> FloatArray:
+        return next(sides) + 0.1 * rng.standard_normal((WALKERS, 3))
+
+    class Local:
+        """Proposes points about a mode only."""
+
+        def near(self, _: WeightedDraws, __: np.random.Generator) -> Local:
+            return self
+
+        def draw(self, rng: np.random.RandomState, n: int) -> FloatArray:
+            return rng.standard_normal((n, 3))
+
+        def log_density(self, points: FloatArray) -> FloatArray:
+            return np.zeros(points.shape[0])
+
+    monkeypatch.setattr(sampling, "_start", near)
+    monkeypatch.setattr(sampling, "Proposal", Local())
     with pytest.raises(NotConverged, match=r"after 1200 steps.*several modes") as caught:
-        sample(two, sides, stream(13))
+        sample(two, wide(3), stream(13))
     chains = np.asarray(caught.value.chains)
-    assert chains.shape == (constants.N_ENSEMBLES, 1200, 18, 3)
+    assert chains.shape == (constants.N_ENSEMBLES, 1200, WALKERS, 3)
     assert not np.array_equal(chains[0], chains[1])
 
 
 def test_too_few_steps_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fewer steps than 50 autocorrelation times are not enough, whatever R-hat is."""
     monkeypatch.setattr(sampling, "_FIRST_STEPS", 60)
-    monkeypatch.setattr(constants, "MAX_STEPS", 60)
+    monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", 60)
     with pytest.raises(NotConverged, match="needed are 50"):
-        sample(gaussian, begin, stream(14))
+        sample(gaussian, BEGIN, stream(14))
 
 
 def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
     """A run that does not converge is looked at few times, and the last time at its full length."""
     first, most, lengths = 16, 50, list[int]()
 
-    def arrived(rng: np.random.Generator) -> FloatArray:
-        return rng.multivariate_normal(MEAN, COV, size=WALKERS)
+    arrived = even(np.random.default_rng(1).multivariate_normal(MEAN, COV, size=500))
 
     def doubtful(_: str, chains: FloatArray, **__: object) -> FloatArray:
         return np.full(chains.shape[-1], 2.0)
@@ -215,7 +247,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(sampling, "_FIRST_STEPS", first)
     monkeypatch.setattr(sampling, "_diagnose", doubtful)
-    monkeypatch.setattr(constants, "MAX_STEPS", most)
+    monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", most)
     monkeypatch.setattr(constants, "MIN_AUTOCORRELATION_TIMES", 0)
     monkeypatch.setattr(autocorr, "integrated_time", counted)
     with pytest.raises(NotConverged, match=r"after 50 steps .* R-hat 2\.000"):
@@ -230,67 +262,45 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_walker_that_never_moves_is_no_convergence(monkeypatch: pytest.MonkeyPatch) -> None:
     """One that begins on a needle stays there: refused with the chains, not with a broken sum."""
     monkeypatch.setattr(sampling, "_FIRST_STEPS", 30)
-    monkeypatch.setattr(constants, "MAX_STEPS", 40)
+    monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", 40)
 
     def needle(x: FloatArray) -> FloatArray:
         return gaussian(x) + 30 * np.exp(-0.5 * np.sum(((x - MEAN) / 1e-5) ** 2, axis=1))
 
-    def one_on_it(rng: np.random.Generator) -> FloatArray:
-        return np.vstack([MEAN, begin(rng)[1:]])
+    def one_on_it(draws: WeightedDraws, rng: np.random.Generator) -> FloatArray:
+        return np.vstack([MEAN, _start(draws, rng)[1:]])
 
+    monkeypatch.setattr(sampling, "_start", one_on_it)
     with pytest.raises(
         NotConverged, match="after 40 steps the autocorrelation time is 40"
     ) as caught:
-        sample(needle, one_on_it, stream(16))
+        sample(needle, BEGIN, stream(16))
     assert (np.asarray(caught.value.chains)[:, :, 0] == MEAN).all()
 
 
-@pytest.mark.parametrize("width", [1e-4, 1e-2, 1.0])
-def test_starts_are_inside_the_support_and_distinct(width: float) -> None:
-    """However narrow the support within the prior, every walker starts inside, alone."""
-
-    def box(x: FloatArray) -> FloatArray:
-        inside = np.all(np.abs(x - 0.1) < 2 * max(width, 0.15), axis=1)
-        return np.where(inside, -0.5 * np.sum(((x - 0.1) / width) ** 2, axis=1), -np.inf)
-
-    starts: list[Start] = [
-        start_from_prior(box, wide),
-        start_near(np.full(2, 0.1), width**2 * np.eye(2), box),
-    ]
-    for start in starts:
-        rng = np.random.default_rng(1)
-        points = start(rng)
-        assert points.shape == (64, 2)
-        assert np.isfinite(box(points)).all()
-        assert np.unique(points, axis=0).shape[0] == 64
-        assert not np.array_equal(points, start(rng))
-
-
-@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 64), (2, 64), (5, 80)])
+@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 32), (2, 32), (5, 40)])
 def test_starts_among_draws_are_some_of_them(n_dim: int, walkers: int) -> None:
     """So many walkers as the dimensions ask for begin at draws, no two at the same."""
     rng = np.random.default_rng(5)
     points = rng.standard_normal((500, n_dim))
-    start = start_among(points, np.full(500, 1 / 500))
-    found = start(rng)
+    found = _start(even(points), rng)
     assert found.shape == (walkers, n_dim)
     assert {tuple(point) for point in found} <= {tuple(point) for point in points}
     assert np.unique(found, axis=0).shape[0] == walkers
-    assert not np.array_equal(found, start(rng))
+    assert not np.array_equal(found, _start(even(points), rng))
 
 
 def test_starts_among_draws_follow_their_weight() -> None:
     """Draws a little more probable are taken as much more often; those without weight never."""
     points = np.arange(4000.0)[:, None]
     weight = np.where(points[:, 0] < 2000, 3.0, 1.0) * (points[:, 0] % 2 == 0)
-    start, rng = start_among(points, weight / weight.sum()), np.random.default_rng(6)
-    found = np.concatenate([start(rng)[:, 0] for _ in range(60)])
+    draws, rng = WeightedDraws(points, weight / weight.sum(), 0.0), np.random.default_rng(6)
+    found = np.concatenate([_start(draws, rng)[:, 0] for _ in range(120)])
     assert (found % 2 == 0).all()
     error = np.sqrt(0.75 * 0.25 / found.size)
     assert abs(np.mean(found < 2000) - 0.75) < 4.5 * error
     # Negative control: taken alike.
-    start = start_among(points, np.full(4000, 1 / 4000))
-    found = np.concatenate([start(rng)[:, 0] for _ in range(60)])
+    found = np.concatenate([_start(even(points), rng)[:, 0] for _ in range(120)])
     assert abs(np.mean(found < 2000) - 0.75) > 4.5 * error
 
 
@@ -301,59 +311,13 @@ def test_starts_among_few_draws_of_weight_spread_out() -> None:
     weight = np.exp(log_weight - log_weight.max())
     weight /= weight.sum()
     assert 1 / np.sum(weight**2) < 20
-    found = start_among(points, weight)(np.random.default_rng(7))
-    assert np.unique(found).size == 64
+    found = _start(WeightedDraws(points, weight, 0.0), np.random.default_rng(7))
+    assert np.unique(found).size == WALKERS
     assert np.median(np.abs(found - 0.5)) < 0.1
 
 
-def test_a_centre_outside_the_support_is_refused() -> None:
-    """Where next to no point about a centre is possible, the error carries what was found."""
-    start = start_near(MEAN, COV, lambda x: np.full(x.shape[0], -np.inf))
-    with pytest.raises(NotConverged, match=r"of 6400 points about .* 0 lie inside") as caught:
-        start(np.random.default_rng(1))
-    assert np.asarray(caught.value.chains).shape == (0, 2)
-
-
-def test_starts_find_a_posterior_far_narrower_than_the_prior() -> None:
-    """Walkers start at the posterior, a thousandth of the prior wide, with about its spread."""
-
-    def narrow(x: FloatArray) -> FloatArray:
-        return -0.5 * np.sum(((x - 1.0) / 3e-3) ** 2, axis=1)
-
-    start, rng = start_from_prior(narrow, wide), np.random.default_rng(2)
-    points = np.concatenate([start(rng) for _ in range(5)])
-    assert np.abs(points - 1.0).max() < 10 * 3e-3
-    assert 0.7 * 3e-3 < points.std() < 2 * 3e-3
-
-
-def test_starts_reach_a_narrow_ridge() -> None:
-    """A ridge that is a ten thousandth of the prior wide is reached."""
-    slope = np.array([1.0, 0.99, -0.98, 1.01])
-
-    def ridge(x: FloatArray) -> FloatArray:
-        across = (x - 1.0) @ slope / 3e-4
-        return -0.5 * (across**2 + np.sum(((x - 1.0) / 0.1) ** 2, axis=1))
-
-    def prior(rng: np.random.Generator, n: int) -> FloatArray:
-        return 3 * rng.standard_normal((n, 4))
-
-    points = start_from_prior(ridge, prior)(np.random.default_rng(4))
-    assert ridge(points).min() > -30
-
-
-def test_a_prior_outside_the_support_is_refused() -> None:
-    """Where no draw of the prior is possible the error names what to widen, with the draws."""
-    with pytest.raises(NotConverged, match="widen the map or the prior") as caught:
-        start_from_prior(lambda x: np.full(x.shape[0], -np.inf), wide)(np.random.default_rng(3))
-    assert np.asarray(caught.value.chains).shape[-1] == 2
-
-
-def test_a_prior_with_too_few_possible_draws_is_refused() -> None:
-    """Where fewer draws are possible than an ensemble has walkers the error gives both numbers."""
-
-    def seldom(x: FloatArray) -> FloatArray:
-        possible = np.arange(x.shape[0]) < 7
-        return np.where(possible, 0.0, -np.inf)
-
-    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 64 are needed"):
-        start_from_prior(seldom, wide)(np.random.default_rng(3))
+def test_too_few_draws_are_refused() -> None:
+    """Where there are fewer draws than an ensemble has walkers the error gives both numbers."""
+    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed.*widen") as caught:
+        sample(gaussian, even(BEGIN.points[:7]), stream(3))
+    assert np.asarray(caught.value.chains).shape == (7, 2)

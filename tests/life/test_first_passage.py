@@ -10,7 +10,7 @@ from scipy.stats.distributions import rv_frozen
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life.remaining_life import first_passage
 from lmshealth.life.scenarios import DegradationPath
-from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging
+from lmshealth.stage.degradation_laws import AnyLaw, Free, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from tests.oracles import binomial_band
 
@@ -79,7 +79,9 @@ class NoBridge:
 
 
 @pytest.mark.parametrize(
-    "law", [WEAR, FALLING, LINEAR, Unchanging()], ids=["wear", "loosening", "linear", "none"]
+    "law",
+    [WEAR, FALLING, LINEAR, Free(), Unchanging()],
+    ids=["wear", "loosening", "linear", "free", "none"],
 )
 def test_without_deviation_it_is_the_law(law: AnyLaw) -> None:
     """The closed form of each law, at the limit that is left where health is off it."""
@@ -91,7 +93,7 @@ def test_without_deviation_it_is_the_law(law: AnyLaw) -> None:
     closed = path.passage(theta, 0.8 * np.exp(-off)) - NOW
     # Only what gains can be above a limit now that it was below before.
     back = (closed <= 0) & (path.health(theta, np.array([NOW]))[:, 0] * np.exp(off) > 0.8)
-    assert isinstance(law, Linear) or not back.any()
+    assert isinstance(law, Linear | Free) or not back.any()
     np.testing.assert_array_equal(found, np.where(back, np.inf, closed))
     finite = np.isfinite(found)
     if isinstance(law, Unchanging):

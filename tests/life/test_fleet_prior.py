@@ -35,7 +35,16 @@ from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosenin
 from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from lmshealth.tracking.history import History
-from tests.lives import FOOT, FREQUENCY, MOUNT, PRELOAD, make_history, make_stage, true_drift
+from tests.lives import (
+    FOOT,
+    FREQUENCY,
+    LAWS_ALONE,
+    MOUNT,
+    PRELOAD,
+    make_history,
+    make_stage,
+    true_drift,
+)
 from tests.lives import make_prognosis as prognosis_with
 
 NONE = '{ kind = "none" }'
@@ -54,7 +63,8 @@ WALKS, SCALES, DEVIATIONS = (0.2,) * 5, (0.9, 0.07, 0.03), (0.6, 0.3, 0.1)
 @pytest.fixture(scope="module")
 def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     """Preload that wears or not, under a mount that keeps its stiffness."""
-    return make_stage(tmp_path_factory.mktemp("stage"), (WEAR_OR_NOT, STILL_MOUNT))
+    folder = tmp_path_factory.mktemp("stage")
+    return make_stage(folder, (WEAR_OR_NOT, STILL_MOUNT), tail=LAWS_ALONE)
 
 
 def gaussian(z: float, error: float) -> FloatArray:
@@ -289,7 +299,7 @@ def test_laws_with_a_fleet_prior_are_laws_of_a_description(
     assert changed == {"weight", *([field] if field else [])}
     written = msgspec.json.encode(updated.parameters[0])
     assert msgspec.json.decode(written, type=ParameterSpec).laws[0] == found
-    weights = [scenario.weight for scenario in list_scenarios(updated.parameters, (), 1e6)]
+    weights = [scenario.weight for scenario in list_scenarios(updated.parameters, (), 1e6, 0.05)]
     assert sum(weights) == pytest.approx(1.0)
     if field:
         before, after = getattr(law, field), getattr(found, field)
@@ -321,6 +331,7 @@ def small_grid() -> Iterator[None]:
     """Average over one walk and no deviation: evidence is computed alike for any."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "WALK_STDS", (1e-5,))
+        patch.setattr(constants, "WALK_PRIOR", (1.0,))
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
         patch.setattr(constants, "DEVIATION_STDS", (0.0,))
@@ -338,7 +349,7 @@ def lived(travel: FloatArray, life_km: float) -> History:
 
 def fitted(history: History, stage: Stage) -> LifePosterior:
     """Fit a life quickly."""
-    return fit_life(history, stage, 5, chains=False, n_draws=2000)
+    return fit_life(history, stage, 5, chains=False)
 
 
 def test_a_machine_needs_the_fleet_prior_until_its_life_is_informed(
@@ -368,6 +379,23 @@ def test_evidence_is_that_of_the_posterior(small_grid: None, stage: Stage) -> No
     assert 8000 * np.exp(best) == pytest.approx(4000, rel=0.25)
 
 
+def test_a_free_change_has_its_share_of_the_prior_and_no_evidence_of_its_own(
+    small_grid: None, tmp_path: Path
+) -> None:
+    """Laws of the description have what the free change leaves them, before and after."""
+    free = make_stage(tmp_path, (WEAR_OR_NOT, STILL_MOUNT), tail="[life]\nfree = 0.2\n")
+    posterior = fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), free)
+    evidence = machine_evidence(free, posterior)
+    preload, laws = evidence.laws["guide_preload"], posterior.laws("guide_preload")
+    assert set(preload) == {"hertz-wear", "none"}
+    assert [one.prior for one in preload.values()] == pytest.approx([0.4, 0.4])
+    for kind, one in preload.items():
+        assert one.posterior == pytest.approx(laws.get((kind, 0.0), 0.0))
+    # The scatter is that of draws in which no mode moves alone.
+    for own in evidence.scatter.values():
+        assert sum(one.posterior for one in own) == pytest.approx(1, abs=1e-9)
+
+
 def test_a_law_that_is_ruled_out_changes_its_share_alone(small_grid: None, stage: Stage) -> None:
     """A part that keeps its health is evidence for few that wear, and none on their pace."""
     still = machine_evidence(stage, fitted(lived(np.linspace(0.0, 4e6, 12), 1e9), stage))
@@ -387,7 +415,7 @@ def test_an_unidentifiable_limit_needs_no_fleet_prior(
 ) -> None:
     """A part that the modes cannot see stays unknown for ever: that is no question of age."""
     monkeypatch.setattr("lmshealth.stage.constants.MAP_ERRORS", ((1.0, 1.0),))
-    blind = make_stage(tmp_path, (PRELOAD, STILL_MOUNT, LIMITED_FOOT))
+    blind = make_stage(tmp_path, (PRELOAD, STILL_MOUNT, LIMITED_FOOT), tail=LAWS_ALONE)
     posterior = fitted(lived(np.linspace(0.0, 2e6, 12), 4000.0), blind)
     evidence = machine_evidence(blind, posterior)
     assert not needs_fleet_prior(evidence)

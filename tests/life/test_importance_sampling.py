@@ -12,6 +12,7 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.importance_sampling import (
+    Proposal,
     WeightedDraws,
     importance_sample,
     importance_sample_to_ess,
@@ -189,3 +190,47 @@ def test_a_start_that_spans_fewer_dimensions_than_the_density(inside: int) -> No
 
     found = importance_sample_to_ess(density, points, np.random.default_rng(2), 2000)
     assert agrees(found, LN_SCALE)
+
+
+# Proposals
+
+
+def proposal(n_dim: int) -> Proposal:
+    """Make a proposal near draws of a correlated Gaussian."""
+    rng = np.random.default_rng(1)
+    root = 0.2 * np.random.default_rng(n_dim).standard_normal((n_dim, n_dim)) + 0.1 * np.eye(n_dim)
+    points = rng.standard_normal((500, n_dim)) @ root.T + np.linspace(-1, 2, n_dim)
+    return Proposal.near(WeightedDraws(points, np.full(500, 1 / 500), 0.0), rng)
+
+
+def test_the_density_of_a_proposal_integrates_to_one() -> None:
+    """In one dimension on a grid with its tails, in two over a wide one."""
+    one = proposal(1)
+    x = one.mean + one.factor[0] * np.sinh(np.linspace(-9, 9, 20_001))[:, None]
+    assert np.trapezoid(np.exp(one.log_density(x)), x[:, 0]) == pytest.approx(1, abs=1e-4)
+    two = proposal(2)
+    axis = np.linspace(-14, 14, 561)
+    unit = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    cell = (axis[1] - axis[0]) ** 2 * np.prod(np.diag(two.factor))
+    total = np.exp(two.log_density(two.mean + unit @ two.factor.T)).sum() * cell
+    assert total == pytest.approx(1, abs=3e-3)
+
+
+@pytest.mark.parametrize("n_dim", [1, 2, 5])
+def test_draws_of_a_proposal_follow_its_density(n_dim: int) -> None:
+    """A Gaussian integrated by the proposal's draws is 1, as with the generator of emcee."""
+    own = proposal(n_dim)
+    book = stats.multivariate_normal(own.mean, 1.3 * own.factor @ own.factor.T)
+    for rng in (np.random.default_rng(2), np.random.RandomState(3)):  # noqa: NPY002
+        x = own.draw(rng, 20_000)
+        ratio = np.exp(np.reshape(book.logpdf(x), -1) - own.log_density(x))
+        error = ratio.std() / np.sqrt(20_000)
+        assert abs(ratio.mean() - 1) < 4.5 * error
+        assert error < 0.02
+        assert abs(1.1 * ratio.mean() - 1) > 4.5 * error  # negative control
+    in_one = own.draw(np.random.default_rng(4), 20_000)[:, 0]
+    if n_dim == 1:
+        grid = np.sort(in_one)
+        fine = own.mean[0] + own.factor[0, 0] * np.sinh(np.linspace(-9, 9, 40_001))
+        cdf = np.cumsum(np.exp(own.log_density(fine[:, None])) * np.gradient(fine))
+        assert stats.kstest(grid, lambda v: np.interp(v, fine, cdf)).pvalue > 1e-4

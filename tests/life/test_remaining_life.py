@@ -12,10 +12,12 @@ import pytest
 from scipy import stats
 
 from lmshealth.errors import BadStage, NotEnoughData
-from lmshealth.life import ensemble_sampling as sampling
 from lmshealth.life import constants
+from lmshealth.life import ensemble_sampling as sampling
+from lmshealth.life.density import LifeDensity
 from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import LifeDensity, fit_life
+from lmshealth.life.posterior import fit_life
+from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.remaining_life import (
     _beyond_laws,
     _usage,
@@ -24,7 +26,6 @@ from lmshealth.life.remaining_life import (
     parameters_with_limit,
     prognose,
 )
-from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.stage.degradation_laws import Accelerating, Linear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Normal
@@ -33,6 +34,7 @@ from tests.lives import (
     FADING,
     FOOT,
     FREQUENCY,
+    LAWS_ALONE,
     MOUNT,
     PRELOAD,
     START,
@@ -43,7 +45,7 @@ from tests.lives import (
     true_drift,
 )
 
-KNOWN_USAGE = "[usage]\nkm_per_day = 20\nhorizon_km = 5000\n"
+KNOWN_USAGE = LAWS_ALONE + "[usage]\nkm_per_day = 20\nhorizon_km = 5000\n"
 STILL_MOUNT = MOUNT[: MOUNT.index("[parameter.law]")]
 FADING_OR_NOT = FADING.replace("law = {", "law = [{").replace("} }\n", "} }, { kind = 'none' }]\n")
 LIMITED_FOOT = FOOT + "limit = { below = 0.8 }\n"
@@ -54,6 +56,7 @@ def small_grid() -> Iterator[None]:
     """Average over two walks, in short chains, about exact laws: checks hold for any of them."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "WALK_STDS", (1e-5, 1.5e-3))
+        patch.setattr(constants, "WALK_PRIOR", (0.5, 0.5))
         patch.setattr(sampling, "_FIRST_STEPS", 300)
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
@@ -88,10 +91,10 @@ def fading(stage: Stage) -> Prognosis:
 
 
 @pytest.mark.slow
-def test_ten_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
-    """10,000 draws of each limit; "any" is the smaller of them, draw by draw."""
+def test_four_thousand_draws_and_the_first_limit(fading: Prognosis) -> None:
+    """4,000 draws of each limit; "any" is the smaller of them, draw by draw."""
     assert fading.parameters == ("guide_preload", "mount_stiffness", "any")
-    assert fading.remaining.shape == (10_000, 3)
+    assert fading.remaining.shape == (4000, 3)
     np.testing.assert_array_equal(fading.remaining[:, 2], fading.remaining[:, :2].min(axis=1))
     np.testing.assert_array_equal(fading.limits, [0.6, 0.7, np.nan])
 
@@ -138,7 +141,7 @@ def test_a_machine_that_does_not_wear_keeps_its_censored_draws(stage: Stage) -> 
     infinite = np.isinf(found.remaining[:, 0])
     assert 0.02 < infinite.mean() < 0.98
     assert found.beyond_horizon()[0] >= infinite.mean()
-    assert found.remaining.shape == (10_000, 3)
+    assert found.remaining.shape == (4000, 3)
     assert np.isfinite(found.curve_quantiles).all()
 
 
@@ -206,7 +209,7 @@ def test_stated_usage_needs_no_odometer(stage: Stage) -> None:
 @pytest.fixture(scope="module")
 def unstated(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     """Load a stage whose usage has to be read from the odometer."""
-    return make_stage(tmp_path_factory.mktemp("unstated"), (FADING,))
+    return make_stage(tmp_path_factory.mktemp("unstated"), (FADING,), tail=LAWS_ALONE)
 
 
 def moved(rng: np.random.Generator, n: int, spread: float) -> History:
@@ -273,7 +276,7 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, (STILL_MOUNT,), tail=KNOWN_USAGE)
     found = prognose(fading_life(0.0), stage, 1)
     assert np.isinf(found.remaining).all()
-    assert found.degrees_of_freedom == 16
+    assert found.degrees_of_freedom == pytest.approx(16 - 2, abs=0.01)
     assert np.isfinite(found.curve_quantiles).all()
     assert found.laws == (LawWeight("mount_stiffness", "none", 0.0, 1.0),)
 
@@ -282,7 +285,7 @@ def test_a_stage_without_any_law_never_fails(tmp_path: Path) -> None:
 def test_an_unidentifiable_parameter_is_named_and_left_out(stage: Stage, fading: Prognosis) -> None:
     """The foot has a limit, but moves no mode: it has no remaining life and is not in "any"."""
     assert fading.unidentifiable == ("foot",)
-    assert fading.health.shape == (10_000, 2)
+    assert fading.health.shape == (4000, 2)
     assert fading.curve_quantiles.shape[2] == 2
     assert {weight.parameter for weight in fading.laws} == {"guide_preload", "mount_stiffness"}
     assert [p.name for _, p in parameters_with_limit(stage)] == [
@@ -368,9 +371,8 @@ def test_curves_pass_through_the_health_now(fading: Prognosis) -> None:
     ):
         low, high = np.sort(curve[order])
         now = np.quantile(fading.health[:, 0], level)
-        # Every fifth draw makes the curves.
-        margin = 5 * fading.health[:, 0].std() / np.sqrt(fading.ess / 5)
-        assert low - margin < now < high + margin
+        # The curves are of the same draws, exactly by their laws.
+        assert low <= now <= high
 
 
 @pytest.mark.slow
@@ -385,7 +387,7 @@ def test_a_floor_above_the_limit_never_fails_and_one_below_does(tmp_path: Path) 
     infinite = np.isinf(found.remaining[:, 0])
     assert 0.05 < infinite.mean() < 0.95
     assert np.isfinite(found.remaining[~infinite]).all()
-    assert found.health.shape == (10_000, 1)
+    assert found.health.shape == (4000, 1)
 
 
 def test_limited_parameters_keep_their_position(tmp_path: Path) -> None:
@@ -447,7 +449,7 @@ def test_the_posterior_does_not_depend_on_the_horizon(
     """Horizons of 2,500 and 160,000 km: the same health, and the same risks up to the nearer."""
     monkeypatch.setattr(constants, "DEVIATION_STDS", (deviation,))
     stages = [
-        make_stage(tmp_path / str(km), (FADING,), tail=f"[usage]\nhorizon_km = {km}\n")
+        make_stage(tmp_path / str(km), (FADING,), tail=LAWS_ALONE + f"[usage]\nhorizon_km = {km}\n")
         for km in (2500, 160_000)
     ]
     near, far = (prognose(fading_life(1.5e-4), stage, 3, chains=False) for stage in stages)

@@ -8,10 +8,10 @@ from scipy import stats
 from scipy.optimize import brentq
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.life.constants import STEP_PROBABILITY
 from lmshealth.life import constants
-from lmshealth.life.scenarios import DegradationPath, Scenario, list_scenarios
-from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Unchanging
+from lmshealth.life.constants import STEP_PROBABILITY
+from lmshealth.life.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
+from lmshealth.stage.degradation_laws import AnyLaw, Free, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.description import ParameterSpec
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 
@@ -21,7 +21,8 @@ WEAR = HertzWear(life_km=Lognormal(8000, 1.0), exponent=Uniform(0.7, 1.6))
 LOOSE = Loosening(life_km=Lognormal(4000, 1.0), floor=Uniform(0.3, 1.0), weight=3.0)
 LINEAR = Linear(rate_per_km=Normal(0.0, 2e-4))
 NONE = Unchanging(weight=4.0)
-LAWS: list[AnyLaw] = [WEAR, LOOSE, LINEAR, NONE]
+FREE = Free()
+LAWS: list[AnyLaw] = [WEAR, LOOSE, LINEAR, NONE, FREE]
 
 
 def parameter(name: str, *laws: AnyLaw) -> ParameterSpec:
@@ -46,7 +47,7 @@ MOUNT = parameter("mount", LOOSE, NONE)
 )
 def test_scenarios_have_all_the_probability(steps: tuple[float, ...], n: int) -> None:
     """Every choice of laws, begins and steps, or none, occurs once; weights add up to one."""
-    scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW)
+    scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW, 0.0)
     assert len(scenarios) == n
     assert sum(scenario.weight for scenario in scenarios) == pytest.approx(1, abs=1e-14)
     keys = {tuple((b.law.kind, b.begin, b.steps) for b in one.paths) for one in scenarios}
@@ -60,7 +61,7 @@ def test_scenarios_have_all_the_probability(steps: tuple[float, ...], n: int) ->
 
 def test_a_law_has_its_weight_whether_it_restarts_or_not() -> None:
     """Beginnings share what a law has; weights count against those of the same parameter."""
-    scenarios = list_scenarios((PRELOAD, MOUNT), STEPS, NOW)
+    scenarios = list_scenarios((PRELOAD, MOUNT), STEPS, NOW, 0.0)
     weights: dict[tuple[str, float], float] = {}
     for scenario in scenarios:
         for path in scenario.paths:
@@ -81,13 +82,30 @@ def test_a_law_has_its_weight_whether_it_restarts_or_not() -> None:
 
 def test_a_scenario_without_parameters_is_one_certain_life() -> None:
     """One law of each parameter, and no step, is one scenario."""
-    (scenario,) = list_scenarios((parameter("foot", NONE), MOUNT_ONLY), (), NOW)
+    (scenario,) = list_scenarios((parameter("foot", NONE), MOUNT_ONLY), (), NOW, 0.0)
     assert scenario.weight == 1
     assert scenario.sizes == (0, 2)
     assert scenario.n_dim == 2
 
 
 MOUNT_ONLY = parameter("mount", LOOSE)
+
+
+def test_a_free_change_has_its_share_of_the_laws() -> None:
+    """A twentieth of a parameter's laws; what never changes, or has it itself, gets none."""
+    laws = {law.kind: share for law, share in laws_of(PRELOAD, 0.05)}
+    shares = {"hertz-wear": 0.95 / 6, "linear": 0.95 / 6, "none": 0.95 * 4 / 6, "free": 0.05}
+    assert laws == pytest.approx(shares)
+    assert [law.kind for law, _ in laws_of(PRELOAD, 0.0)] == ["hertz-wear", "linear", "none"]
+    assert laws_of(parameter("foot", NONE), 0.05) == [(NONE, 1.0)]
+    own = parameter("mount", LOOSE, Free(std=0.3))
+    assert laws_of(own, 0.05) == [(LOOSE, 0.75), (own.laws[1], 0.25)]
+    for steps, n in (((), 4 * 3), (STEPS, 7 * 5 + 4 * 3)):
+        scenarios = list_scenarios((PRELOAD, MOUNT), steps, NOW, 0.05)
+        assert len(scenarios) == n
+        assert sum(one.weight for one in scenarios) == pytest.approx(1, abs=1e-14)
+        of_free = sum(one.weight for one in scenarios if one.paths[0].law.kind == "free")
+        assert of_free == pytest.approx(0.05)
 
 
 @pytest.mark.parametrize("law", LAWS, ids=[law.kind for law in LAWS])
@@ -109,7 +127,7 @@ def test_jumps_act_from_their_step_on(law: AnyLaw) -> None:
     assert np.ptp(first) > 0.1
 
 
-@pytest.mark.parametrize("law", LAWS[:3], ids=[law.kind for law in LAWS[:3]])
+@pytest.mark.parametrize("law", [*LAWS[:3], FREE], ids=["hertz-wear", "loosening", "linear", "free"])
 def test_a_restarted_law_is_1_until_then(law: AnyLaw) -> None:
     """Up to where it begins only jumps act; from there it is the law of the travel since."""
     path, k = DegradationPath(law, 1.2e6, STEPS), len(law.names)
@@ -129,7 +147,7 @@ FALLING = [WEAR, LOOSE, Linear(rate_per_km=Lognormal(2e-4, 0.5)), NONE]
 
 
 @pytest.mark.parametrize("begin", [0.0, 1.2e6])
-@pytest.mark.parametrize("law", FALLING, ids=[law.kind for law in LAWS])
+@pytest.mark.parametrize("law", FALLING, ids=[law.kind for law in FALLING])
 def test_passage_after_the_last_step_is_the_root_of_health(law: AnyLaw, begin: float) -> None:
     """Where a limit is reached after all steps, root finding on health finds the same travel."""
     path = DegradationPath(law, begin, STEPS)
@@ -190,7 +208,7 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
 
 
 @pytest.mark.parametrize("begin", [0.0, 0.5e6])
-@pytest.mark.parametrize("law", [WEAR, LOOSE], ids=["hertz-wear", "loosening"])
+@pytest.mark.parametrize("law", [WEAR, LOOSE, FREE], ids=["hertz-wear", "loosening", "free"])
 def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
     """Wear and loosening, restarted or not, by quadrature on a grid of coordinates."""
     scenario = one_scenario(DegradationPath(law, begin, ()))
@@ -204,6 +222,8 @@ def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -
     assert density.sum() * cell == pytest.approx(1, abs=3e-3)
     mean = density @ grid * cell
     assert (np.abs(y.mean(axis=0) - mean) < 5 * y.std(axis=0) / np.sqrt(20_000) + 5e-3).all()
+    if law is FREE:  # whose coordinates are those at any travel
+        return
     # Negative control: draws as if the law had another travel behind it.
     other = one_scenario(DegradationPath(law, 1.2e6, ())).draw(np.random.default_rng(3), 20_000)
     assert (np.abs(other.mean(axis=0) - mean) > 0.05).any()

@@ -11,11 +11,15 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
+from lmshealth.life.likelihood import NO_MODE
+from lmshealth.life.posterior import LoneMode
 from lmshealth.life.verdict import (
+    OUTSIDE_MAP,
     degraded_below,
     degraded_words,
     doubt_of_names,
     judge,
+    lone_sentence,
     verdict_of,
 )
 from lmshealth.stage.description import Stage, load_stage
@@ -112,6 +116,52 @@ def test_an_uninformed_parameter_is_left_out(stage: Stage) -> None:
     assert "Mount stiffness: not constrained by these logs." in found.why
 
 
+YAW = LoneMode("yaw", -0.02, 0.001, 0.8)
+
+
+def alone(share: float, n: int = 1000) -> np.ndarray:
+    """Let yaw move alone in the first draws."""
+    return np.where(np.arange(n) < share * n, 2, NO_MODE)
+
+
+@pytest.mark.parametrize(("share", "verdict"), [(0.8, OUTSIDE_MAP), (0.3, "healthy")])
+def test_a_mode_that_moves_alone_in_most_draws_is_the_verdict(
+    stage: Stage, share: float, verdict: str
+) -> None:
+    """With its drift and what to check, and health beside it; its probability is that of draws."""
+    health = make_health(around(0.99, 1.0), lone=alone(share), lone_modes=(YAW,))
+    found = judge(stage, logs(8), health)
+    assert (found.verdict, found.probability) == (verdict, pytest.approx(max(share, 1 - share)))
+    said = found.why.startswith(lone_sentence(YAW, stage))
+    assert said == (verdict == OUTSIDE_MAP)
+    assert "Guide preload is at 99 %" in found.why
+    assert degraded_words(OUTSIDE_MAP) == ()
+
+
+def test_the_sentence_about_a_mode_that_moves_alone_has_its_size(stage: Stage) -> None:
+    """In percent, with its standard deviation, and the parameters that do not do this."""
+    said = lone_sentence(YAW, stage)
+    assert said.startswith("Yaw has moved by −2.0 ± 0.1 % alone; no state of guide preload and")
+
+
+def test_a_mode_that_moves_alone_counts_only_without_a_loss(stage: Stage) -> None:
+    """Draws with a loss are of the loss, whatever else moved; the most probable is the verdict."""
+    worn = make_health(around(0.7, 1.0), lone=alone(1.0), lone_modes=(YAW,))
+    found = judge(stage, logs(8), worn)
+    assert (found.verdict, found.probability) == ("preload", pytest.approx(1.0))
+    half = np.vstack([around(0.7, 1.0, 400), around(0.99, 1.0, 600)])
+    mixed = make_health(half, lone=np.where(np.arange(1000) < 650, NO_MODE, 2), lone_modes=(YAW,))
+    found = judge(stage, logs(8), mixed)
+    # 400 draws of a loss, 250 healthy ones, and 350 in which yaw moved alone.
+    assert (found.verdict, found.probability) == ("preload", pytest.approx(0.4))
+
+
+def test_a_mode_that_moves_alone_without_informed_health_is_no_verdict(stage: Stage) -> None:
+    """Where the logs constrain no parameter, none of the draws counts."""
+    health = make_health(around(0.99, 1.0), informed=(0.1, 0.1), lone=alone(1.0), lone_modes=(YAW,))
+    assert judge(stage, logs(8), health).verdict == "not-enough-data"
+
+
 def stepped(*, declared: bool = False, epoch: int = 5, evidence: float = 30.0) -> Track:
     """Make a track with one step of roll and pitch."""
     events = tuple(
@@ -148,14 +198,14 @@ def test_a_declared_or_past_step_is_not_the_verdict(stage: Stage) -> None:
     ("n_logs", "options", "needle"),
     [
         (3, {}, "3 usable logs since the baseline began; it needs 5"),
-        (8, {"converged": False}, "did not converge"),
+        (8, {"fit": 9e-4}, "No life of the parameters on the map explains the logs (p = 0.0009)"),
         (8, {"informed": (0.2, 0.4)}, "do not constrain any health parameter"),
     ],
 )
 def test_too_little_data_has_no_verdict(
     stage: Stage, n_logs: int, options: dict, needle: str
 ) -> None:
-    """Few logs, no convergence or no information: not-enough-data, without a probability."""
+    """Few logs, no life that explains them or no information: not-enough-data, without a probability."""
     found = judge(stage, logs(n_logs), make_health(around(0.5, 0.5), **options))
     assert found.verdict == "not-enough-data"
     assert np.isnan(found.probability)

@@ -29,6 +29,7 @@ def summary(assessment: Assessment) -> Summary:
         ("mount", "Loss of mount stiffness", "bad"),
         ("both", "Loss of guide preload and mount stiffness", "bad"),
         ("step", "Sudden change without a known cause", "bad"),
+        ("outside-map", "A mode moved alone, by a cause outside the map", "open"),
         ("not-enough-data", "Not enough data for a verdict", "open"),
         ("no-alarm", "Modes tracked, no alarm", "open"),
     ],
@@ -80,6 +81,29 @@ def test_health_is_that_of_the_draws(make: Maker) -> None:
         draws = assessment.health.samples[-1, :, k]
         assert one.below_limit == np.mean(draws < one.limit)
     assert [one.determined for one in summary(blind(assessment)).health] == [True, False]
+
+
+def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
+    """What to do is to look for its cause; it stands before healthy machines, after worn ones."""
+    assessment = make()
+    outside = replace(assessment.judgement, verdict="outside-map")
+    found = summary(replace(assessment, judgement=outside))
+    assert found.to_do.startswith("Find out what moved the mode: its sensor, cables, payload")
+    assert "Order" in summary(assessment).to_do or "Do " in summary(assessment).to_do
+    healthy = summary(make("sound", wear_km=400000, floor=0.98))
+    assert summary(assessment).urgency < found.urgency < healthy.urgency
+
+
+def test_gauges_and_limits_are_of_the_same_draws(make: Maker) -> None:
+    """A gauge shows the last epoch alone, whatever the laws of the prognosis are."""
+    assessment = make()
+    assert assessment.health is not None
+    low = replace(assessment, health=replace(assessment.health, chains=assessment.health.chains / 2))
+    gauge, other = summary(assessment).health[0], summary(low).health[0]
+    np.testing.assert_allclose(
+        (other.low, other.median, other.high), np.divide((gauge.low, gauge.median, gauge.high), 2)
+    )
+    assert low.service() == assessment.service()
 
 
 def test_without_results_a_summary_has_no_numbers(make: Maker) -> None:

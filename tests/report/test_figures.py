@@ -171,12 +171,10 @@ def test_posterior_of_three_parameters_is_refused(ax: Axes, health: Health) -> N
         plots.plot_posterior(ax, health, ("a", "b", "c"))
 
 
-def test_health_marks_limit_and_failures(ax: Axes, health: Health) -> None:
-    """Limit, baseline and epochs without convergence are marked."""
-    converged = health.converged.copy()
-    converged[5] = False
-    plots.plot_health(ax, replace(health, converged=converged), "guide_preload", 0.6)
-    assert {"limit 60 %", "baseline", "sampler not converged"} <= set(labels(ax))
+def test_health_marks_limit_and_baseline(ax: Axes, health: Health) -> None:
+    """Limit and baseline are marked."""
+    plots.plot_health(ax, health, "guide_preload", 0.6)
+    assert {"limit 60 %", "baseline"} <= set(labels(ax))
     low, high = ax.get_ylim()
     assert low < 60
     assert high > 100

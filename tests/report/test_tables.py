@@ -112,7 +112,7 @@ def assessment(stage: Stage, prognosis_: Prognosis | None) -> Assessment:
     draws = np.random.default_rng(1).normal(0.9, 0.01, (2, 500, 1))
     health = health_of(
         draws, recorded_at=two, travel=travel, parameters=("guide_preload",),
-        converged=np.array([True, False]), informed=np.full((2, 1), 0.9), stage="test-A",
+        informed=np.full((2, 1), 0.9), stage="test-A",
     )  # fmt: skip
     verdict = Verdict("test-A", two[-1], "healthy", 0.8, "")
     return Assessment(stage, history, ("d", "e"), track, health, prognosis_, verdict, (), (), 0)
@@ -215,12 +215,13 @@ def test_track_and_its_covariance_agree(stage: Stage) -> None:
     assert made["effects"].to_dict("records")[0]["covariate"] == "temperature_c"
 
 
-def test_health_quantiles_are_ordered_and_have_their_convergence(stage: Stage) -> None:
-    """Every row has q05 ≤ q25 ≤ median ≤ q75 ≤ q95, and its convergence."""
+def test_health_quantiles_are_ordered_and_have_their_sampler(stage: Stage) -> None:
+    """Every row has q05 ≤ q25 ≤ median ≤ q75 ≤ q95, and what drew it, which has converged."""
     health = tables(stage, np.full(100, 1e6))["health"]
     values = health[["q05", "q25", "median", "q75", "q95"]].to_numpy()
     assert (np.diff(values, axis=1) > 0).all()
-    assert health["converged"].tolist() == [True, False]
+    assert health["converged"].tolist() == [True, True]
+    assert health["sampler"].tolist() == ["emcee", "emcee"]
 
 
 def test_remaining_life_has_three_units(stage: Stage) -> None:

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from itertools import pairwise
+from pathlib import Path
 from typing import get_args
 
 import msgspec
 import numpy as np
 import pytest
+from scipy import stats
 from scipy.optimize import brentq
 
 from lmshealth.stage.degradation_laws import (
     Accelerating,
     AnyLaw,
+    Free,
     HertzWear,
     Law,
     Linear,
@@ -22,6 +28,8 @@ from lmshealth.stage.degradation_laws import (
     Unchanging,
 )
 from lmshealth.stage.priors import Lognormal, Normal, Prior, Uniform
+from tests.conftest import ROOT
+from tests.lives import FADING, map_rows, stage_text
 
 NOW = 1.7e6
 WEAR = HertzWear(Lognormal(8000, 1.0), Uniform(0.7, 1.6))
@@ -29,6 +37,7 @@ LOOSE = Loosening(Lognormal(4000, 1.0), Uniform(0.3, 1.0))
 POWER = Power(Lognormal(6000, 0.5), Uniform(0.5, 2.0))
 LINEAR = Linear(Normal(0.0, 2e-4))
 LATE = Accelerating(life_km=Lognormal(4000, 1.0), slow=Lognormal(0.1, 1.0))
+FREE = Free()
 LAWS = [WEAR, LOOSE, POWER, LINEAR, LATE]
 NAMES = ["hertz-wear", "loosening", "power", "linear", "accelerating"]
 
@@ -83,7 +92,46 @@ def test_draws_follow_the_prior(law: AnyLaw) -> None:
             assert abs(share - level) < 5 * np.sqrt(level * (1 - level) / 20_000)
 
 
-@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+@pytest.mark.parametrize("now", [1e4, NOW])
+def test_a_free_change_by_now_is_normal_whenever_now_is(now: float) -> None:
+    """Ln health now is N(0, std) in both directions, and ln of the exponent N(0, its sigma)."""
+    law = Free(std=0.2, exponent_sigma=0.4)
+    y = law.draw(np.random.default_rng(5), 20_000, now)
+    theta = law.natural(y, now)
+    change = np.log(law.health(theta, np.array([0.0, now / 4, now])))
+    assert (change[:, 0] == 0).all()
+    assert stats.kstest(change[:, 2], stats.norm(0, 0.2).cdf).pvalue > 1e-4
+    assert stats.kstest(change[:, 2], stats.norm(0, 0.22).cdf).pvalue < 1e-4  # negative control
+    assert stats.kstest(np.log(theta[:, 1]), stats.norm(0, 0.4).cdf).pvalue > 1e-4
+    np.testing.assert_allclose(change[:, 1], change[:, 2] * 0.25 ** theta[:, 1], rtol=1e-9)
+    assert abs(np.corrcoef(y.T)[0, 1]) < 4.5 / np.sqrt(20_000)
+    # The density is that of the draws: its mean is minus the entropy of two standard normals.
+    value = law.log_prior(y, now)
+    assert abs(value.mean() + np.log(2 * np.pi * np.e)) < 5 * value.std() / np.sqrt(20_000)
+
+
+def test_the_prior_of_a_free_change_integrates_to_one() -> None:
+    """By quadrature on a grid of its coordinates."""
+    axis = np.linspace(-8, 8, 401)
+    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    total = np.exp(FREE.log_prior(grid, NOW)).sum() * (axis[1] - axis[0]) ** 2
+    assert total == pytest.approx(1, abs=1e-9)
+
+
+def test_a_free_change_ends_where_it_loses_and_never_where_it_gains() -> None:
+    """Losses reach a limit, gains none, however far; a limit of 1 or more is reached at once."""
+    theta = FREE.natural(FREE.draw(np.random.default_rng(6), 2000, NOW), NOW)
+    loses = theta[:, 0] < 0
+    assert 900 < loses.sum() < 1100
+    passage = FREE.passage(theta, np.array(0.8))
+    np.testing.assert_array_equal(np.isfinite(passage), loses)
+    at = FREE.health(theta[loses], passage[loses, None])[:, 0]
+    np.testing.assert_allclose(at, 0.8, rtol=1e-9)
+    assert (FREE.health(theta[~loses], np.array([NOW, 9 * NOW])) >= 1).all()
+    np.testing.assert_array_equal(FREE.passage(theta, np.array(1.0)), 0.0)
+
+
+@pytest.mark.parametrize("law", [*LAWS, FREE, Unchanging()], ids=[*NAMES, "free", "none"])
 def test_draws_are_finite_and_inside_the_support(law: AnyLaw) -> None:
     """Every draw of a prior has a finite density there."""
     y = law.draw(np.random.default_rng(3), 2000, NOW)
@@ -104,7 +152,7 @@ def test_a_prior_that_reaches_below_zero_is_cut_there(law: AnyLaw) -> None:
     assert np.isfinite(y).all()
 
 
-@pytest.mark.parametrize("law", LAWS, ids=NAMES)
+@pytest.mark.parametrize("law", [*LAWS, FREE], ids=[*NAMES, "free"])
 def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
     """Where a limit is reached, root finding on health gives the same travel."""
     theta = law.natural(law.draw(np.random.default_rng(4), 60, NOW), NOW)
@@ -123,7 +171,7 @@ def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
                 assert off(1e13) > -1e-12
 
 
-@pytest.mark.parametrize("law", [*LAWS, Unchanging()], ids=[*NAMES, "none"])
+@pytest.mark.parametrize("law", [*LAWS, FREE, Unchanging()], ids=[*NAMES, "free", "none"])
 def test_each_draw_may_have_its_own_limit(law: AnyLaw) -> None:
     """An array of limits gives what each limit alone gives, up to those at the baseline."""
     theta = law.natural(law.draw(np.random.default_rng(7), 40, NOW), NOW)
@@ -154,7 +202,7 @@ def test_before_it_begins_a_law_changes_nothing(law: AnyLaw) -> None:
 
 def test_every_law_of_a_description_is_tested() -> None:
     """The laws above are all that a description may name, each with a label for reports."""
-    assert {type(law) for law in [*LAWS, Unchanging()]} == set(get_args(AnyLaw))
+    assert {type(law) for law in [*LAWS, FREE, Unchanging()]} == set(get_args(AnyLaw))
     assert all(law.label for law in get_args(AnyLaw))
 
 
@@ -237,3 +285,64 @@ def test_laws_that_cannot_be_are_refused(law: Callable[[], Law], message: str) -
     """Priors outside of what makes sense are refused before anything is drawn from them."""
     with pytest.raises(ValueError, match=message):
         law()
+
+
+# Laws of other packages
+
+_MODULE = """
+from lmshealth.stage.degradation_laws import Linear
+
+class Swelling(Linear, frozen=True, tag="swelling", tag_field="kind"):
+    "Gain in proportion to travel."
+    label = "swelling"
+
+def nothing():
+    "No law."
+"""
+_SCRIPT = """
+import numpy as np
+from lmshealth import load_stage
+stage = load_stage("small.toml")
+(law,) = stage.parameters[0].laws
+print(law.kind, law.label)
+from lmshealth.life.posterior import fit_life
+from tests.lives import FREQUENCY, make_history, true_drift
+travel = np.linspace(0, 1e6, 8)
+drift = true_drift(("guide_preload",), np.log(1 - 2e-7 * travel)[:, None])[:, :2]
+life = fit_life(make_history(np.log(FREQUENCY[:2]) + drift, travel=travel), stage, 1, chains=False)
+print({path.law.kind for one in life.scenarios for path in one.scenario.paths})
+print(round(float(np.median(life.health)), 2))
+"""
+
+
+@pytest.mark.slow
+def test_a_law_of_another_package_is_one_of_a_description(tmp_path: Path) -> None:
+    """An entry point adds a kind of law, which is fitted; without the package it is unknown."""
+    law = FADING.replace('kind = "linear"', 'kind = "swelling"')
+    (tmp_path / "small.toml").write_text(stage_text((law,)))
+    (tmp_path / "map.csv").write_text("\n".join(map_rows(("guide_preload",))) + "\n")
+    package = tmp_path / "package"
+    info = package / "swelling-1.0.dist-info"
+    info.mkdir(parents=True)
+    (package / "swelling.py").write_text(_MODULE)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: swelling\nVersion: 1.0\n")
+    entries = "[lmshealth.laws]\nswelling = swelling:Swelling\nother = swelling:nothing\n"
+    (info / "entry_points.txt").write_text(entries)
+    for paths, known in (([ROOT, package], True), ([ROOT], False)):
+        path = os.pathsep.join(map(str, paths))
+        done = subprocess.run(
+            [sys.executable, "-c", _SCRIPT],
+            cwd=tmp_path,
+            env=os.environ | {"PYTHONPATH": path},
+            capture_output=True,
+            text=True,
+            check=False,
+        )
+        if known:
+            assert done.returncode == 0, done.stderr
+            kind, kinds, median = done.stdout.splitlines()
+            assert kind == "swelling swelling"
+            assert "swelling" in kinds
+            assert float(median) == pytest.approx(0.8, abs=0.05)
+        else:
+            assert "swelling" in done.stderr and "BadStage" in done.stderr

@@ -1,0 +1,125 @@
+"""Assessment of a machine: what samples a life, what is kept for the next log, and what is past."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from lmshealth._private.serialize import pack, unpack
+from lmshealth.batch import assess as assessing
+from lmshealth.batch.assess import Machine, StoredLife
+from lmshealth.life import constants
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.report.assessment import Assessment
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage, true_drift
+
+Step = Callable[[int, StoredLife | None], tuple[Assessment, StoredLife | None]]
+
+
+@pytest.fixture
+def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
+    """A preload that fades, by few points of the grid."""
+    monkeypatch.setattr(constants, "WALK_STDS", (1e-4,))
+    monkeypatch.setattr(constants, "WALK_PRIOR", (1.0,))
+    monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0,))
+    monkeypatch.setattr(constants, "DEVIATION_PRIOR", (1.0,))
+    return make_stage(tmp_path, (FADING,), n_modes=3, tail=LAWS_ALONE)
+
+
+def readings(n: int, *, loss: float = 0.0, after: int = 0) -> list[LogEstimates]:
+    """Make the estimates of so many weekly logs, with a loss by the last of 40."""
+    rng, made = np.random.default_rng(1), []
+    for k in range(n):
+        x = np.log([1 - loss * max(k - after, 0) / 40])
+        ln_f = np.log(FREQUENCY) + true_drift(("guide_preload",), x) + 1e-4 * rng.normal(size=3)
+        modes = dict(zip(("roll", "pitch", "yaw"), ln_f.tolist(), strict=True))
+        one = make_reading(f"{k:02d}.csv", 7.0 * k, 1e5 * k, modes)
+        cov = np.diag([2.5e-7] * 3 + [0.05**2] * 3)
+        ln_damping = np.log([0.018, 0.015, 0.017])
+        made.append(replace(one, modes=replace(one.modes, cov=cov, ln_damping=ln_damping)))
+    return made
+
+
+@pytest.fixture
+def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, bool]]:
+    """List of each fit whether chains ran, and whether it began with draws; none really run."""
+    seen: list[tuple[bool, bool]] = []
+
+    def counting(*given: Any, chains: bool = True, **options: Any) -> LifePosterior:
+        seen.append((chains, options.get("before") is not None))
+        life = fit_life(*given, chains=False, **options)
+        return replace(life, sampler="emcee" if chains else "importance")
+
+    monkeypatch.setattr(assessing, "fit_life", counting)
+    return seen
+
+
+def machine(stage: Stage) -> Machine:
+    """Name no logs: their keys play no part."""
+    return Machine("", (), stage, NO_MAINTENANCE, 5, 0)
+
+
+def test_emcee_samples_the_first_and_each_sixteenth_log(
+    stage: Stage, fits: list[tuple[bool, bool]]
+) -> None:
+    """In between importance sampling updates, from draws that a store has kept, and says so."""
+    before: StoredLife | None = None
+    found = {}
+    for n in (13, 14, 15, 16, 17, 31, 33):
+        made, after = assessing._assess(readings(n), machine(stage), before)
+        assert made.health is not None and after is not None
+        (found[n],) = set(made.health.sampler)
+        assert made.judgement.verdict == after.verdict == "healthy"
+        assert after.n_logs == n
+        before = unpack(pack(after), StoredLife)
+    emcee = [n for n, sampler in found.items() if sampler == "emcee"]
+    assert emcee == [13, 16, 33]
+    assert fits == [(n in emcee, n > 13) for n in found]
+
+
+def test_emcee_samples_where_the_verdict_changes(
+    stage: Stage, fits: list[tuple[bool, bool]]
+) -> None:
+    """An update that turns healthy to degraded is repeated by chains, and these are published."""
+    _, before = assessing._assess(readings(20), machine(stage), None)
+    assert before is not None and before.verdict == "healthy"
+    fits.clear()
+    made, after = assessing._assess(readings(30, loss=1.2, after=19), machine(stage), before)
+    assert made.health is not None and after is not None
+    assert made.judgement.verdict == after.verdict == "preload"
+    assert set(made.health.sampler) == {"emcee"}
+    assert fits == [(False, True), (True, True)]
+
+
+def test_an_assessment_alone_is_by_emcee(stage: Stage, fits: list[tuple[bool, bool]]) -> None:
+    """`assess` knows of no assessment before."""
+    made = assessing.assess(readings(8), stage, epochs=3)
+    assert made.health is not None
+    assert set(made.health.sampler) == {"emcee"}
+    assert len(made.health.recorded_at) == 3
+    assert fits == [(True, False)]
+
+
+def test_a_mode_that_moves_alone_is_the_verdict(tmp_path: Path) -> None:
+    """Yaw by −2 % alone: outside-map, without a service by it, in words."""
+    stage = make_stage(tmp_path, (FADING,), n_modes=3, tail="")
+    made = []
+    for k, one in enumerate(readings(24)):
+        ln_f = one.modes.ln_frequency + np.array([0.0, 0.0, -0.02 * k / 23])
+        made.append(replace(one, modes=replace(one.modes, ln_frequency=ln_f)))
+    with pytest.MonkeyPatch.context() as patch:
+        quick = lambda *given, chains=True, **more: fit_life(*given, chains=False, **more)  # noqa: E731
+        patch.setattr(assessing, "fit_life", quick)
+        found = assessing.assess(made, stage, epochs=3)
+    assert found.judgement.verdict == "outside-map"
+    assert found.judgement.probability > 0.9
+    assert "Yaw has moved by −2.0" in found.judgement.why
+    assert found.service().kind != "now"
