@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -16,12 +15,9 @@ from lmshealth.batch.assess import Machine, StoredLife
 from lmshealth.life import constants
 from lmshealth.life.posterior import LifePosterior, fit_life
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage, true_drift
-
-Step = Callable[[int, StoredLife | None], tuple[Assessment, StoredLife | None]]
 
 
 @pytest.fixture
@@ -34,11 +30,11 @@ def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
     return make_stage(tmp_path, (FADING,), n_modes=3, tail=LAWS_ALONE)
 
 
-def readings(n: int, *, loss: float = 0.0, after: int = 0) -> list[LogEstimates]:
-    """Make the estimates of so many weekly logs, with a loss by the last of 40."""
+def readings(n: int, *, loss: float = 0.0) -> list[LogEstimates]:
+    """Make the estimates of so many weekly logs, with a loss by log 40."""
     rng, made = np.random.default_rng(1), []
     for k in range(n):
-        x = np.log([1 - loss * max(k - after, 0) / 40])
+        x = np.log([1 - loss * k / 40])
         ln_f = np.log(FREQUENCY) + true_drift(("guide_preload",), x) + 1e-4 * rng.normal(size=3)
         modes = dict(zip(("roll", "pitch", "yaw"), ln_f.tolist(), strict=True))
         one = make_reading(f"{k:02d}.csv", 7.0 * k, 1e5 * k, modes)
@@ -89,10 +85,10 @@ def test_emcee_samples_where_the_verdict_changes(
     stage: Stage, fits: list[tuple[bool, bool]]
 ) -> None:
     """An update that turns healthy to degraded is repeated by chains, and these are published."""
-    _, before = assessing._assess(readings(20), machine(stage), None)
+    _, before = assessing._assess(readings(17, loss=0.2), machine(stage), None)
     assert before is not None and before.verdict == "healthy"
     fits.clear()
-    made, after = assessing._assess(readings(30, loss=1.2, after=19), machine(stage), before)
+    made, after = assessing._assess(readings(31, loss=0.2), machine(stage), before)
     assert made.health is not None and after is not None
     assert made.judgement.verdict == after.verdict == "preload"
     assert set(made.health.sampler) == {"emcee"}

@@ -181,8 +181,6 @@ def test_one_question_has_one_answer_wherever_it_is_read(done: Done) -> None:
         assert gauge.below_limit == shown["probability_below_limit"] == below
         assert prognosis.already_past()[j] == below
         assert float(remaining[gauge.name]["probability_already_past"]) == below
-        by_laws = next(one for one in summary.life.limits if one.parameter == gauge.name)
-        assert by_laws.health[1] == gauge.median
         # The curve of the life passes through it.
         at = np.searchsorted(prognosis.curve_travel, prognosis.travel)
         around = prognosis.curve_quantiles[2, at - 1 : at + 1, j]

@@ -332,6 +332,7 @@ def small_grid() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(constants, "WALK_STDS", (1e-5,))
         patch.setattr(constants, "WALK_PRIOR", (1.0,))
+        patch.setattr(constants, "LONE_WALKS", ((1e-5, 1.0),))
         patch.setattr(constants, "NOISE_SCALES", (1.0,))
         patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
         patch.setattr(constants, "DEVIATION_STDS", (0.0,))

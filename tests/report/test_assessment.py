@@ -141,19 +141,16 @@ def test_censored_and_negative_lives(make: Maker) -> None:
 
 
 def test_limits_in_other_units_are_shown_as_fractions(make: Maker) -> None:
-    """A parameter with a baseline of 5 kN has its health by the laws as a fraction of it."""
+    """A parameter with a baseline of 5 kN has its limit as a fraction of it."""
     assessment = make()
     prognosis, stage = assessment.prognosis, assessment.stage
     assert prognosis is not None
     preload, mount = stage.description.parameter
     in_newton = structs.replace(preload, baseline=5000.0, unit="N")
     described = structs.replace(stage.description, parameter=(in_newton, mount))
-    scaled = replace(
-        prognosis, limits=prognosis.limits * [5e3, 1, 1], health=prognosis.health * [5e3, 1]
-    )
+    scaled = replace(prognosis, limits=prognosis.limits * [5e3, 1, 1])
     one, other = (
         summarise_life(life, own).limits[0]
         for life, own in ((prognosis, stage), (scaled, replace(stage, description=described)))
     )
-    assert other.limit / other.baseline == pytest.approx(one.limit)
-    assert other.health == pytest.approx(one.health)
+    assert other.share == pytest.approx(one.share)

@@ -57,7 +57,7 @@ def summary(state: dict[str, Any]) -> Summary:
     own = dict(state)
     by, remaining = own.pop("service_by"), own.pop("remaining")
     health = [
-        ParameterHealth(name, True, True, 1.0, low, median, high, None, np.nan)
+        ParameterHealth(name, True, 1.0, low, median, high, None, np.nan)
         for name, (low, median, high) in own.pop("health").items()
     ]
     life = None

@@ -180,13 +180,6 @@ def test_health_marks_limit_and_baseline(ax: Axes, health: Health) -> None:
     assert high > 100
 
 
-def test_life_hides_undetermined_epochs(ax: Axes, history: History, prognosis: Prognosis) -> None:
-    """Epochs that are mostly prior are not drawn with the law."""
-    health = make_health(history, life(8000, 0.68)[1], (0.9, 0.1))
-    plots.plot_life(ax, prognosis, "mount_stiffness", health=health)
-    assert "epochs, 90 %" not in labels(ax)
-
-
 def test_undetermined_health_is_drawn_as_prior(ax: Axes, history: History) -> None:
     """An undetermined parameter is hatched and labelled as prior."""
     plots.plot_health(
@@ -196,10 +189,10 @@ def test_undetermined_health_is_drawn_as_prior(ax: Axes, history: History) -> No
     assert any(collection.get_hatch() for collection in ax.collections)
 
 
-def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis, health: Health) -> None:
+def test_life_shows_now_limit_and_horizon(ax: Axes, prognosis: Prognosis) -> None:
     """A horizon far behind the limit is named instead of squeezing the picture."""
-    plots.plot_life(ax, prognosis, "guide_preload", health=health)
-    assert {"now", "limit 60 %", "law", "epochs, 90 %", "limit reached"} <= set(labels(ax))
+    plots.plot_life(ax, prognosis, "guide_preload")
+    assert {"now", "limit 60 %", "law", "limit reached"} <= set(labels(ax))
     assert "horizon at 21 720 km" in plain(ax.get_xlabel())
     near = Figure().add_subplot()
     plots.plot_life(near, replace(prognosis, horizon=3e6), "mount_stiffness")

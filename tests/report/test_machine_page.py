@@ -539,7 +539,7 @@ def test_the_prior_of_the_fleet_is_on_the_page(make: Maker, tmp_path: Path) -> N
         "82 %; life 4 100 km (1 800 to 9 330)",
         "guide preload, no change 50 % 18 %",
         "above 99 %; 2 % per 1 000 km (−6.2 to 10 %)",
-        "random walk of ln frequency 0.44 % 0.05 %",
+        "random walk of ln frequency 0.16 % 0.05 %",
         "factor on reported errors 1.07 1.50",
         "deviation of health from its law 0.88 % 0.00 %",
     ):
