@@ -137,7 +137,8 @@ class _Exploration:
         They are drawn from with a few grid points first, which is enough to place their draws.
         """
         whole = self.grid
-        self.grid = whole[(whole.noise_scale == 1) & (whole.deviation == 0)]
+        least = (whole.noise_scale.min(), whole.deviation.min())
+        self.grid = whole[(whole.noise_scale == least[0]) & (whole.deviation == least[1])]
         self.add(anchors)
         kept = np.zeros(whole.walk.size, dtype=bool)
         for k in self.likely():

@@ -18,6 +18,7 @@ _KM = 1000.0
 # ln of ratios of lengths is cut here: a distant walker may ask for a length outside the range of
 # floats, where its prior is 0 anyway.
 _LARGEST_LN = 300
+_LEAST_BEND = 1e-8  # below which a bend is a straight line but for rounding
 _BISECTIONS = 50
 
 
@@ -298,43 +299,68 @@ class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind",
 
 
 class Free(Law, frozen=True, tag="free", tag_field="kind", kw_only=True):
-    """A change of either direction without a physical model: ln h(s) = a (s / s_now)^b.
+    """A smooth change of either direction without a physical model.
 
-    With a ~ N(0, `std`) and ln b ~ N(0, `exponent_sigma`): the change by now, whenever now is.
+    ln h(s) = a g(s / s_now) / g(1) with g(x) = (1 - exp(-c x^b)) / c: the change a by now, whenever
+    now is, by a power of the travel (c = 0), one that settles (c > 0) or accelerates (c < 0).
+    a ~ N(0, `std`²), ln b ~ N(0, `exponent_sigma`²), c ~ N(0, `bend_std`²).
     """
 
     std: Annotated[float, within(*constants.EFFECT)] = 0.15
     exponent_sigma: Annotated[float, within(*constants.SIGMA)] = 0.5
+    bend_std: Annotated[float, within(*constants.EFFECT)] = 2.0
     label: ClassVar[str] = "change of either direction without a law"
-    names: ClassVar[tuple[str, ...]] = ("per_power", "exponent")
+    names: ClassVar[tuple[str, ...]] = ("per_power", "exponent", "bend")
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
-        """Convert y1 = a / std and y2 = ln b / exponent_sigma to a / now^b and b."""
+        """Convert a / std, ln b / exponent_sigma and c / bend_std to factors r and k of s^b.
+
+        ln h = r s^b φ(k s^b) with φ(z) = (1 - exp(-z)) / z.
+        """
         exponent = np.exp(np.clip(self.exponent_sigma * y[:, 1], -_LARGEST_LN, _LARGEST_LN))
+        bend = self.bend_std * y[:, 2]
         with np.errstate(over="ignore", under="ignore"):
-            return np.column_stack([self.std * y[:, 0] / now**exponent, exponent])
+            scale = float(now) ** -exponent
+            per_power = self.std * y[:, 0] * scale / _settled(bend)
+        return np.column_stack([per_power, exponent, bend * scale])
 
     def log_prior(self, y: FloatArray, now: float) -> FloatArray:
         """Return the log prior density."""
-        return np.asarray(-0.5 * np.sum(y**2, axis=1) - np.log(2 * np.pi))
+        return np.asarray(-0.5 * np.sum(y**2, axis=1) - 1.5 * np.log(2 * np.pi))
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
-        return rng.standard_normal((n, 2))
+        return rng.standard_normal((n, 3))
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
         """Return the health, which may be above 1."""
+        per_power, exponent, bend = theta.T[:, :, None]
         with np.errstate(over="ignore", invalid="ignore"):
-            change = theta[:, :1] * np.maximum(travel, 0) ** theta[:, 1:]
-        return np.exp(np.minimum(change, _LARGEST_LN))
+            power = np.maximum(travel, 0) ** exponent
+            change = per_power * power * _settled(bend * power)
+        # Far beyond now the change has no bound; nor has what it was far from there.
+        change = np.where(np.isnan(change), -_LARGEST_LN, change)
+        return np.exp(np.clip(change, -_LARGEST_LN, _LARGEST_LN))
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
-        """Return the travel at the limit, inf without a loss."""
-        per_power, exponent = theta.T
-        loss, losing = np.log(np.minimum(limit, 1.0)), per_power < 0
-        with np.errstate(over="ignore"):
-            travel = (loss / np.where(losing, per_power, -1.0)) ** (1 / exponent)
-        return np.where(losing | (loss == 0), travel, np.inf)
+        """Return the travel at the limit, inf where the change settles above it."""
+        per_power, exponent, bend = theta.T
+        loss = np.log(np.minimum(limit, 1.0))
+        with np.errstate(over="ignore", divide="ignore", invalid="ignore"):
+            power = loss / np.where(per_power < 0, per_power, -1.0)
+            # -ln(1 - k q) / k, which is q for k = 0; NaN where it settles before.
+            curved = -np.log1p(-bend * power) / np.where(bend == 0, 1.0, bend)
+            power = np.where(np.abs(bend * power) < _LEAST_BEND, power, curved)
+            travel = power ** (1 / exponent)
+        reached = (per_power < 0) & ~np.isnan(travel)
+        return np.where(reached, travel, np.where(loss == 0, 0.0, np.inf))
+
+
+def _settled(z: FloatArray) -> FloatArray:
+    """Return (1 - exp(-z)) / z, 1 at 0."""
+    z = np.maximum(z, -_LARGEST_LN)
+    near = np.abs(z) < _LEAST_BEND
+    return np.where(near, 1 - z / 2, -np.expm1(-z) / np.where(near, 1.0, z))
 
 
 def _laws_of_other_packages(known: tuple[type[Law], ...]) -> tuple[type[Law], ...]:
