@@ -175,12 +175,12 @@ def test_modes_far_apart_have_their_share() -> None:
     """Independent proposals reach both of two far modes, by their integrals."""
 
     def two(x: FloatArray) -> FloatArray:
-        parts = [np.log(p) - 0.5 * np.sum(((x - c) / 0.05) ** 2, axis=1)
-                 for p, c in ((0.3, -4.0), (0.7, 4.0))]  # fmt: skip
+        parts = [np.log(p) - 0.5 * np.sum(((x - c) / 0.4) ** 2, axis=1)
+                 for p, c in ((0.3, -3.0), (0.7, 3.0))]  # fmt: skip
         return np.logaddexp(*parts)
 
-    side = np.random.default_rng(13).choice([-4.0, 4.0], size=(800, 1))
-    start = even(side + 0.1 * np.random.default_rng(14).standard_normal((800, 2)))
+    side = np.random.default_rng(13).choice([-3.0, 3.0], size=(800, 1))
+    start = even(side + 0.4 * np.random.default_rng(14).standard_normal((800, 2)))
     found = sample(two, start, stream(13))
     right = (found.flat[:, 0] > 0).astype(float)
     agree(right, 0.7, found.ess_bulk.min())

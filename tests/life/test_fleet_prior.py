@@ -208,7 +208,8 @@ def test_scatter_of_a_fleet_is_estimated(stage: Stage) -> None:
     history = lived(np.linspace(0.0, 2e6, 8), 4000.0)
     before, after = (LifeLikelihood.of(history, one).grid for one in (stage, updated))
     k = np.searchsorted(np.unique(before.walk), before.walk)
-    expected = np.log(np.array(priors.scatter.walk) / scatter_prior(stage).walk)[k]
+    walk = np.array(priors.scatter.walk) / np.sum(priors.scatter.walk)
+    expected = np.log(walk / scatter_prior(stage).walk)[k]
     np.testing.assert_allclose(after.log_weight - before.log_weight, expected, atol=1e-9)
 
 
