@@ -12,9 +12,8 @@ from unittest.mock import patch
 
 from click.testing import CliRunner
 
-from lmshealth.health import constants
-from lmshealth.health import ensemble_sampling as sampling
-from lmshealth.prognosis import constants as prognosis_constants
+from lmshealth.life import constants
+from lmshealth.life import ensemble_sampling as sampling
 from lmshealth.report import figures as plots
 from studies.harness.checkout import ROOT
 
@@ -26,8 +25,8 @@ _GROUPS = {"lmshealth": ("lmshealth.cli.main", "main"), "models": ("models.__mai
 def call(program: str, *arguments: object, quick: bool, some_refused: bool = False) -> str:
     """Call ``lmshealth`` or ``models``, and return what it prints; exit if it fails.
 
-    The quick call is in this process, which has imported everything already, with short chains of
-    health, lives by importance sampling alone, and no pictures: most of the time goes into these.
+    The quick call is in this process, which has imported everything already, with lives by
+    importance sampling alone, and no pictures: most of the time goes into these.
     """
     words = [str(word) for word in arguments]
     if quick:
@@ -62,8 +61,8 @@ def _insist(status: int, some_refused: bool, command: str, messages: str) -> Non
 
 @contextmanager
 def quick_posteriors() -> Iterator[None]:
-    """Sample health by short chains, and lives by importance sampling alone."""
-    with short_chains(), patch.object(prognosis_constants, "MIN_CHAIN_PROBABILITY", inf):
+    """Sample lives by importance sampling alone."""
+    with short_chains(), patch.object(constants, "MIN_CHAIN_PROBABILITY", inf):
         yield
 
 

@@ -22,8 +22,8 @@ from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
+from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.prognosis.results import Prognosis
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
@@ -98,10 +98,7 @@ def main() -> None:
 
 def compared(updated: Assessment, fresh: Assessment, short: Assessment) -> Row:
     """Compare the answers after a new log with those from nothing, and with another life's."""
-    own, other = updated.health, fresh.health
-    assert own is not None and other is not None
     return {
-        "epochs_equal": bool(np.array_equal(own.samples, other.samples)),
         "apart": apart(updated.prognosis, fresh.prognosis),
         "control_apart": apart(updated.prognosis, short.prognosis),
     }

@@ -12,11 +12,12 @@ import numpy as np
 
 from lmshealth import identify, read_log
 from lmshealth.errors import LmshealthError
-from lmshealth.health.inference import infer
-from lmshealth.health.verdict import degraded_below, doubt_of_names, judge, verdict_of
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
-from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.life.health import health_of
+from lmshealth.life.posterior import fit_life
+from lmshealth.life.remaining_life import prognosis_of
+from lmshealth.life.verdict import degraded_below, doubt_of_names, judge, verdict_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, accepted_estimates, track
@@ -102,20 +103,18 @@ def reported(kind: str, seed: int, is_drawn: bool, logs: int) -> Row:
         "known": all(_is_known(law) for law in (laws.preload, laws.mount)),
         "laws": [type(_inner(law)).__name__ for law in (laws.preload, laws.mount)],
     }
+    accepted = accepted_estimates(history, found)
     try:
-        health = infer(found, stage, [53, seed], epochs=[len(history.logs) - 1])
+        posterior = fit_life(accepted, stage, [53, seed], chains=False)
+        prognosis = prognosis_of(posterior, accepted, stage)
     except LmshealthError as why:
         return row | {"refused": str(why)}
-    row["epoch"] = _placed(health.samples[0], truth, rng)
+    health = health_of(posterior, accepted, stage, [len(history.logs) - 1])
     verdict = judge(stage, history, health, found)
     row |= {"verdict": verdict.verdict, "probability": _number(verdict.probability),
             "true_verdict": _true_verdict(stage, truth)}  # fmt: skip
-    try:
-        prognosis = prognose(accepted_estimates(history, found), stage, [54, seed], chains=False)
-    except LmshealthError as why:
-        return row | {"refused": str(why)}
     left, horizon = _left(plan, life), prognosis.horizon
-    row["now"] = _placed(prognosis.health, truth, rng)
+    row["now"] = _placed(health.samples[-1], truth, rng)
     row["left"] = _placed(prognosis.remaining, left, rng, horizon) | {
         "horizon_km": horizon / _KM, "km": [_number(km) for km in left / _KM],
     }  # fmt: skip
