@@ -95,15 +95,12 @@ class FleetPrior:
     def apply_to(self, stage: Stage) -> Stage:
         """Return the stage with this prior, and a digest of both."""
         known = {(law.parameter, law.kind): law for law in self.laws}
-        parameters = []
-        for parameter in stage.parameters:
-            laws = tuple(
-                _with_prior(law, known[parameter.name, law.kind]) for law in parameter.laws
-            )
-            parameters.append(msgspec.structs.replace(parameter, law=laws))
-        description = msgspec.structs.replace(stage.description, parameter=tuple(parameters))
+        laws = {
+            one.name: tuple(_with_prior(law, known[one.name, law.kind]) for law in one.laws)
+            for one in stage.parameters
+        }
         digest = fingerprint(stage.digest, self.laws, self.scatter)
-        return replace(stage, description=description, digest=digest, scatter=self.scatter)
+        return replace(stage.with_laws(laws), digest=digest, scatter=self.scatter)
 
 
 def machine_evidence(stage: Stage, life: LifePosterior) -> MachineEvidence:

@@ -21,7 +21,7 @@ from lmshealth.life.ensemble_sampling import rank_r_hat
 from lmshealth.life.likelihood import diagonal
 from lmshealth.life.posterior import LifePosterior, LoneMode, fit_life
 from lmshealth.stage.constants import INFORMED
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import ANY_CHANGE, Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.read_tables import Drifts
@@ -311,18 +311,23 @@ def infer_drifts(
     """Infer the health parameters from a table of drifts, each epoch from its own drifts alone.
 
     Drifts that a filter has made of the logs are not independent from epoch to epoch, so that they
-    are no data of a life. The prior is that of `infer` at the travel of the epoch. The last epoch
-    is drawn by emcee, the others by importance sampling.
+    are no data of a life. The prior is that of `infer` at the travel of the epoch; without an
+    odometer parameters may change by as much as their priors in the description allow. The last
+    epoch is drawn by emcee, the others by importance sampling.
 
     Raises
     ------
     BadStage
         If the description has no health parameter.
     NotEnoughData
-        If no mode of the map has a drift, or the odometer is missing.
+        If no mode of the map has a drift.
     """
     if not stage.parameters:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
+    if not np.isfinite(drifts.travel).all():
+        # Without an odometer the laws say nothing about how far they have come.
+        stage = stage.with_laws({one.name: ANY_CHANGE for one in stage.parameters})
+        drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
     histories = {k: _of_drifts(drifts, stage, k) for k in range(len(drifts.recorded_at))}
     usable = [k for k, one in histories.items() if one is not None]
     if not usable:

@@ -360,7 +360,7 @@ def _settled(z: FloatArray) -> FloatArray:
     """Return (1 - exp(-z)) / z, 1 at 0."""
     z = np.maximum(z, -_LARGEST_LN)
     near = np.abs(z) < _LEAST_BEND
-    return np.where(near, 1 - z / 2, -np.expm1(-z) / np.where(near, 1.0, z))
+    return np.asarray(np.where(near, 1 - z / 2, -np.expm1(-z) / np.where(near, 1.0, z)))
 
 
 def _laws_of_other_packages(known: tuple[type[Law], ...]) -> tuple[type[Law], ...]:

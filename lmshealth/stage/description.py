@@ -2,17 +2,17 @@
 
 import hashlib
 import os
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from datetime import date
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, structs
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import escapes, read_table
@@ -23,11 +23,14 @@ from lmshealth.io.log import MOMENTS, Metadata
 from lmshealth.io.metadata import INVISIBLE
 from lmshealth.io.refusal import repeated
 from lmshealth.stage import constants
-from lmshealth.stage.degradation_laws import AnyLaw, Unchanging
+from lmshealth.stage.degradation_laws import AnyLaw, Free, Unchanging
 from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
 _SHIPPED = Path(__file__).parent / "descriptions"
+ANY_CHANGE: tuple[AnyLaw, ...] = (Unchanging(), Free())
+"""Laws of a parameter whose description states none."""
+_ONE_SIGMA = (0.1587, 0.8413)  # levels of a normal distribution one standard deviation about
 Value = Annotated[float, within(*constants.VALUE)]
 Frequency = Annotated[float, within(*constants.FREQUENCY_HZ)]
 Component = Annotated[float, within(-constants.COMPONENT, constants.COMPONENT)]
@@ -99,8 +102,9 @@ class Limit(_Part, frozen=True):
 class ParameterSpec(_Part, frozen=True):
     """A health parameter to infer.
 
-    ``law`` may list several laws, of which the parameter follows one. ``verdict`` overrides the
-    word by which verdict.csv names its loss.
+    ``law`` may list several laws, of which the parameter follows one; without it the parameter
+    keeps its value or changes without a law, by as much as its prior allows. ``verdict`` overrides
+    the word by which verdict.csv names its loss.
     """
 
     name: Annotated[Name, Meta(examples=["guide_preload"])]
@@ -108,7 +112,7 @@ class ParameterSpec(_Part, frozen=True):
     baseline: Value = 1.0
     unit: Name = ""
     limit: Annotated[Limit | None, Meta(examples=[{"below": 0.6}])] = None
-    law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = Unchanging()
+    law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = ANY_CHANGE
     verdict: Name = ""
 
     def __post_init__(self) -> None:
@@ -127,7 +131,11 @@ class ParameterSpec(_Part, frozen=True):
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
         """Candidate laws, at least one."""
-        return self.law if isinstance(self.law, tuple) else (self.law,)
+        if self.law != ANY_CHANGE:
+            return self.law if isinstance(self.law, tuple) else (self.law,)
+        low, high = self.prior.quantile(np.array(_ONE_SIGMA)).tolist()
+        std = float(np.log(high / low) / 2) if low > 0 else Free().std
+        return Unchanging(), Free(std=std)
 
     @property
     def word(self) -> str:
@@ -339,6 +347,14 @@ class Stage:
             return metadata.description in (self.name, f"{self.name}.toml")
         pattern = self.description.match.stage
         return metadata.stage is not None and fnmatchcase(metadata.stage, pattern)
+
+    def with_laws(self, laws: Mapping[str, tuple[AnyLaw, ...]]) -> Self:
+        """Return the stage with other laws of some parameters, by name; its digest stays."""
+        parameters = tuple(
+            structs.replace(one, law=laws.get(one.name, one.law)) for one in self.parameters
+        )
+        description = structs.replace(self.description, parameter=parameters)
+        return replace(self, description=description)
 
     def drift(self, x: FloatArray, modes: tuple[str, ...]) -> FloatArray:
         """Predict the drift of ln f of modes on the map since the baseline.

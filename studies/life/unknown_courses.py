@@ -28,11 +28,11 @@ from unittest.mock import patch
 
 import msgspec
 import numpy as np
-
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.maintenance_decision import decide
 from lmshealth.prognosis.remaining_life import prognose
 from lmshealth.prognosis.results import Prognosis
+
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
 from studies.harness.claims import Claim, counted, number

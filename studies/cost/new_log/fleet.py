@@ -33,8 +33,8 @@ from lmshealth import load_stage
 from lmshealth._private.seeds import seed_of
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
-from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.life.remaining_life import prognose
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.track import accepted_estimates

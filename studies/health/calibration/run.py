@@ -25,13 +25,13 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-
-from lmshealth._private.seeds import stream
-from lmshealth.errors import NotConverged
 from lmshealth.health.epoch_posterior import EpochPosterior
 from lmshealth.health.importance_sampling import importance_sample_to_ess
 from lmshealth.health.inference import draw as draw_chains
 from lmshealth.health.inference import infer
+
+from lmshealth._private.seeds import stream
+from lmshealth.errors import NotConverged
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
 from studies.harness.ranks import N_DRAWS, Array, judge, rank, thinned, uniform

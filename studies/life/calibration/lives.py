@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
-
 from lmshealth.prognosis import constants
 from lmshealth.prognosis.remaining_life import early_life, rate_std
+from numpy.typing import NDArray
+
 from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD

@@ -34,11 +34,11 @@ from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
-
 from lmshealth.prognosis import constants, remaining_life
 from lmshealth.prognosis.fleet_prior import ended_lives
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import prognose
+
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.claims import Claim, counted, number

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
-
 from lmshealth.prognosis import constants
 from lmshealth.prognosis import life_likelihood as model
+from numpy.typing import NDArray
+
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.stage.priors import Lognormal

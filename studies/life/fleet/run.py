@@ -24,9 +24,6 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy.stats import sem
-
 from lmshealth.prognosis.fleet_prior import (
     FleetPrior,
     MachineEvidence,
@@ -36,6 +33,9 @@ from lmshealth.prognosis.fleet_prior import (
 )
 from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
 from lmshealth.prognosis.remaining_life import passages
+from numpy.typing import NDArray
+from scipy.stats import sem
+
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior

@@ -9,11 +9,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pandas as pd
-
-from lmshealth.errors import LmshealthError
 from lmshealth.health.inference import infer
 from lmshealth.health.verdict import doubt_of_names, judge
 from lmshealth.prognosis.remaining_life import prognose
+
+from lmshealth.errors import LmshealthError
 from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.constants import RUL_LEVELS
 from lmshealth.stage.description import Stage, load_stage

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+from lmshealth.health.verdict import degraded_below
 from numpy.typing import NDArray
 from scipy.stats import bernoulli
 
-from lmshealth.health.verdict import degraded_below
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named

@@ -26,9 +26,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from lmshealth.health.verdict import degraded_below, verdict_of
 
 from lmshealth import LogEstimates, build_history, identify, read_log
-from lmshealth.health.verdict import degraded_below, verdict_of
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.signal.following_error import loop_error
