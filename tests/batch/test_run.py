@@ -24,6 +24,7 @@ import h5py
 import numpy as np
 import pytest
 from click.testing import CliRunner
+from msgspec import structs
 from sqlalchemy import text
 
 from lmshealth import examples
@@ -52,7 +53,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import log_tables, machine_tables
-from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
@@ -965,7 +966,10 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     make: Maker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Oracle: the life fitted from nothing under the prior; no chains are run for the update."""
+    # Without a free change, the laws decide whose paces the prior is of.
     stage = load_stage("lms-y")
+    described = structs.replace(stage.description, life=LifeSpec(free=0.0))
+    stage = replace(stage, description=described)
     young = examples.history().first_logs(15)
     moments = [datetime.fromisoformat(when.isoformat()) for when in young.recorded_at]
     young = replace(young, recorded_at=tuple(moments))

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lmshealth.life.ensemble_sampling import start_from_prior
-from lmshealth.life.likelihood import LifeLikelihood, ln_health
-from lmshealth.life.posterior import LifeDensity
+from lmshealth.life.density import LifeDensity
+from lmshealth.life.importance_sampling import importance_sample_to_ess
+from lmshealth.life.likelihood import NO_MODE, LifeLikelihood, ln_health
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import make_history
@@ -86,16 +85,20 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     # Both parts lose: of all scenarios the one with the most to draw.
     scenario = max(likelihood.data.scenarios, key=lambda one: one.n_dim)
     density = LifeDensity(likelihood, scenario, likelihood.grid)
-    begin = start_from_prior(density.log_probability, scenario.draw)
-    y = np.concatenate([begin(np.random.default_rng(k)) for k in range(8)])[:walkers]
-    density = density.narrowed(y)
-    grid = density.grid
-    # A filter with health as given knows of no deviation from it.
-    value = np.where(grid.deviation == 0, grid.log_weight - 0.5 * grid.rest, -np.inf)
-    density = replace(density, grid=grid[np.arange(grid.walk.size) == np.argmax(value)])
-    walk, scale = float(density.grid.walk[0]), float(density.grid.noise_scale[0])
-    prior = scenario.log_prior(y)
-    model_std = float(density.grid.map_std[0])
+    rng = np.random.default_rng(0)
+    start = scenario.draw(rng, 600)
+    draws = importance_sample_to_ess(density.log_probability, start, rng, 2000, 100.0)
+    y, grid = draws.resampled(rng, walkers), density.grid
+    # A filter with health as given knows of no deviation from it, and of no mode that moves alone.
+    known = (grid.deviation == 0) & (grid.lone == NO_MODE)
+    value = np.where(known, grid.log_weight - 0.5 * grid.rest, -np.inf)
+    point = grid[np.arange(grid.walk.size) == np.argmax(value)]
+    walk, scale = float(point.walk[0]), float(point.noise_scale[0])
+    model_std = stage.map_errors[0][0]
+
+    def terms() -> Array:
+        x, _ = likelihood.path(scenario, y)
+        return likelihood.terms(point, x)[0, 0]
 
     def loop() -> Array:
         x, _ = ln_health(stage, scenario, y[:looped], history.clock())
@@ -103,4 +106,4 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
         setting = {"walk": walk, "scale": scale, "model_std": model_std}
         return np.array([by_filterpy(history, flat[0], flat[1:], **setting) for flat in flats])
 
-    return Walkers(lambda: density.log_probability(y) - prior, loop, y.shape[0], looped)
+    return Walkers(terms, loop, y.shape[0], looped)
