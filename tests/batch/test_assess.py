@@ -22,7 +22,7 @@ from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage,
 
 @pytest.fixture
 def stage(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Stage:
-    """A preload that fades, by few points of the grid."""
+    """Make a preload that fades, and few points of the grid."""
     monkeypatch.setattr(constants, "WALK_STDS", (1e-4,))
     monkeypatch.setattr(constants, "WALK_PRIOR", (1.0,))
     monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0,))

@@ -1,4 +1,4 @@
-"""Two ways to draw one scenario of a life: ours, and a plain loop of emcee over the same density."""
+"""Two ways to draw a scenario of a life: ours, and a plain loop of emcee over its density."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class Target(NamedTuple):
 
 
 def target(history: History, stage: Stage) -> Target:
-    """Make the density of the scenario of a life with the most coordinates."""
+    """Make the density of the first scenario of a life, by the laws that it follows."""
     likelihood, rng = LifeLikelihood.of(history, stage), np.random.default_rng(0)
-    scenario = max(likelihood.data.scenarios, key=lambda one: one.n_dim)
+    scenario = likelihood.data.scenarios[0]
     density = LifeDensity(likelihood, scenario, likelihood.grid)
     start = scenario.draw(rng, 600)
     draws = importance_sample_to_ess(density.log_probability, start, rng, 2000, 100.0)

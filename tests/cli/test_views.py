@@ -23,9 +23,9 @@ from lmshealth.cli.views import (
     print_summaries,
     print_track,
 )
-from lmshealth.modal.naming import Difference
 from lmshealth.life.maintenance_decision import decide, probability_before
 from lmshealth.life.prognosis import LawWeight, Prognosis
+from lmshealth.modal.naming import Difference
 from lmshealth.report.assessment import Assessment, summarise, summarise_life
 from lmshealth.report.fleet_page import by_urgency
 from lmshealth.report.tables import prognosis_rows, stage_rows

@@ -21,6 +21,8 @@ from lmshealth.life.posterior import LifePosterior, fit_life
 from lmshealth.life.remaining_life import prognosis_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
+from lmshealth.tracking.read_tables import Drifts
+from lmshealth.tracking.track import Track
 from tests.lives import (
     AXES,
     FADING,
@@ -64,7 +66,7 @@ def stage(small_grid: None, tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 @pytest.fixture(scope="module")
 def fading(small_grid: None, tmp_path_factory: pytest.TempPathFactory) -> Stage:
-    """A preload that fades or gains, by an exact map."""
+    """Make a preload that fades or gains, with an exact map."""
     folder = tmp_path_factory.mktemp("fading")
     return make_stage(folder, (FADING,), model_std=0.0, tail=LAWS_ALONE)
 
@@ -94,11 +96,17 @@ def health(stage: Stage, history: History) -> Health:
     return infer(history, stage, 5, chains=False)
 
 
-def table(drifts: list[FloatArray], cov: FloatArray = COV):
+def read(track: Track) -> Drifts:
+    """Read the drifts of a track."""
+    values = track.travel, track.modes, track.drift, track.drift_cov
+    return Drifts(track.stage, track.recorded_at, *values)
+
+
+def table(drifts: list[FloatArray], cov: FloatArray = COV) -> Drifts:
     """Make a table of a baseline and the given drifts, at even distances up to 1,000 km."""
     m = cov.shape[0]
     drift = np.vstack([np.zeros(m), *drifts])
-    return make_track(drift, np.stack([np.zeros((m, m)), *[cov] * len(drifts)]))
+    return read(make_track(drift, np.stack([np.zeros((m, m)), *[cov] * len(drifts)])))
 
 
 def single_grid(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -142,9 +150,7 @@ def test_past_epochs_are_of_the_same_draws(
 
 def test_health_holds_the_truth_at_every_epoch(health: Health) -> None:
     """Truth of preload and mount lie in the central 99 % of draws, and of most in 50 %."""
-    truth = np.column_stack(
-        [(1 - TRAVEL / 8e6) ** 1.5, 0.8 + 0.2 * np.exp(-TRAVEL / 1.5e6)]
-    )[1:]
+    truth = np.column_stack([(1 - TRAVEL / 8e6) ** 1.5, 0.8 + 0.2 * np.exp(-TRAVEL / 1.5e6)])[1:]
     low, high = health.quantile(np.array([0.005, 0.995]))
     assert ((low < truth) & (truth < high)).all()
     assert (health.informed[-1] > 0.5).all()
@@ -181,7 +187,7 @@ def test_the_seed_alone_decides(history: History, stage: Stage, health: Health) 
 def test_chains_are_judged_by_importance_sampling(
     history: History, stage: Stage, health: Health
 ) -> None:
-    """emcee has the health of importance sampling, and how far both differ is in the result."""
+    """Emcee has the health of importance sampling, and how far both differ is in the result."""
     found = infer(history, stage, 5)
     assert found.sampler == ("emcee",) * 11
     assert (found.r_hat < constants.MAX_R_HAT).all()
@@ -251,7 +257,7 @@ def test_an_epoch_of_drifts_is_that_of_a_grid(
 ) -> None:
     """Quantiles of health by one table of drifts have the right probability on a 1-D grid."""
     single_grid(monkeypatch)
-    drift = true_drift(("guide_preload",), np.log([0.75]))[:2] + [5e-4, -5e-4]
+    drift = true_drift(("guide_preload",), np.log([0.75]))[:2] + np.array([5e-4, -5e-4])
     cov = 9 * COV
     found = infer_drifts(table([drift / 3, drift], cov), fading, 5)
     travel_km = found.travel[-1] / 1000
@@ -298,7 +304,7 @@ def test_a_mode_that_is_missing_at_an_epoch_is_done_without(tmp_path: Path) -> N
     drift[1, 1], cov[1, 1], cov[1, :, 1] = np.nan, np.nan, np.nan
     drift[2], cov[2] = np.nan, np.nan
     track = make_track(drift, cov)
-    found = infer_drifts(track, stage, 3)
+    found = infer_drifts(read(track), stage, 3)
     assert found.recorded_at == (track.recorded_at[1], track.recorded_at[3])
     assert found.identifiable.tolist() == [[False, True], [True, True]]
     assert (found.informed[0] < found.informed[1]).all()
@@ -311,7 +317,7 @@ def test_drifts_that_are_not_enough_are_refused(stage: Stage, tmp_path: Path) ->
     with pytest.raises(BadStage, match=r"no \[\[parameter\]\]"):
         infer_drifts(table([drift]), make_stage(tmp_path, ()), 1)
     with pytest.raises(NotEnoughData, match=r"roll.*pitch"):
-        infer_drifts(make_track(np.zeros((3, 0)), np.zeros((3, 0, 0))), stage, 1)
+        infer_drifts(read(make_track(np.zeros((3, 0)), np.zeros((3, 0, 0)))), stage, 1)
     with pytest.raises(NotEnoughData, match="no epoch has a drift of any"):
         infer_drifts(table([]), stage, 1)
     bare = replace(table([drift]), travel=np.full(2, np.nan))
@@ -424,9 +430,7 @@ def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
 DAYS = '[life]\nfree = 0\nlone_mode = 0\nclock = "days"\n'
 
 
-def test_a_machine_without_an_odometer_has_a_life_by_days(
-    tmp_path: Path, history: History
-) -> None:
+def test_a_machine_without_an_odometer_has_a_life_by_days(tmp_path: Path, history: History) -> None:
     """Twelve weekly logs at 32.5 km a day have the life of an odometer that says so."""
     per_day = 2500 / 77
     usage = f"[usage]\nkm_per_day = {per_day}\n"
@@ -435,11 +439,14 @@ def test_a_machine_without_an_odometer_has_a_life_by_days(
     bare = replace(history, travel=np.full(12, np.nan))
     with pytest.raises(NotEnoughData, match=r'odometer.*clock = "days"'):
         infer(bare, by_odometer, 1, chains=False)
-    timed, known = infer(bare, by_days, 1, chains=False), infer(history, by_odometer, 1, chains=False)
+    timed, known = (
+        infer(bare, by_days, 1, chains=False),
+        infer(history, by_odometer, 1, chains=False),
+    )
     np.testing.assert_allclose(timed.samples, known.samples, rtol=1e-5)
     prognosis = prognosis_of(fit_life(bare, by_days, 1, chains=False), bare, by_days)
     np.testing.assert_array_equal(prognosis.health, timed.samples[-1])
-    assert (prognosis.usage == pytest.approx(per_day * 1000))
+    assert prognosis.usage == pytest.approx(per_day * 1000)
     assert np.isfinite(prognosis.remaining).any()
 
 

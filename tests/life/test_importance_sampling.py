@@ -221,7 +221,7 @@ def test_draws_of_a_proposal_follow_its_density(n_dim: int) -> None:
     """A Gaussian integrated by the proposal's draws is 1, as with the generator of emcee."""
     own = proposal(n_dim)
     book = stats.multivariate_normal(own.mean, 1.3 * own.factor @ own.factor.T)
-    for rng in (np.random.default_rng(2), np.random.RandomState(3)):  # noqa: NPY002
+    for rng in (np.random.default_rng(2), np.random.RandomState(3)):
         x = own.draw(rng, 20_000)
         ratio = np.exp(np.reshape(book.logpdf(x), -1) - own.log_density(x))
         error = ratio.std() / np.sqrt(20_000)

@@ -109,7 +109,7 @@ def healths(scenario: Scenario, y: FloatArray, clock: FloatArray) -> FloatArray:
 
 
 def believed(model_std: float) -> LifeBelief:
-    """What is believed of a life, with one relative error of the map."""
+    """State what is believed of a life, with one relative error of the map."""
     slopes = np.array([SENSITIVITY[name][:2] for name in NAMES])
     return LifeBelief(slopes=slopes, model_std=model_std, intercept_std=constants.INTERCEPT_STD)
 

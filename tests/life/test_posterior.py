@@ -14,7 +14,7 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.life import constants, posterior
+from lmshealth.life import constants, exploration, posterior
 from lmshealth.life.density import LifeDensity
 from lmshealth.life.ensemble_sampling import Sample
 from lmshealth.life.importance_sampling import importance_sample_to_ess
@@ -229,7 +229,7 @@ def test_the_update_of_a_life_without_wear_is_accepted(
     probable = {way.scenario.n_dim: way.probability for way in one.scenarios}
     assert probable[0] > constants.MIN_CHAIN_PROBABILITY
     starts = []
-    explore = posterior.explore
+    explore = exploration.explore
 
     def counting(*arguments, **options):
         starts.append(arguments[2:])
@@ -605,7 +605,7 @@ def test_a_mode_that_moves_alone_is_found_with_its_drift(alone: Stage) -> None:
 @pytest.mark.slow
 def test_the_probability_of_fit_is_uniform_on_lives_of_the_model(alone: Stage) -> None:
     """Of forty drawn lives p is not far from uniform; of doubled noise all are small."""
-    rng, p, p_wrong = np.random.default_rng(4), [], []
+    rng, p, p_wrong = np.random.default_rng(4), list[float](), list[float]()
     slopes = np.array([SENSITIVITY[name] for name in NAMES])
     for k in range(40):
         rate = rng.uniform(-0.3, 0.5) / TRAVEL[-1]

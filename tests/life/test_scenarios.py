@@ -127,7 +127,9 @@ def test_jumps_act_from_their_step_on(law: AnyLaw) -> None:
     assert np.ptp(first) > 0.1
 
 
-@pytest.mark.parametrize("law", [*LAWS[:3], FREE], ids=["hertz-wear", "loosening", "linear", "free"])
+@pytest.mark.parametrize(
+    "law", [*LAWS[:3], FREE], ids=["hertz-wear", "loosening", "linear", "free"]
+)
 def test_a_restarted_law_is_1_until_then(law: AnyLaw) -> None:
     """Up to where it begins only jumps act; from there it is the law of the travel since."""
     path, k = DegradationPath(law, 1.2e6, STEPS), len(law.names)

@@ -205,7 +205,7 @@ def test_a_declared_or_past_step_is_not_the_verdict(stage: Stage) -> None:
 def test_too_little_data_has_no_verdict(
     stage: Stage, n_logs: int, options: dict, needle: str
 ) -> None:
-    """Few logs, no life that explains them or no information: not-enough-data, without a probability."""
+    """Few logs, no life that explains them, no information: no verdict and no probability."""
     found = judge(stage, logs(n_logs), make_health(around(0.5, 0.5), **options))
     assert found.verdict == "not-enough-data"
     assert np.isnan(found.probability)

@@ -98,7 +98,9 @@ def test_gauges_and_limits_are_of_the_same_draws(make: Maker) -> None:
     """A gauge shows the last epoch alone, whatever the laws of the prognosis are."""
     assessment = make()
     assert assessment.health is not None
-    low = replace(assessment, health=replace(assessment.health, chains=assessment.health.chains / 2))
+    low = replace(
+        assessment, health=replace(assessment.health, chains=assessment.health.chains / 2)
+    )
     gauge, other = summary(assessment).health[0], summary(low).health[0]
     np.testing.assert_allclose(
         (other.low, other.median, other.high), np.divide((gauge.low, gauge.median, gauge.high), 2)

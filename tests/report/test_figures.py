@@ -18,9 +18,9 @@ from matplotlib.figure import Figure
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life.health import Health
-from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.life.maintenance_decision import decide
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import figures as plots
 from lmshealth.report.text import plain
 from lmshealth.stage.description import Decision

@@ -12,12 +12,12 @@ import pandas as pd
 import pytest
 
 from lmshealth._private.tables import RUN_TABLES, TABLES, Row
-from lmshealth.life.verdict import Verdict
 from lmshealth.io.log import Metadata, Refusal
-from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.modes import Modes
 from lmshealth.life.maintenance_decision import decide, probability_before
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.life.verdict import Verdict
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.modes import Modes
 from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.tables import (
     csv_text,

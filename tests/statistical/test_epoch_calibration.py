@@ -10,19 +10,19 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
+from lmshealth.health.epoch_posterior import EpochPosterior
+from lmshealth.life.inference import draw, infer_together
 from scipy import stats
+from studies.health.one_guide import SHARED, drifts_of
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.seeds import stream
-from lmshealth.health.epoch_posterior import EpochPosterior
-from lmshealth.life.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.data.histories import map_std
 from studies.harness.metrics import place
 from studies.health.calibration.lives import assuming
 from studies.health.calibration.lives import draw as draw_track
 from studies.health.calibration.run import ranks_of
-from studies.health.one_guide import SHARED, drifts_of
 from tests.claims import Claims
 from tests.lives import AXES, MODES, make_stage, true_drift
 from tests.oracles import cdf_at
