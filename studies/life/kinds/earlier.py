@@ -24,7 +24,8 @@ class Earlier:
     """The program ``answers.py`` on the code of an earlier revision."""
 
     def __init__(self) -> None:
-        self._stack, self._process = ExitStack(), None
+        self._stack = ExitStack()
+        self._process: subprocess.Popen[str] | None = None
 
     def __enter__(self) -> Self:
         return self
@@ -34,20 +35,28 @@ class Earlier:
 
     def answer(self, kind: str, number: int, how: str) -> Any:
         """Answer a life as `answers.answer` does."""
-        if self._process is None:
-            folder = Path(self._stack.enter_context(TemporaryDirectory())) / "code"
-            code = self._stack.enter_context(checkout(REVISION, folder))
-            self._process = self._stack.enter_context(
-                subprocess.Popen(
-                    [sys.executable, PROGRAM],
-                    env=os.environ | {"PYTHONPATH": str(code)},
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    text=True,
-                )
-            )
-            self._stack.callback(self._process.stdin.close)
-        request = {"logs": life_of(kind, number).logs(), "map_table": map_table(),
-                   "seed": number, "how": how}  # fmt: skip
+        self._process = self._process or self._started()
+        assert self._process.stdin and self._process.stdout
+        request = {
+            "logs": life_of(kind, number).logs(),
+            "map_table": map_table(),
+            "seed": number,
+            "how": how,
+        }
         print(json.dumps(request), file=self._process.stdin, flush=True)
         return json.loads(self._process.stdout.readline())
+
+    def _started(self) -> subprocess.Popen[str]:
+        folder = Path(self._stack.enter_context(TemporaryDirectory())) / "code"
+        code = self._stack.enter_context(checkout(REVISION, folder))
+        environment = os.environ | {"PYTHONPATH": str(code)}
+        # At the end its input is closed, which ends it.
+        return self._stack.enter_context(
+            subprocess.Popen(
+                [sys.executable, PROGRAM],
+                env=environment,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                text=True,
+            )
+        )

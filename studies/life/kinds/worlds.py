@@ -115,7 +115,9 @@ class Life:
         lost = self.size * self.course[-1] / (1 - np.array(list(LIMITS.values())))
         if np.any(np.abs(lost - DEGRADED) < NEAR):
             return ()
-        words = [word for word, own in zip(("preload", "mount"), lost, strict=True) if own > DEGRADED]
+        words = [
+            word for word, own in zip(("preload", "mount"), lost, strict=True) if own > DEGRADED
+        ]
         verdict = "both" if len(words) == 2 else "".join(words) or "healthy"
         return (verdict, "step") if self.world.jumps else (verdict,)
 
@@ -143,18 +145,9 @@ def course(rng: np.random.Generator, kind: str) -> Course:
     if kind == "loosening":
         length = rng.uniform(0.3, 1.2)
         return lambda u: np.expm1(-u / length) / np.expm1(-1 / length)
-    if kind == "power":
-        n = rng.choice([rng.uniform(0.6, 0.8), rng.uniform(1.4, 2.0)])
-        return lambda u: u**n
     if kind == "exponential":
         rate = rng.uniform(0.7, 2.5)
         return lambda u: np.expm1(rate * u) / np.expm1(rate)
-    if kind == "late":
-        slow, n = rng.uniform(0.1, 0.3), rng.uniform(5, 9)
-        return lambda u: slow * u + (1 - slow) * u**n
-    if kind == "bathtub":
-        early, even, n = *rng.uniform(0.05, 0.125, 2), rng.uniform(7, 11)
-        return lambda u: early * -np.expm1(-u / 0.03) + even * u + (1 - early - even) * u**n
     if kind == "onset":
         onset = rng.uniform(0.15, 0.6)
         return lambda u: np.maximum(u - onset, 0.0) / (1 - onset)
@@ -163,15 +156,29 @@ def course(rng: np.random.Generator, kind: str) -> Course:
         sizes = rng.dirichlet(np.full(at.size, 3.0))
         return lambda u: (u[..., None] >= at) @ sizes
     if kind == "jump":
-        # The sudden loss is between a third and four fifths of the logs of a life seen to 70 %.
-        at, size = rng.uniform(0.2, 0.4), rng.uniform(0.25, 0.4)
-        return lambda u: (1 - size) * u + size * (u >= at)
+        # Seen by a fifth of the logs at the least.
+        begin, size = rng.uniform(0.2, 0.4), rng.uniform(0.25, 0.4)
+        return lambda u: (1 - size) * u + size * (u >= begin)
     if kind == "relubrication":
-        at, parts = np.sort(rng.uniform(0.15, 0.6, 2)), rng.uniform(0.1, 0.3, 2)
-        back = parts * [at[0], at[1] - parts[0] * at[0]]
+        times, parts = np.sort(rng.uniform(0.15, 0.6, 2)), rng.uniform(0.1, 0.3, 2)
+        back = parts * [times[0], times[1] - parts[0] * times[0]]
         # Each takes back a part of what is lost, over 4 % of the life.
-        return lambda u: (u - np.clip((u[..., None] - at) / 0.04, 0, 1) @ back) / (1 - back.sum())
-    return lambda u: u
+        return lambda u: (
+            (u - np.clip((u[..., None] - times) / 0.04, 0, 1) @ back) / (1 - back.sum())
+        )
+    return _sum_of_powers(rng, kind)
+
+
+def _sum_of_powers(rng: np.random.Generator, kind: str) -> Course:
+    """Draw a running-in, an even loss, and the rest by a power of the travel."""
+    early, even, n = 0.0, 1.0, 1.0
+    if kind == "power":
+        even, n = 0.0, rng.choice([rng.uniform(0.6, 0.8), rng.uniform(1.4, 2.0)])
+    elif kind == "late":
+        even, n = rng.uniform(0.1, 0.3), rng.uniform(5, 9)
+    elif kind == "bathtub":
+        early, even, n = *rng.uniform(0.05, 0.125, 2), rng.uniform(7, 11)
+    return lambda u: early * -np.expm1(-u / 0.03) + even * u + (1 - early - even) * u**n
 
 
 def life_of(name: str, number: int) -> Life:
@@ -220,7 +227,9 @@ def _losses(rng: np.random.Generator, world: World, u: Array) -> tuple[Array, Ar
     size, lost, slower = np.zeros(2), np.zeros((N_LOGS, 2)), np.ones(2)
     if world.preload and world.mount:
         slower[rng.integers(2)] = rng.uniform(1.0, 1.6)
-    for j, (parameter, kind) in enumerate(zip(PARAMETERS, (world.preload, world.mount), strict=True)):
+    for j, (parameter, kind) in enumerate(
+        zip(PARAMETERS, (world.preload, world.mount), strict=True)
+    ):
         if kind == "settling":
             size[j], lost[:, j] = -rng.uniform(0.08, 0.2), -np.expm1(-u / rng.uniform(0.15, 0.5))
         elif kind:
