@@ -36,8 +36,8 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     """Digest the code that a work depends on.
 
     This is the function and what it needs of its own module, every module of the project that is
-    imported for it, directly or not, all tables and descriptions of their packages, and the versions
-    of libraries. Comments, docstrings and layout do not count.
+    imported for it, directly or not, all tables and descriptions of their packages, and the
+    versions of libraries. Comments, docstrings and layout do not count.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 

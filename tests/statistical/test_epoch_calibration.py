@@ -1,8 +1,7 @@
 """Calibration of health at one epoch on truths drawn from the stated priors.
 
-The model is checked on grids, without the sampler; the chains are held to the grids on some truths.
-The shipped descriptions are checked by the covariances of real tracks and independent draws, and a
-guide that two machines share by chains.
+The model is checked on grids, without the sampler; the chains are held to the grids on some truths,
+and a guide that two machines share is checked by chains.
 """
 
 from __future__ import annotations
@@ -19,9 +18,6 @@ from lmshealth.health.inference import draw, infer_together
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.data.histories import map_std
 from studies.harness.metrics import place
-from studies.health.calibration.lives import assuming
-from studies.health.calibration.lives import draw as draw_track
-from studies.health.calibration.run import ranks_of
 from studies.health.one_guide import SHARED, drifts_of
 from tests.claims import Claims
 from tests.lives import AXES, MODES, make_stage, true_drift
@@ -93,25 +89,6 @@ def test_chains_are_as_calibrated_as_grids(
     right, wrong = (np.abs(own).ravel() for own in np.moveaxis(np.array(errors), 1, 0))
     claims.claim("chains", all_of(2 * stats.norm.sf(right)))
     claims.control("chains", all_of(2 * stats.norm.sf(wrong)))
-
-
-def test_ranks_at_epochs_of_tracks_are_uniform(rng: np.random.Generator, claims: Claims) -> None:
-    """Of both stages, with the covariances of real tracks, the true parameters are one more draw.
-
-    Control: on other lives a map is taken for exact that is wrong by 5 %.
-    """
-    for name in ("lms-x", "lms-y"):
-        stage = load_stage(name)
-        for n, assumed, state in (
-            (claims.trials, stage, claims.claim),
-            (claims.part.control, assuming(stage, 0.0), claims.control),
-        ):
-            lives = [draw_track(rng, stage, 1) for _ in range(n)]
-            ranks = np.array(
-                [ranks_of(one, assumed, rng, [k])[0][0] for k, one in enumerate(lives)]
-            )
-            for own, parameter in zip(ranks.T, ("preload", "mount"), strict=True):
-                state(f"{parameter}, {name}", uniform(own))
 
 
 def test_the_fit_is_seldom_improbable(
