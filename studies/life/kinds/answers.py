@@ -90,7 +90,6 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
         "probability": _number(judged.probability),
         "why": judged.why,
         "health": {},
-        "health_by_life": {},
         "left_km": None,
         "service": [service.kind, _number(service.wait)],
     }
@@ -100,9 +99,6 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
             draws = made.health.samples[-1][:, j]
             found["health"][made.health.parameters[j]] = _quantiles(np.log(draws))
     if made.prognosis is not None:
-        names = made.prognosis.parameters[: made.prognosis.health.shape[1]]
-        for j, name in enumerate(names):
-            found["health_by_life"][name] = _quantiles(np.log(made.prognosis.health[:, j]))
         km = np.minimum(made.prognosis.remaining[:, -1] / _KM, _NEVER_KM)
         found["left_km"] = _quantiles(km)
     return found | {"cpu_s": round(time.process_time() - start, 2)}

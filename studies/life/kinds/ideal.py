@@ -9,12 +9,16 @@ bound that a posterior without this knowledge is compared with.
 from __future__ import annotations
 
 import numpy as np
+from scipy.special import logsumexp
 
 from studies.life.kinds.plant import FREQUENCY_HZ, MODES, PARAMETERS, Array, drift, drifts_alone
 from studies.life.kinds.worlds import N_LOGS, REFERENCE_C, Life
 
 # Priors: ln of a parameter now (that of the description), intercept, slope (per K), jump.
 HEALTH_STD, INTERCEPT_STD, SLOPE_STD, JUMP_STD = 0.3, 0.03, 1e-3, 0.01
+# Sizes of the map's relative errors with their probabilities, as the description states them.
+MAP_ERRORS = (0.05, 0.75), (0.15, 0.25)
+_EACH = range(len(MODES))
 _COARSE, _FINE = {1: 241, 2: 61}, {1: 241, 2: 81}
 _UNLIKELY = 1e-6  # density over its maximum beyond which the fine grid ends
 
@@ -68,15 +72,22 @@ def _density(life: Life, moving: list[int], axes: list[Array]) -> Array:
         ln_health[:, :, j] = np.log1p(np.expm1(points[:, k : k + 1]) * share)
     residual = life.ln_f - np.log(FREQUENCY_HZ) - drift(ln_health)
     alone = drifts_alone(ln_health)
-    log_density = -0.5 * np.sum((points / HEALTH_STD) ** 2, axis=1)
-    for i in range(len(MODES)):
-        wrong = life.world.map_error * alone[..., i]
-        cov = _known_cov(life, i) + np.einsum("nkj,nlj->nkl", wrong, wrong)
-        root = np.linalg.cholesky(cov)
-        white = np.linalg.solve(root, residual[:, :, i, None])[..., 0]
-        log_det = np.log(np.einsum("nkk->nk", root)).sum(axis=1)
-        log_density -= 0.5 * np.sum(white**2, axis=1) + log_det
+    parts = [
+        np.log(weight) + sum(_log_likelihood(life, i, residual, size * alone) for i in _EACH)
+        for size, weight in MAP_ERRORS
+    ]
+    prior = -0.5 * np.sum((points / HEALTH_STD) ** 2, axis=1)
+    log_density = prior + logsumexp(parts, axis=0)
     return np.asarray(np.exp(log_density - log_density.max()).reshape(grid.shape[:-1]))
+
+
+def _log_likelihood(life: Life, mode: int, residual: Array, wrong: Array) -> Array:
+    """Return the log likelihood of the estimates of a mode, for a size of the map's errors."""
+    own = wrong[..., mode]
+    root = np.linalg.cholesky(_known_cov(life, mode) + np.einsum("nkj,nlj->nkl", own, own))
+    white = np.linalg.solve(root, residual[:, :, mode, None])[..., 0]
+    log_det = np.log(np.einsum("nkk->nk", root)).sum(axis=1)
+    return np.asarray(-0.5 * np.sum(white**2, axis=1) - log_det)
 
 
 def _known_cov(life: Life, mode: int) -> Array:
