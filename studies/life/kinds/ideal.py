@@ -1,9 +1,10 @@
 """Posterior of health by who knows the shape of every course, all scatter, and what stays.
 
 Unknown are the loss now of each parameter that changes, the intercept and the slope of each mode
-with temperature, the declared jump, and the error of the map. All but the losses are normal and
-integrated out, so that the posterior of one or two losses is computed on a grid. Its width is the
-bound that a posterior without this knowledge is compared with.
+with temperature, the declared jump, and the error of the map, of the two sizes that the description
+states. All but the losses and this size are normal and integrated out, so that the posterior of one
+or two losses is computed on a grid. Its width is what a posterior without this knowledge is
+compared with.
 """
 
 from __future__ import annotations

@@ -5,22 +5,23 @@ Method
     tabulated; the description is otherwise the shipped one of lms-y. Relative errors of 5 % ("as
     declared") of the effect of each parameter on each mode are drawn for each life, in two rows
     10 %. A life has 30 logs up to 50, 70 or 90 % of its length (lognormal, 1,500 to 6,000 km), ln f
-    with standard deviations of 2 to 6e-4, seasons, and a random walk of 3e-4. `worlds.py` draws
-    what becomes of it: courses of the preload that the description has (hertz) and has not, a mount
-    that loosens, both, a mount that settles stiffer while the preload wears ("opposite"), one mode
-    that moves by another cause, steps, and machines that stay as they are. `lmshealth.assess`
-    answers, with the chains that it publishes.
+    with standard deviations of 2 to 6e-4 (in two rows 1 to 1.6e-3), seasons, and a random walk of
+    3e-4. `worlds.py` draws what becomes of it: courses of the preload that the description has
+    (hertz) and has not, a mount that loosens, both, a mount that settles stiffer while the preload
+    wears ("opposite"), one mode that moves by another cause, steps, and machines that stay as they
+    are. `lmshealth.assess` answers, with the chains that it publishes.
     Each kind is judged by itself: a share over lives that wear and lives that do not hides both.
     Places of the truth among draws, ties at random, give the shares of 90 and 50 % intervals that
     hold; widths are compared with those of a posterior that knows the shape of every course, all
-    scatter, and which parameters stay (`ideal.py`). A verdict counts where no loss is within 5 % of
-    the share at which it counts as degraded; of a lone mode it must name the mode. A row passes if
-    the 95 % interval of its figure reaches what is required; all courses of the preload together
-    must meet it. Control, which must fail: the same lives, fewer of them, by the code that had a
-    posterior of its own at each epoch: its health alone, and with the prognosis, without its
-    chains, for lives that wear and are seen up to 90 %.
+    scatter, and which parameters stay (`ideal.py`), but of the map what the description states: it
+    cannot hold 90 % where the map is twice as wrong, and need not be surpassed there. A verdict
+    counts where no loss is within 5 % of the share at which it counts as degraded; of a lone mode
+    it must name the mode. A row passes if the 95 % interval of its figure reaches what is required;
+    all courses of the preload together must meet it. Control, which must fail: the same lives,
+    fewer of them, by the code that had a posterior of its own at each epoch: its health alone, and
+    with the prognosis, without its chains, for lives that wear and are seen up to 90 %.
 Run time
-    Some ten seconds of one processor a life, 25 kinds of 100 lives: seven hours. ``--kinds`` does
+    Some ten seconds of one processor a life, 27 kinds of 100 lives: eight hours. ``--kinds`` does
     the kinds whose names contain one of some words (``late;opposite``), ``--lives`` so many of
     each, ``--earlier`` by the code of the control; they print their claims, record nothing, and
     keep all answers.
@@ -36,17 +37,28 @@ from studies.life.kinds.answers import HEALTH_ALONE, WITHOUT_CHAINS, answer
 from studies.life.kinds.earlier import Earlier
 from studies.life.kinds.plant import PARAMETERS, map_table
 from studies.life.kinds.scores import scored, summarised
-from studies.life.kinds.worlds import HEALTHY, LONE, SEED, SHARES, WEARING, WORLDS, life_of
+from studies.life.kinds.worlds import (
+    HEALTHY,
+    LONE,
+    MAP_ERROR,
+    SEED,
+    SHARES,
+    WEARING,
+    WORLDS,
+    life_of,
+)
 
 LIVES, QUICK_LIVES, QUICK = 100, 2, ("preload, late", "yaw alone, 2 %")
 ALL = "preload, all courses"
 # Lives of the control.
 EARLIER = {
-    **dict.fromkeys(WEARING, 14),
-    **dict.fromkeys(LONE, 14),
-    **dict.fromkeys(HEALTHY, 28),
-    "mount, loosening": 98,
-    "opposite": 56,
+    **dict.fromkeys(WEARING, 8),
+    **dict.fromkeys(LONE, 8),
+    **dict.fromkeys(HEALTHY, 16),
+    "mount, loosening": 56,
+    "opposite": 32,
+    "preload, linear, short logs": 40,
+    "mount, loosening, short logs": 40,
 }
 # Required: shares of intervals that hold, bias of ln, width over the ideal; of a lone mode named,
 # of opposite changes held; most alarms and most held of machines that stay; remaining life held,
@@ -143,8 +155,8 @@ def verdicts(answered: Row) -> dict[str, bool]:
         checks["health by the code before is wrong (control)"] = not all(
             fine for what, fine in own if what.startswith("guide_preload")
         )
-        soundly = [before[kind]["surely_degraded"]["hits"] for kind in LONE]
-        checks["lone modes are degraded parts for the code before (control)"] = sum(soundly) > 0
+        named = [before[kind]["right"]["high"] for kind in LONE]
+        checks["lone modes are not named by the code before (control)"] = max(named) < NAMED
     return checks
 
 
@@ -159,10 +171,13 @@ def _asked(kind: str, row: Row) -> Iterator[tuple[str, bool]]:
         if kind == "opposite":
             yield f"{name} is held", own["held_90"]["high"] >= OPPOSITE
             continue
-        yield (
-            f"{name} is held",
-            _within(own["held_90"], HELD_90, loose) and _within(own["held_50"], HELD_50, loose),
-        )
+        if kind != ALL and WORLDS[kind].map_error > MAP_ERROR:
+            # As often as by who knows all but this error.
+            held = own["held_90"]["high"] >= own["ideal_held_90"]["share"]
+        else:
+            held = _within(own["held_90"], HELD_90, loose)
+            held &= _within(own["held_50"], HELD_50, loose)
+        yield f"{name} is held", held
         mean, error = own["bias"]
         yield f"{name} has no bias", abs(mean) <= BIAS + 2 * loose * error
         yield f"{name} is narrow", own["width_over_ideal"] <= WIDTH

@@ -29,7 +29,8 @@ SEED, N_LOGS = 20261127, 30
 SHARES = (0.5, 0.7, 0.9)  # of the life, at the last log
 LIFE_KM = 3000.0, 0.42  # median, and standard deviation of the logarithm: 1,500 to 6,000 km (90 %)
 KM_PER_DAY = 3.0, 8.0
-STD_F, STD_ZETA = (2e-4, 6e-4), 0.08
+# Ranges of the standard deviations of ln f; the second is of logs of 20 s.
+STD_F, WIDE_STD_F, STD_ZETA = (2e-4, 6e-4), (1e-3, 1.6e-3), 0.08
 MAP_ERROR, WIDE_MAP_ERROR = 0.05, 0.1
 REFERENCE_C = 21.0
 # Share of the loss at the limit from which a parameter is degraded (README), and how close is near.
@@ -47,6 +48,7 @@ class World:
     mount: str = ""  # course of its loss, or "settling", by which it becomes stiffer
     lone: tuple[str, float] | None = None  # mode that moves by another cause, and its size
     map_error: float = MAP_ERROR  # relative, of the effect of each parameter on each mode
+    std: tuple[float, float] = STD_F  # range of the standard deviations of ln f
     walk: float = 3e-4  # standard deviation of the random walk of ln f over the logs
     wander: float = 0.0  # standard deviation of its stationary wander, five logs long
     season_k: float = 6.0  # amplitude of the seasons
@@ -67,6 +69,8 @@ OTHERS = {
     "opposite": World(preload="linear", mount="settling"),
     "preload, linear, map 10 % wrong": World(preload="linear", map_error=WIDE_MAP_ERROR),
     "mount, loosening, map 10 % wrong": World(mount="loosening", map_error=WIDE_MAP_ERROR),
+    "preload, linear, short logs": World(preload="linear", std=WIDE_STD_F),
+    "mount, loosening, short logs": World(mount="loosening", std=WIDE_STD_F),
     "preload, linear, a declared step": World(preload="linear", retuned=0.01),
     "preload, linear, a sudden loss": World(preload="jump", jumps=True),
 }
@@ -202,7 +206,7 @@ def life_of(name: str, number: int) -> Life:
         true[retuned_at:] += world.retuned * rng.standard_normal(len(MODES))
     days = length_km * u / km_per_day
     temperature, heated = _temperature(rng, world, days)
-    std = rng.uniform(*STD_F, (N_LOGS, len(MODES)))
+    std = rng.uniform(*world.std, (N_LOGS, len(MODES)))
     ln_f = np.log(FREQUENCY_HZ) + true + heated + _walks(rng, world, u)
     left = length_km * (1 - share) if np.any(size > 0) else np.inf
     return Life(
