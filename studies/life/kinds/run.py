@@ -52,10 +52,10 @@ LIVES, QUICK_LIVES, QUICK = 100, 2, ("preload, late", "yaw alone, 2 %")
 ALL = "preload, all courses"
 # Lives of the control.
 EARLIER = {
-    **dict.fromkeys(WEARING, 8),
+    **dict.fromkeys(WEARING, 12),
     **dict.fromkeys(LONE, 8),
     **dict.fromkeys(HEALTHY, 16),
-    "mount, loosening": 56,
+    "mount, loosening": 100,
     "opposite": 32,
     "preload, linear, short logs": 40,
     "mount, loosening, short logs": 40,
