@@ -308,18 +308,6 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
     assert control["inside"] < control["inferred"] == 3
 
 
-def test_sbc_epoch(root: Path) -> None:
-    """Ranks of health at some epochs may be uniform; a map taken for exact covers much less."""
-    answer = json.loads(run_study(root, "studies.health.calibration.run"))
-    assert all(answer["passed"].values())
-
-    def hits(kind: str) -> int:
-        return sum(row["coverage"][1]["hits"] for row in answer["ranks"][kind].values())
-
-    # Of eight lives and two parameters 90 % and 23 % are expected.
-    assert hits("map taken as exact") < 8 < hits("lms-y") <= 16
-
-
 def test_sbc_life(root: Path) -> None:
     """Ranks of health and remaining life are uniform; who takes every part to lose is found out."""
     answer = json.loads(run_study(root, "studies.life.calibration.run"))
@@ -351,24 +339,14 @@ def test_cost_of_a_log_of_a_fleet(root: Path) -> None:
     assert all(passed[name] for name in names)
 
 
-def test_blind_lives(root: Path) -> None:
-    """A sound machine and one that is too young are told as such, and none as what it is not."""
-    answer = json.loads(run_study(root, "studies.robustness.blind_lives.run"))
-    assert all(answer["passed"].values())
-    told = answer["verdicts"]["all"]
-    # The third is of a drawn machine, from estimates.
-    assert (told["right"]["n"], answer["drawn"], answer["front_page"]["n"]) == (3, 1, 2)
-    found = told["reported_of_true"]
-    assert [found[word][word] for word in ("healthy", "not-enough-data")] == [1, 1]
-
-
-def test_remaining_life_of_unknown_courses(root: Path) -> None:
-    """Two lives that accelerate late are held; the named laws alone service both too late."""
-    answer = json.loads(run_study(root, "studies.life.unknown_courses"))
-    found = answer["courses"]["late"]["all"]
-    assert found["n"] == 2
-    assert (found["now"]["held"], found["now"]["late"]) == (2, 0)
-    assert (found["named laws alone"]["held"], found["named laws alone"]["late"]) == (0, 2)
+def test_kinds_of_lives(root: Path) -> None:
+    """Two lives that wear late, and two of which a mode moves alone, are each in their own row."""
+    kinds = json.loads(run_study(root, "studies.life.kinds.run"))["kinds"]
+    assert set(kinds) == {"preload, late", "yaw alone, 2 %", "preload, all courses"}
+    late = kinds["preload, late"]
+    assert late["left_90"]["n"] == late["n"] == 2
+    assert late["late"]["hits"] == 0
+    assert kinds["yaw alone, 2 %"]["left_90"] is None
 
 
 def test_one_guide(root: Path) -> None:

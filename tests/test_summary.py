@@ -76,19 +76,16 @@ def test_every_figure_is_of_a_record() -> None:
 
 def test_figures_follow_the_record(copied: Path) -> None:
     """Another record gives other figures, in the table of claims and in the overview."""
-    path = copied / "life" / "unknown_courses.json"
+    path = copied / "life" / "fleet" / "conformal.json"
     record = json.loads(path.read_text())
-    row = record["courses"]["late"]["all"]["now"]
-    assert row["held"] == 60
-    assert "| 90 % intervals of the remaining life hold: late | 60 of 60 |" in summary.group_page(
-        "life"
-    )
-    row["held"] = 47
+    row = record["ways"]["program"]["late"]["calibrated"]
+    assert row["outlive"] == 16
+    claim = "running machines that outlive the calibrated travel: late, program"
+    assert f"| {claim} | 16 of 16 |" in summary.group_page("life")
+    row["outlive"] = 11
     path.write_text(json.dumps(record))
-    assert "| 90 % intervals of the remaining life hold: late | 47 of 60 |" in summary.group_page(
-        "life"
-    )
-    assert "remaining life hold: late: 47 of 60" in summary.overview()
+    assert f"| {claim} | 11 of 16 |" in summary.group_page("life")
+    assert f"{claim}: 11 of 16" in summary.overview()
 
 
 def test_a_missing_record_is_reported(copied: Path) -> None:

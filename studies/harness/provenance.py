@@ -36,8 +36,8 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     """Digest the code that a work depends on.
 
     This is the function and what it needs of its own module, every module of the project that is
-    imported for it, directly or not, all tables and descriptions of the packages, and the versions
-    of libraries. Comments, docstrings and layout do not count.
+    imported for it, directly or not, all tables and descriptions of their packages, and the
+    versions of libraries. Comments, docstrings and layout do not count.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 
@@ -52,10 +52,13 @@ def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
     total = hashlib.sha256(" ".join(version(library) for library in _LIBRARIES).encode())
     total.update("".join(ast.dump(statement) for statement in needed).encode())
     roots = _imports(needed) | {_file(module.split(".")) for module in also}
-    for module in sorted(_closure({root for root in roots if root is not None})):
+    modules = sorted(_closure({root for root in roots if root is not None}))
+    for module in modules:
         total.update(module.relative_to(PROJECT).as_posix().encode())
         total.update(_content(module))
-    for package in ("lmshealth", "models"):
+    # Of the packages whose code it runs.
+    used = {module.relative_to(PROJECT).parts[0] for module in modules}
+    for package in sorted(used & {"lmshealth", "models"}):
         for table in sorted((PROJECT / package).rglob("*")):
             if table.suffix in (".toml", ".csv"):
                 total.update(table.name.encode() + table.read_bytes())

@@ -40,11 +40,6 @@ _SIMULATIONS = 20_000
 _FEW, _FEW_SIMULATIONS = 20, 2_000
 
 
-def thinned(draws: Array) -> Array:
-    """Take `N_DRAWS` draws, evenly spaced over the first axis."""
-    return np.asarray(draws[np.linspace(0, len(draws) - 1, N_DRAWS).round().astype(int)])
-
-
 def rank(truth: Array, draws: Array, rng: np.random.Generator) -> list[float]:
     """Rank truths ``(n,)`` among draws ``(n_draws, n)``, as a share from 0 to 1."""
     return [round(float(value), 6) for value in place(draws, truth, rng)]

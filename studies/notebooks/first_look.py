@@ -108,6 +108,6 @@ assert np.isfinite(left.rul_km_q95)
 # date is the last day on which that of a failure is at most 5 %.
 #
 # **What this does not show.** One simulated life is no evidence that intervals hold: the studies
-# `blind_lives` and `drawn_machines` count that over many lives. The simulated stage follows the
+# `kinds` and `drawn_machines` count that over many lives. The simulated stage follows the
 # modal map by construction; a real one does so as well as its map has been made. Remaining life
 # assumes that no crash is still to come.

@@ -21,8 +21,6 @@ def _both(kind: str) -> tuple[str, str]:
     return f"f, {kind}", f"ζ, {kind}"
 
 
-_HEALTH = ("preload", "mount")
-
 TESTS = {
     # Readings of one log.
     "test_lines_are_called_no_oftener_than_declared": Part(800, ("false alarms",), control=60),
@@ -56,15 +54,16 @@ TESTS = {
     # Health at one epoch.
     "test_health_is_calibrated": Part(300, ("preload, grid", "mount, grid")),
     "test_chains_are_as_calibrated_as_grids": Part(10, ("chains",)),
-    "test_ranks_at_epochs_of_tracks_are_uniform": Part(
-        100,
-        tuple(f"{name}, {stage}" for stage in ("lms-x", "lms-y") for name in _HEALTH),
-        control=60,
-    ),
     "test_the_fit_is_seldom_improbable": Part(300, ("fit",), control=30),
     "test_a_shared_guide_is_calibrated": Part(
         36, ("shared preload", "mount of X beside it", "mount of Y beside it")
     ),
+    # Lives of another plant, by kind.
+    "test_health_of_lives_that_wear_is_held": Part(12, ("preload that wears",)),
+    "test_a_mode_that_moves_alone_is_named": Part(
+        8, ("mode alone, named", "mode alone, no part degraded")
+    ),
+    "test_machines_that_stay_raise_no_alarm": Part(8, ("no alarm, by kind",)),
     # Laws and the remaining life.
     "test_losses_by_laws_are_calibrated": Part(150, ("loss by the law", "health now")),
     "test_health_off_its_law_is_calibrated": Part(250, ("health now, off its law",)),

@@ -37,7 +37,6 @@ from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
 from studies.harness.ranks import N_DRAWS, Array, judge, rank, uniform
 from studies.harness.study import Row, Study
-from studies.health.calibration.lives import assuming
 from studies.life.calibration.lives import Life, draw
 
 SEED = 20261123
@@ -88,6 +87,14 @@ def one(kind: str, life: int) -> Row:
         return {"rank": None}
     draws = quantities(found, drawn.now, np.random.default_rng([SEED, life, 1]))
     return {"rank": rank(truth, draws[rng.permutation(len(draws))[:N_DRAWS]], rng)}
+
+
+def assuming(stage: Stage, share: float) -> Stage:
+    """Return the same stage with a share of the error of its map."""
+    assert stage.description.map is not None
+    less = share * stage.description.map.model_std
+    spec = msgspec.structs.replace(stage.description.map, model_std=less)
+    return replace(stage, description=msgspec.structs.replace(stage.description, map=spec))
 
 
 def always_losing(stage: Stage) -> Stage:

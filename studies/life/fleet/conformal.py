@@ -45,8 +45,16 @@ from studies.harness.claims import Claim, counted, number
 from studies.harness.data.histories import make_history
 from studies.harness.study import Row, Study
 from studies.life.fleet.lives import machine
-from studies.life.unknown_courses import course
-from studies.robustness.off_model.worlds import LN_F, LN_ZETA, MODES, STD_F, STD_ZETA, Array
+from studies.life.kinds.worlds import course
+from studies.robustness.off_model.worlds import (
+    LN_F,
+    LN_ZETA,
+    LOST_AT_LIMIT,
+    MODES,
+    STD_F,
+    STD_ZETA,
+    Array,
+)
 
 SEED = 20261125
 FLEETS, N_ENDED, N_RUNNING = 2, 9, 8
@@ -109,7 +117,11 @@ def spread(rng: np.random.Generator, end: float, n: int) -> Array:
 def one(kind: str, number_: int, n_ended: int, n_running: int) -> Row:
     """Draw a fleet; return its ended lives, and what is predicted of its running machines."""
     rng = np.random.default_rng([SEED, number_, len(kind)])
-    lost, row = course(rng, kind), Row(kind=kind, ended={way: [] for way in WAYS}, running=[])
+    share, row = course(rng, kind), Row(kind=kind, ended={way: [] for way in WAYS}, running=[])
+
+    def lost(u: Array) -> Array:
+        return LOST_AT_LIMIT * share(u)
+
     for _ in range(n_ended):
         length = _KM * LIFE_KM * np.exp(SCATTER * rng.standard_normal())
         end = rng.uniform(0.8, 1.0) if rng.random() < AT_SERVICE else rng.uniform(1.0, 1.03)
@@ -121,9 +133,9 @@ def one(kind: str, number_: int, n_ended: int, n_running: int) -> Row:
             row["ended"][way] += [asdict(life) for life in ended]
     for _ in range(n_running):
         length = _KM * LIFE_KM * np.exp(SCATTER * rng.standard_normal())
-        share = rng.uniform(0.3, 0.9)
-        history = history_of(rng, lost, length, spread(rng, share, LOGS_RUNNING))
-        left = length * (1 - share)
+        seen = rng.uniform(0.3, 0.9)
+        history = history_of(rng, lost, length, spread(rng, seen, LOGS_RUNNING))
+        left = length * (1 - seen)
         own: Row = {"left_km": left / _KM}
         for way, found in by_way(partial(prognose, history, stage(), SEED, chains=False)):
             draws = np.minimum(found.remaining[:, -1], found.horizon)
