@@ -58,6 +58,8 @@ RATE_NEAR, RATE_SHARE = 0.1, 0.75
 # Standard deviations of ln f and ln ζ about a mode's first estimate.
 LN_F_STD = 0.1
 LN_ZETA_STD = 1.0
+# Rate of ln f of the published filter per life: 0.7 % a log, far beyond any wear.
+PUBLISHED_RATE_STD = 1.0
 # Random walk of ln ζ per life.
 DAMPING_WALK = 0.5
 # Bias of ln f and ln ζ between two sources of one mode.

@@ -279,15 +279,15 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
         state[:, :size, :size] += noise.reshape(-1, size, size)
     for j, step in enumerate(space.steps):
         if step.first == k:
-            _begin_step(space, state, step, j)
+            begin_step(space, state, step, j)
     if k in space.history.baselines:
         state[:, base] = state[:, level]
         state[:, :, base] = state[:, :, level]
     return FilterBank(own, bank.log_weight, state)
 
 
-def _begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
-    """Add the variance of the j-th step of a state space to states that the caller owns."""
+def begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
+    """Add the variance of the j-th step of a state space to covariances that the caller owns."""
     jump = space.jump(j)
     variance = np.repeat(np.square(constants.JUMP_STD[step.kind]), space.n_modes)
     own = np.arange(jump.start, jump.stop)

@@ -1,0 +1,229 @@
+"""Published filter: one `filterpy` Kalman filter per machine, whose states are the track.
+
+The filter has the state space of `state_space` and one set of nuisances per log, which the filter
+bank selects from the logs up to it: process noise, noise scales and the weight of each estimate.
+The rates have a weak prior, so that a drift is not shrunk to zero. The state of a log is never
+changed by later logs; where a change is adopted, the filter continues from the log before it.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+from filterpy.kalman import KalmanFilter
+
+from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth.tracking import constants
+from lmshealth.tracking.change_detection import N_CHECKPOINTS
+from lmshealth.tracking.filter_bank import FilterBank, FilterModel, Innovation, begin_step
+
+# Least weight of an estimate: an outlier for certain.
+_LEAST_WEIGHT = 1e-10
+# Eigenvalues of correlations below this are rounding.
+_SINGULAR = 1e-10
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Nuisances(ReadOnly):
+    """Settings of the filter at one log; stacked, those of all logs with a leading axis."""
+
+    level_walk: FloatArray  # variance per life of the random walk of ln f
+    rate_walk: FloatArray  # variance per life of the random walk of the rate
+    settling: FloatArray  # variance of ln f by settling
+    running_in: FloatArray  # probability that the machine runs in
+    wander: FloatArray  # variance of the wander in variances of the first estimates
+    wander_keep: FloatArray  # its correlation with the log before
+    scales: FloatArray  # factor on the reported errors of each source, ``(n_sources,)``
+    moved: FloatArray  # mean square of the change of ln f since the log before, if it runs in
+    # Probability that an estimate is no outlier, 1 where there is none, ``(2 n_series,)``.
+    weight: FloatArray
+
+    @classmethod
+    def stacked(cls, logs: Sequence[Self]) -> Self:
+        """Return the nuisances of all logs as one object."""
+        names = cls.__dataclass_fields__
+        return cls(*(np.array([getattr(one, name) for one in logs]) for name in names))
+
+    def of_log(self, k: int) -> Self:
+        """Return the nuisances of one log of stacked ones."""
+        names = self.__dataclass_fields__
+        return type(self)(*(np.array(getattr(self, name)[k]) for name in names))
+
+
+def select_nuisances(
+    model: FilterModel, bank: FilterBank, found: Innovation, k: int
+) -> Nuisances:
+    """Select the nuisances of log k from the posterior of the bank after it.
+
+    Random walks and scales are geometric means over the posterior, because those of few improbable
+    filters are larger by orders of magnitude; the random walk of rates is that of the changing
+    filters. Running-in, by which rates of the bank decay, enters as noise of its size.
+    """
+    own, share, space = bank.hyperparameters, bank.weight, model.space
+    changing = np.where(own.healthy, 0.0, share)
+    changing /= max(changing.sum(), 1e-300)
+    spread = own.wander_variance
+    wander = float(share @ spread)
+    decays = np.where(own.rate_decay > 0, share, 0.0)
+    running_in = decays.sum()
+    rates = bank.mean[:, space.rate] ** 2
+    rates += np.einsum("gii->gi", bank.cov[:, space.rate, space.rate])
+    weight = np.ones(model.values.shape[1])
+    weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
+    return Nuisances(
+        level_walk=np.exp(share @ np.log(own.level_walk**2)),
+        rate_walk=np.exp(changing @ np.log(np.maximum(own.rate_walk**2, 1e-10))),
+        settling=share @ own.settling**2,
+        running_in=running_in,
+        wander=np.array(wander),
+        wander_keep=share @ (spread * own.wander_keep) / (wander or 1.0),
+        scales=np.exp(share @ np.log(own.scales)),
+        moved=decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2,
+        weight=weight,
+    )
+
+
+class PublishedFilter:
+    """Kalman filter of one machine, online: a log at a time, or again from an earlier log.
+
+    Attributes
+    ----------
+    kalman : KalmanFilter
+        State ``(size,)`` and covariance ``(size, size)`` after the last log.
+    nuisances : list of Nuisances
+        Those of each log so far.
+    """
+
+    def __init__(self, model: FilterModel) -> None:
+        self.model, self.nuisances = model, list[Nuisances]()
+        mean, cov = model.space.prior()
+        rate = model.space.rate
+        cov[rate, rate] += constants.PUBLISHED_RATE_STD**2 * model.together
+        self.kalman = KalmanFilter(dim_x=mean.size, dim_z=1)
+        self.kalman.x, self.kalman.P = mean, cov
+        # States and covariances before each of the last logs.
+        self._before: dict[int, tuple[FloatArray, FloatArray]] = {}
+
+    def filter(self, nuisances: Nuisances) -> None:
+        """Predict to the next log and update with its estimates."""
+        k, model, kalman = len(self.nuisances), self.model, self.kalman
+        self._before[k] = kalman.x, kalman.P
+        self._before.pop(k - N_CHECKPOINTS, None)
+        self.nuisances.append(nuisances)
+        move, noise = self.transition(k)
+        kalman.predict(F=move, Q=noise)
+        rows = model.rows[k]
+        if rows.size:
+            errors = self._errors(k)
+            kalman.update(model.values[k, rows], R=errors, H=model.space.matrix(k)[rows])
+
+    def select(self, nuisances: Nuisances, first: int) -> None:
+        """Filter the next log, and again those since `first` with the same nuisances of machine."""
+        since = max(first, min(self._before, default=0))
+        for one in self.rewind(since, self.model) if since < len(self.nuisances) else ():
+            self.filter(replace(nuisances, weight=one.weight, moved=one.moved))
+        self.filter(nuisances)
+
+    def rewind(self, first: int, model: FilterModel) -> list[Nuisances]:
+        """Return to the state before a log, and return the nuisances of the logs since then.
+
+        The model may have more steps than before.
+        """
+        self.model, size = model, model.space.size
+        mean, cov = self._before[first]
+        self.kalman = KalmanFilter(dim_x=size, dim_z=1)
+        more = size - mean.size
+        self.kalman.x, self.kalman.P = np.pad(mean, (0, more)), np.pad(cov, (0, more))
+        self.nuisances, later = self.nuisances[:first], self.nuisances[first:]
+        return later
+
+    def undecided(self) -> tuple[FloatArray, FloatArray]:
+        """Return the state where the last log has outliers, any of which may be a step.
+
+        Half of the squared innovation is added to the variance of the error and of the quantity:
+        both explanations are within two standard deviations.
+        """
+        k, model = len(self.nuisances) - 1, self.model
+        rows, space = model.rows[k], model.space
+        move, noise = self.transition(k)
+        trial = KalmanFilter(dim_x=space.size, dim_z=1)
+        trial.x, trial.P = self._before[k]
+        trial.predict(F=move, Q=noise)
+        matrix = space.matrix(k)[rows]
+        off = np.where(self.nuisances[k].weight[rows] < 0.5, model.values[k, rows] - matrix @ trial.x, 0.0)
+        half = off**2 / 2
+        r = len(space.history.series)
+        at = np.where(rows < r, space.level.start, space.damping.start) + model.mode_of[rows]
+        jump = np.zeros(space.size)
+        np.maximum.at(jump, at, half)
+        trial.P = trial.P + np.diag(jump)
+        errors = self._errors(k, weighted=False) + np.diag(half)
+        trial.update(model.values[k, rows], R=errors, H=matrix)
+        return trial.x, trial.P
+
+    def _errors(self, k: int, *, weighted: bool = True) -> FloatArray:
+        """Return the covariance of the errors of the estimates of log k."""
+        model, own, rows = self.model, self.nuisances[k], self.model.rows[k]
+        scale = own.scales[model.scale_of[rows]]
+        if weighted:
+            scale = scale / np.sqrt(own.weight[rows])
+        reported = model.space.history.cov[k][np.ix_(rows, rows)]
+        return np.asarray(reported * np.outer(scale, scale) + np.diag(model.extra[k, rows]))
+
+    def transition(self, k: int) -> tuple[FloatArray, FloatArray]:
+        """Return transition matrix and covariance of the process noise into log k."""
+        model, own, space = self.model, self.nuisances[k], self.model.space
+        move, noise = np.eye(space.size), np.zeros((space.size, space.size))
+        tick, wander = space.ticks[k], space.wander
+        if k == 0:
+            noise[wander, wander] = own.wander * model.wander_cov
+        elif space.seen[k]:
+            move[space.level, space.rate] = tick * np.eye(space.n_modes)
+            move[wander, wander] *= own.wander_keep
+            drive = own.rate_walk * np.array([tick**3 / 3, tick**2 / 2, tick])
+            settling = own.settling * space.settling[k] + own.running_in * own.moved
+            fresh, damping = (1 - own.wander_keep**2) * own.wander, constants.DAMPING_WALK**2 * tick
+            variances = np.array([own.level_walk * tick, settling, *drive, fresh, damping])
+            noise[: wander.stop, : wander.stop] = (variances @ model.noise).reshape(
+                wander.stop, wander.stop
+            )
+        if k in model.reopened:
+            # Before the transition: the rate has had its prior since the log before.
+            fresh_rate = move[:, space.rate]
+            prior = constants.PUBLISHED_RATE_STD**2 * model.together
+            noise += fresh_rate @ prior @ fresh_rate.T
+        for j, step in enumerate(space.steps):
+            if step.first == k:
+                begin_step(space, noise[None], step, j)
+        if k in space.history.baselines:
+            for part in (move, noise, noise.T):
+                part[space.base] = part[space.level]
+        return move, noise
+
+    def smooth(self) -> tuple[FloatArray, FloatArray]:
+        """Smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965].
+
+        The logs are filtered once more with their nuisances.
+        """
+        again, size = PublishedFilter(self.model), self.model.space.size
+        n = len(self.nuisances)
+        means, covs = np.empty((n, size)), np.empty((n, size, size))
+        moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
+        for k, one in enumerate(self.nuisances):
+            again.filter(one)
+            means[k], covs[k] = again.kalman.x, again.kalman.P
+            moves[k], noises[k] = again.transition(k)
+        smoothed = again.kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
+        return smoothed[0], smoothed[1]
+
+
+def _inverse(cov: FloatArray) -> FloatArray:
+    """Invert a covariance where it is not singular.
+
+    An exact copy of ℓ, and steps that are still to come, make it singular. The correlations are
+    inverted, because variances of ln ζ are ten orders of magnitude above process noise of ln f.
+    """
+    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    scale = np.outer(np.where(std > 0, std, 1.0), np.where(std > 0, std, 1.0))
+    return np.asarray(np.linalg.pinv(cov / scale, rcond=_SINGULAR, hermitian=True) / scale)
