@@ -16,8 +16,6 @@ ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
-# The same from which published states allow for a change that began lately, and its probability.
-BEGUN_GATE, BEGUN_PROBABILITY = 3.0, 0.5
 # Standardised innovations count at most so much there: a single one opens no weighing for long.
 MOST_INNOVATION = 6.0
 # The kind of a change is settled at these odds over all other kinds, or after so many logs.

@@ -13,19 +13,26 @@ from typing import Self
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import N_CHECKPOINTS
 from lmshealth.tracking.filter_bank import FilterBank, FilterModel, Innovation, begin_step
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10
+# Logs that may be filtered again for every new one: bounds the run time.
+_REPEATS = 4
+# Least value of a nuisance that matters, and the factor by which it may differ.
+_TOLERANCES = (
+    ("level_walk", 1e-9, 1.5), ("rate_walk", 1e-5, 1.5), ("settling", 1e-8, 1.5),
+    ("running_in", 1e-4, 1.5), ("wander", 0.03, 1.3), ("scales", 0.0, 1.05),
+)  # fmt: skip
 # Eigenvalues of correlations below this are rounding.
 _SINGULAR = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nuisances(ReadOnly):
+class Nuisances:
     """Settings of the filter at one log; stacked, those of all logs with a leading axis."""
 
     level_walk: FloatArray  # variance per life of the random walk of ln f
@@ -43,17 +50,25 @@ class Nuisances(ReadOnly):
     def stacked(cls, logs: Sequence[Self]) -> Self:
         """Return the nuisances of all logs as one object."""
         names = cls.__dataclass_fields__
-        return cls(*(np.array([getattr(one, name) for one in logs]) for name in names))
+        whole = cls(*(np.array([getattr(one, name) for one in logs]) for name in names))
+        freeze(whole)
+        return whole
 
     def of_log(self, k: int) -> Self:
         """Return the nuisances of one log of stacked ones."""
         names = self.__dataclass_fields__
         return type(self)(*(np.array(getattr(self, name)[k]) for name in names))
 
+    def differ(self, other: Self) -> bool:
+        """Return whether nuisances of the machine differ by more than states depend on them."""
+        for name, least, factor in _TOLERANCES:
+            own, their = (getattr(one, name) + least for one in (self, other))
+            if (np.abs(np.log(own / their)) > np.log(factor)).any():
+                return True
+        return False
 
-def select_nuisances(
-    model: FilterModel, bank: FilterBank, found: Innovation, k: int
-) -> Nuisances:
+
+def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k: int) -> Nuisances:
     """Select the nuisances of log k from the posterior of the bank after it.
 
     Random walks and scales are geometric means over the posterior, because those of few improbable
@@ -61,8 +76,8 @@ def select_nuisances(
     filters. Running-in, by which rates of the bank decay, enters as noise of its size.
     """
     own, share, space = bank.hyperparameters, bank.weight, model.space
-    changing = np.where(own.healthy, 0.0, share)
-    changing /= max(changing.sum(), 1e-300)
+    changing = np.where(own.healthy, 0.0, share) if not own.healthy.all() else share
+    changing = changing / changing.sum()
     spread = own.wander_variance
     wander = float(share @ spread)
     decays = np.where(own.rate_decay > 0, share, 0.0)
@@ -72,16 +87,21 @@ def select_nuisances(
     weight = np.ones(model.values.shape[1])
     weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
     return Nuisances(
-        level_walk=np.exp(share @ np.log(own.level_walk**2)),
-        rate_walk=np.exp(changing @ np.log(np.maximum(own.rate_walk**2, 1e-10))),
+        level_walk=_geometric(share, own.level_walk**2),
+        rate_walk=_geometric(changing, own.rate_walk**2),
         settling=share @ own.settling**2,
         running_in=running_in,
         wander=np.array(wander),
         wander_keep=share @ (spread * own.wander_keep) / (wander or 1.0),
-        scales=np.exp(share @ np.log(own.scales)),
+        scales=_geometric(share, own.scales),
         moved=decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2,
         weight=weight,
     )
+
+
+def _geometric(share: FloatArray, values: FloatArray) -> FloatArray:
+    """Return the geometric mean of values, where all are positive or none is."""
+    return np.asarray(np.exp(share @ np.log(values)) if values.all() else share @ values)
 
 
 class PublishedFilter:
@@ -104,6 +124,8 @@ class PublishedFilter:
         self.kalman.x, self.kalman.P = mean, cov
         # States and covariances before each of the last logs.
         self._before: dict[int, tuple[FloatArray, FloatArray]] = {}
+        self._first = 0  # log of the regime
+        self._credit = 0  # logs that may be filtered again
 
     def filter(self, nuisances: Nuisances) -> None:
         """Predict to the next log and update with its estimates."""
@@ -111,29 +133,41 @@ class PublishedFilter:
         self._before[k] = kalman.x, kalman.P
         self._before.pop(k - N_CHECKPOINTS, None)
         self.nuisances.append(nuisances)
-        move, noise = self.transition(k)
+        move, noise = self._transition(k)
         kalman.predict(F=move, Q=noise)
         rows = model.rows[k]
         if rows.size:
             errors = self._errors(k)
             kalman.update(model.values[k, rows], R=errors, H=model.space.matrix(k)[rows])
 
-    def select(self, nuisances: Nuisances, first: int) -> None:
-        """Filter the next log, and again those since `first` with the same nuisances of machine."""
-        since = max(first, min(self._before, default=0))
-        for one in self.rewind(since, self.model) if since < len(self.nuisances) else ():
-            self.filter(replace(nuisances, weight=one.weight, moved=one.moved))
+    def select(self, nuisances: Nuisances) -> None:
+        """Filter the next log; all of its regime again if the machine's nuisances have changed.
+
+        They are unknown at first: early logs are filtered again once it is known how much they
+        scatter and wander. Checkpoints and a credit bound how far back that reaches.
+        """
+        k, since = len(self.nuisances), max(self._first, min(self._before, default=0))
+        if since < k:
+            self._credit = min(self._credit + _REPEATS, N_CHECKPOINTS)
+            if k <= since + self._credit and nuisances.differ(self.nuisances[-1]):
+                self._credit -= k - since
+                for one in self._return_to(since):
+                    self.filter(replace(nuisances, weight=one.weight, moved=one.moved))
+            of_log = {"weight": nuisances.weight, "moved": nuisances.moved}
+            nuisances = replace(self.nuisances[-1], **of_log)
         self.filter(nuisances)
 
-    def rewind(self, first: int, model: FilterModel) -> list[Nuisances]:
-        """Return to the state before a log, and return the nuisances of the logs since then.
+    def begin_regime(self, first: int, model: FilterModel) -> None:
+        """Continue from the state before a log, with a model that may have one more step."""
+        self.model, self._first = model, first
+        if first < len(self.nuisances):
+            self._return_to(first)
 
-        The model may have more steps than before.
-        """
-        self.model, size = model, model.space.size
+    def _return_to(self, first: int) -> list[Nuisances]:
+        """Return to the state before a log; return the nuisances of the logs since then."""
         mean, cov = self._before[first]
-        self.kalman = KalmanFilter(dim_x=size, dim_z=1)
-        more = size - mean.size
+        more = self.model.space.size - mean.size
+        self.kalman = KalmanFilter(dim_x=mean.size + more, dim_z=1)
         self.kalman.x, self.kalman.P = np.pad(mean, (0, more)), np.pad(cov, (0, more))
         self.nuisances, later = self.nuisances[:first], self.nuisances[first:]
         return later
@@ -146,12 +180,14 @@ class PublishedFilter:
         """
         k, model = len(self.nuisances) - 1, self.model
         rows, space = model.rows[k], model.space
-        move, noise = self.transition(k)
+        move, noise = self._transition(k)
         trial = KalmanFilter(dim_x=space.size, dim_z=1)
         trial.x, trial.P = self._before[k]
         trial.predict(F=move, Q=noise)
         matrix = space.matrix(k)[rows]
-        off = np.where(self.nuisances[k].weight[rows] < 0.5, model.values[k, rows] - matrix @ trial.x, 0.0)
+        off = np.where(
+            self.nuisances[k].weight[rows] < 0.5, model.values[k, rows] - matrix @ trial.x, 0.0
+        )
         half = off**2 / 2
         r = len(space.history.series)
         at = np.where(rows < r, space.level.start, space.damping.start) + model.mode_of[rows]
@@ -168,10 +204,13 @@ class PublishedFilter:
         scale = own.scales[model.scale_of[rows]]
         if weighted:
             scale = scale / np.sqrt(own.weight[rows])
-        reported = model.space.history.cov[k][np.ix_(rows, rows)]
-        return np.asarray(reported * np.outer(scale, scale) + np.diag(model.extra[k, rows]))
+        errors: FloatArray = model.space.history.cov[k][rows[:, None], rows]
+        errors *= scale[:, None] * scale
+        if model.unknown[k]:
+            errors += np.diag(model.extra[k, rows])
+        return errors
 
-    def transition(self, k: int) -> tuple[FloatArray, FloatArray]:
+    def _transition(self, k: int) -> tuple[FloatArray, FloatArray]:
         """Return transition matrix and covariance of the process noise into log k."""
         model, own, space = self.model, self.nuisances[k], self.model.space
         move, noise = np.eye(space.size), np.zeros((space.size, space.size))
@@ -188,8 +227,8 @@ class PublishedFilter:
             noise[: wander.stop, : wander.stop] = (variances @ model.noise).reshape(
                 wander.stop, wander.stop
             )
-        if k in model.reopened:
-            # Before the transition: the rate has had its prior since the log before.
+        reopens = (s.first == k and (s.kind == "reset" or not s.declared) for s in space.steps)
+        if k and any(reopens):  # the rate has its prior again since the log before
             fresh_rate = move[:, space.rate]
             prior = constants.PUBLISHED_RATE_STD**2 * model.together
             noise += fresh_rate @ prior @ fresh_rate.T
@@ -201,20 +240,16 @@ class PublishedFilter:
                 part[space.base] = part[space.level]
         return move, noise
 
-    def smooth(self) -> tuple[FloatArray, FloatArray]:
-        """Smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965].
-
-        The logs are filtered once more with their nuisances.
-        """
-        again, size = PublishedFilter(self.model), self.model.space.size
-        n = len(self.nuisances)
+    def smooth(self, nuisances: Sequence[Nuisances]) -> tuple[FloatArray, FloatArray]:
+        """Filter and smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965]."""
+        n, size = len(nuisances), self.model.space.size
         means, covs = np.empty((n, size)), np.empty((n, size, size))
         moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
-        for k, one in enumerate(self.nuisances):
-            again.filter(one)
-            means[k], covs[k] = again.kalman.x, again.kalman.P
-            moves[k], noises[k] = again.transition(k)
-        smoothed = again.kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
+        for k, one in enumerate(nuisances):
+            self.filter(one)
+            means[k], covs[k] = self.kalman.x, self.kalman.P
+            moves[k], noises[k] = self._transition(k)
+        smoothed = self.kalman.rts_smoother(means, covs, moves, noises, inv=_inverse)
         return smoothed[0], smoothed[1]
 
 

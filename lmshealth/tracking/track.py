@@ -138,7 +138,8 @@ class Track(Result):
     # innovations, and on all published ones where innovations are inconsistent, ``(n_epochs,)``.
     noise_scale: FloatArray
     widening: FloatArray
-    nuisances: Nuisances  # of the published filter, at every epoch
+    # Of the published filter, at every epoch; None of a track that was not filtered here.
+    nuisances: Nuisances | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
@@ -327,12 +328,11 @@ class _Tracker:
         for k in range(len(self.history.logs)):
             if k in self.resets and k:
                 self._begin_regime(self.bank, k, anew=True)
+                self.published.begin_regime(k, self.model)
                 self.alarmed = False
             self._filter(k)
-            window = worst_window(self.sums[: k + 2], self.first)
-            if self._detect(k, *window):
-                window = worst_window(self.sums[: k + 2], self.first)
-            self._publish(k, *window)
+            self._detect(k, *worst_window(self.sums[: k + 2], self.first))
+            self._publish(k)
         return self._track()
 
     def _begin_regime(self, bank: FilterBank, first: int, *, anew: bool = False) -> None:
@@ -359,12 +359,11 @@ class _Tracker:
         self.nis[k], self.innovations[k] = found.nis, np.nan
         self.innovations[k, found.rows[kept]] = found.standardised[kept]
         self.bank = self.checkpoints[k] = bank.pruned()
-        nuisances = select_nuisances(self.model, self.bank, found, k)
-        self.published.select(nuisances, self.first - 1 if self.first > 1 else 0)
+        self.published.select(select_nuisances(self.model, self.bank, found, k))
         self.checkpoints.pop(k - N_CHECKPOINTS, None)
 
-    def _detect(self, k: int, window: int, size: float) -> bool:
-        """Weigh a suspected change, and raise the alarm of a drift: whether a change is adopted.
+    def _detect(self, k: int, window: int, size: float) -> None:
+        """Weigh a suspected change and adopt it, and raise the alarm of a drift.
 
         The mean innovation is largest since the log `window`.
         """
@@ -385,7 +384,7 @@ class _Tracker:
                 if not change.settled(k):
                     self.open = change
                 elif self._adopt(change, k):
-                    return True
+                    return
         # A single log that deviates may be an outlier or the first after a step, and an open change
         # need not be damage: later logs decide.
         waiting = self.open is not None and not self.open.settled(k)
@@ -393,10 +392,9 @@ class _Tracker:
         lone = suspected is not None and k - suspected <= 1
         if evidence >= threshold() and not waiting and not lone:
             self._alarm(k, evidence)
-        return False
 
     def _adopt(self, change: ChangeHypothesis, k: int) -> bool:
-        """Add a change to the model and filter again from the checkpoint before it.
+        """Add a change to the model and filter again from the checkpoint before it, if adopted.
 
         A drift that is no damage, or follows an alarm, is not adopted.
         """
@@ -414,7 +412,7 @@ class _Tracker:
             before = before.padded(self.model.space.size)
         self.widening = self._widened(k, self._dof())
         self._begin_regime(before, j + 1)
-        self.published.rewind(j, self.model)
+        self.published.begin_regime(j, self.model)
         for again in range(j, k + 1):
             self._filter(again)
         if change.damage:
@@ -435,7 +433,7 @@ class _Tracker:
         mode, size, error = self.history.modes[i], float(drift[i]), float(std[i])
         self.alarms.append(Event("alarm", k, mode, "", size, error, evidence, False, k))
 
-    def _publish(self, k: int, window: int, size: float) -> None:
+    def _publish(self, k: int) -> None:
         """Record the state of log k, and the noise scale of each source."""
         kalman = self.published.kalman
         state = self.published.undecided() if k in self.outlying else (kalman.x, kalman.P)
