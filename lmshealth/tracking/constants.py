@@ -16,6 +16,8 @@ ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
+# The same from which the published filter allows for a rate that is new since the window began.
+BEGUN_GATE = 3.0
 # Standardised innovations count at most so much there: a single one opens no weighing for long.
 MOST_INNOVATION = 6.0
 # The kind of a change is settled at these odds over all other kinds, or after so many logs.

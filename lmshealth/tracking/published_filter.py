@@ -13,13 +13,15 @@ from typing import Self
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import N_CHECKPOINTS
 from lmshealth.tracking.filter_bank import FilterBank, FilterModel, Innovation, begin_step
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10
+# Logs after which no running-in goes on: three times the slowest decay.
+_RUN_IN = 3 * max(logs for logs, _ in constants.RUNNING_IN_LOGS)
 # Logs that may be filtered again for every new one: bounds the run time.
 _REPEATS = 4
 # Least value of a nuisance that matters, and the factor by which it may differ.
@@ -45,6 +47,7 @@ class Nuisances:
     moved: FloatArray  # mean square of the change of ln f since the log before, if it runs in
     # Probability that an estimate is no outlier, 1 where there is none, ``(2 n_series,)``.
     weight: FloatArray
+    reopened: BoolArray  # whether rates have their prior again before this log
 
     @classmethod
     def stacked(cls, logs: Sequence[Self]) -> Self:
@@ -58,6 +61,10 @@ class Nuisances:
         """Return the nuisances of one log of stacked ones."""
         names = self.__dataclass_fields__
         return type(self)(*(np.array(getattr(self, name)[k]) for name in names))
+
+    def at(self, log: Self) -> Self:
+        """Return these nuisances of the machine with those of a log alone."""
+        return replace(self, weight=log.weight, moved=log.moved, reopened=log.reopened)
 
     def differ(self, other: Self) -> bool:
         """Return whether nuisances of the machine differ by more than states depend on them."""
@@ -96,6 +103,7 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
         scales=_geometric(share, own.scales),
         moved=decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2,
         weight=weight,
+        reopened=np.array(False),
     )
 
 
@@ -144,18 +152,28 @@ class PublishedFilter:
         """Filter the next log; all of its regime again if the machine's nuisances have changed.
 
         They are unknown at first: early logs are filtered again once it is known how much they
-        scatter and wander. Checkpoints and a credit bound how far back that reaches.
+        scatter and wander. Checkpoints and a credit bound how far back that reaches. Wear that
+        begins later does not revise whether the machine has run in.
         """
         k, since = len(self.nuisances), max(self._first, min(self._before, default=0))
+        if k - self._first >= _RUN_IN:
+            last = self.nuisances[-1]
+            nuisances = replace(nuisances, settling=last.settling, running_in=last.running_in)
         if since < k:
             self._credit = min(self._credit + _REPEATS, N_CHECKPOINTS)
             if k <= since + self._credit and nuisances.differ(self.nuisances[-1]):
                 self._credit -= k - since
                 for one in self._return_to(since):
-                    self.filter(replace(nuisances, weight=one.weight, moved=one.moved))
-            of_log = {"weight": nuisances.weight, "moved": nuisances.moved}
-            nuisances = replace(self.nuisances[-1], **of_log)
+                    self.filter(nuisances.at(one))
+            nuisances = self.nuisances[-1].at(nuisances)
         self.filter(nuisances)
+
+    def reopen(self, first: int) -> None:
+        """Give the rates their prior again before a log, unless they have had it since then."""
+        if first in self._before and not any(one.reopened for one in self.nuisances[first:]):
+            for one in self._return_to(first):
+                opened = np.array(len(self.nuisances) == first)
+                self.filter(replace(one, reopened=opened))
 
     def begin_regime(self, first: int, model: FilterModel) -> None:
         """Continue from the state before a log, with a model that may have one more step."""
@@ -228,7 +246,9 @@ class PublishedFilter:
                 wander.stop, wander.stop
             )
         reopens = (s.first == k and (s.kind == "reset" or not s.declared) for s in space.steps)
-        if k and any(reopens):  # the rate has its prior again since the log before
+        if k and (
+            own.reopened or any(reopens)
+        ):  # the rate has its prior again since the log before
             fresh_rate = move[:, space.rate]
             prior = constants.PUBLISHED_RATE_STD**2 * model.together
             noise += fresh_rate @ prior @ fresh_rate.T

@@ -332,6 +332,9 @@ class _Tracker:
                 self.alarmed = False
             self._filter(k)
             self._detect(k, *worst_window(self.sums[: k + 2], self.first))
+            window, size = worst_window(self.sums[: k + 2], self.first)
+            if size > constants.BEGUN_GATE:  # an older rate may hold no more
+                self.published.reopen(window)
             self._publish(k)
         return self._track()
 

@@ -45,7 +45,8 @@ def test_the_published_filter_is_the_joint_gaussian_given_all_logs(
     The rates have a weak prior, again after the reset before log 9: it costs a digit.
     """
     monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, ("acc", "delta_e")[:n]))
-    monkeypatch.setattr(constants, "SUSPICION_GATE", np.inf)
+    for gate in ("SUSPICION_GATE", "BEGUN_GATE"):
+        monkeypatch.setattr(constants, gate, np.inf)
     history = awkward_history(np.random.default_rng(1))
     followed = track(history, stage)
     found = smooth(history, followed, stage)

@@ -67,6 +67,7 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
         monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, sources[:n]))
         monkeypatch.setattr(constants, "OUTLIER_GATE", inf)
         monkeypatch.setattr(constants, "SUSPICION_GATE", inf)
+        monkeypatch.setattr(constants, "BEGUN_GATE", inf)
 
     return choose
 
@@ -566,7 +567,9 @@ def test_one_log_only_is_tracked(stage: Stage) -> None:
         weight /= (0.05 * scale) ** 2 + constants.LN_ZETA_STD**2
         weight /= weight.sum()
         # The published filter has the geometric mean of the factor, and the mean wander.
-        variance = 25e-8 * (np.exp(2 * weight @ np.log(scale)) + weight @ (grid.wander * scale) ** 2)
+        variance = 25e-8 * (
+            np.exp(2 * weight @ np.log(scale)) + weight @ (grid.wander * scale) ** 2
+        )
         std = np.sqrt(variance * prior / (variance + prior))
         np.testing.assert_allclose(found.ln_frequency_std, std, rtol=0.01)
         assert (found.drift == 0).all()
@@ -672,7 +675,7 @@ def test_nothing_to_judge_is_consistent() -> None:
 def test_a_machine_that_runs_in_and_wears_out_is_held(monkeypatch: pytest.MonkeyPatch) -> None:
     """Neither the first logs nor a rate of long ago make the last drift more certain than it is.
 
-    Without settling, and without rates that change, half of the drifts are beyond 90 % intervals.
+    Without settling, and without a rate that is new, half of the drifts are beyond 90 % intervals.
     """
 
     def held() -> float:
@@ -680,6 +683,6 @@ def test_a_machine_that_runs_in_and_wears_out_is_held(monkeypatch: pytest.Monkey
 
     now = held()
     monkeypatch.setattr(constants, "SETTLING", ((0.0, 1.0),))
-    monkeypatch.setattr(constants, "CHANGING_RATES", ((0.03, 1e-5, 1.0),))
+    monkeypatch.setattr(constants, "BEGUN_GATE", inf)
     assert now > 0.7
     assert held() < now - 0.2
