@@ -73,7 +73,7 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
 
 
 def shown(wander: Wander) -> Wander:
-    """Return the setting of the published filter: as that of the bank, with a weak prior of rates."""
+    """Return the setting of the published filter: that of the bank, with a weak prior of rates."""
     return replace(wander, rate=constants.PUBLISHED_RATE_STD)
 
 
