@@ -333,7 +333,8 @@ class _Tracker:
             self._filter(k)
             self._detect(k, *worst_window(self.sums[: k + 2], self.first))
             window, size = worst_window(self.sums[: k + 2], self.first)
-            if size > constants.BEGUN_GATE:  # an older rate may hold no more
+            # An older rate may hold no more, unless it is an outlier that deviates.
+            if size > constants.BEGUN_GATE and not any(j >= window for j in self.outlying):
                 self.published.reopen(window)
             self._publish(k)
         return self._track()
