@@ -154,27 +154,12 @@ def _gains(
     gains["drift", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
-        healthy = before[before.hyperparameters.healthy]
-        gains["drift", "", j] = begun(model, checkpoints, now, j, healthy)[1] + place
+        anew = restart(model, before[before.hyperparameters.healthy])
+        anew = anew[~anew.hyperparameters.healthy]
+        gain = advance(model, anew, j, now).log_evidence - anew.log_evidence
+        unchanged = checkpoints[now].log_evidence - before.log_evidence
+        gains["drift", "", j] = gain - unchanged + place
     return gains
-
-
-def begun(
-    model: FilterModel,
-    checkpoints: Mapping[int, FilterBank],
-    now: int,
-    first: int,
-    before: FilterBank,
-) -> tuple[FilterBank, float]:
-    """Return the filters of a machine that changes anew since a log, and their log Bayes factor.
-
-    ``before`` are those filters of the checkpoint before it that are followed by the change.
-    """
-    anew = restart(model, before)
-    anew = anew[~anew.hyperparameters.healthy]
-    after = advance(model, anew, first, now)
-    unchanged = checkpoints[now].log_evidence - checkpoints[first - 1].log_evidence
-    return after, after.log_evidence - anew.log_evidence - unchanged
 
 
 def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:

@@ -16,8 +16,8 @@ ALARM_ROUTES = 3
 # Mean standardised innovation over a window, times the root of its length, that opens the weighing
 # of change hypotheses. Lower costs time only: what is published depends on the Bayes factor.
 SUSPICION_GATE = 4.0
-# The same from which published states allow for a change that began lately, and its probability.
-BEGUN_GATE, BEGUN_PROBABILITY = 3.0, 0.5
+# The same from which the published filter allows for a rate that is new since the window began.
+BEGUN_GATE = 3.0
 # Standardised innovations count at most so much there: a single one opens no weighing for long.
 MOST_INNOVATION = 6.0
 # The kind of a change is settled at these odds over all other kinds, or after so many logs.
@@ -58,6 +58,8 @@ RATE_NEAR, RATE_SHARE = 0.1, 0.75
 # Standard deviations of ln f and ln ζ about a mode's first estimate.
 LN_F_STD = 0.1
 LN_ZETA_STD = 1.0
+# Rate of ln f of the published filter per life: 0.7 % a log, far beyond any wear.
+PUBLISHED_RATE_STD = 1.0
 # Random walk of ln ζ per life.
 DAMPING_WALK = 0.5
 # Bias of ln f and ln ζ between two sources of one mode.

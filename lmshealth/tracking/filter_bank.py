@@ -5,7 +5,6 @@ weighted by its evidence. The sets form two groups: a healthy machine has no rat
 walk, a changing one has a rate. States are immutable: `predict` and `update` return a new bank.
 """
 
-from collections.abc import Collection
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -75,18 +74,19 @@ def hyperparameter_grid(n_sources: int) -> Hyperparameters:
         share *= (1 - chance) / len(walks)
         sizes = constants.SETTLING if r <= constants.SLOW_RATE else ((0.0, 1.0),)
         courses += [(w, r, d, 0.0, size, p * share) for size, p in sizes]
-    rows = []
-    disturbances = list(enumerate(product(_scales(n_sources), constants.WANDERS)))
-    for course, (number, (scales, wander)) in product(courses, disturbances):
-        size, logs, p = wander
-        keep = np.exp(-1 / logs) if logs else 0.0
-        weight = course[5] * prod(chance for _, chance in scales) * p
-        rows.append((*course[:5], size, keep, weight, number, *(scale for scale, _ in scales)))
-    table = np.array(rows)
-    prior = table[:, 7] / table[:, 7].sum()
-    walk, rate, drive, decay, settling, size, keep = table[:, :7].T
-    index, noise = table[:, 8].astype(int), table[:, 9:]
-    log_prior = np.log(prior)
+    disturbances = np.array(
+        [
+            (size, np.exp(-1 / logs) if logs else 0.0, p * prod(q for _, q in scales),
+             *(scale for scale, _ in scales))
+            for scales, (size, logs, p) in product(_scales(n_sources), constants.WANDERS)
+        ]
+    )  # fmt: skip
+    n, m = len(courses), len(disturbances)
+    walk, rate, drive, decay, settling, chances = np.repeat(np.array(courses), m, axis=0).T
+    size, keep, weight, *scales = np.tile(disturbances, (n, 1)).T
+    prior = chances * weight
+    log_prior, index = np.log(prior / prior.sum()), np.tile(np.arange(m), n)
+    noise = np.stack(scales, axis=1)
     return Hyperparameters(walk, rate, drive, noise, log_prior, decay, size, keep, settling, index)
 
 
@@ -184,13 +184,12 @@ class Innovation:
 class FilterModel:
     """State space and measurements of a history, as the filters use them.
 
-    Rates have their prior variance again before the logs `reopened`. `values` are the estimates
-    ``[ln f, ln ζ]``, ``(n_logs, 2 n_series)``, `scale_of` the index of the source of each row, and
-    `grid` the hyperparameters that a bank starts with.
+    `values` are the estimates ``[ln f, ln ζ]``, ``(n_logs, 2 n_series)``, `scale_of` the index of
+    the source of each row, and `grid` the hyperparameters that a bank starts with.
     """
 
-    def __init__(self, space: StateSpace, reopened: Collection[int] = ()) -> None:
-        self.space, self.reopened = space, frozenset(reopened)
+    def __init__(self, space: StateSpace) -> None:
+        self.space = space
         history, r = space.history, len(space.history.series)
         self.values = np.hstack([history.ln_frequency, history.ln_damping])
         self.there = np.isfinite(self.values)
@@ -256,8 +255,6 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
     """Predict all filters from the log before to log k, with the steps between."""
     space, own, state = model.space, bank.hyperparameters, bank.state.copy()
     level, rate, base, wander = space.level, space.rate, space.base, space.wander
-    if k in model.reopened:
-        _add(state, rate, own.rate_std**2, model.together)
     if k > 0 and space.seen[k]:
         keep = own.wander_keep[:, None, None]
         state[:, wander] *= keep
@@ -279,15 +276,15 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
         state[:, :size, :size] += noise.reshape(-1, size, size)
     for j, step in enumerate(space.steps):
         if step.first == k:
-            _begin_step(space, state, step, j)
+            begin_step(space, state, step, j)
     if k in space.history.baselines:
         state[:, base] = state[:, level]
         state[:, :, base] = state[:, :, level]
     return FilterBank(own, bank.log_weight, state)
 
 
-def _begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
-    """Add the variance of the j-th step of a state space to states that the caller owns."""
+def begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
+    """Add the variance of the j-th step of a state space to covariances that the caller owns."""
     jump = space.jump(j)
     variance = np.repeat(np.square(constants.JUMP_STD[step.kind]), space.n_modes)
     own = np.arange(jump.start, jump.stop)

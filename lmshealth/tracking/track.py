@@ -11,7 +11,6 @@ from typing import Any, Literal
 
 import numpy as np
 from scipy import stats
-from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth._private.result import Result
@@ -25,7 +24,6 @@ from lmshealth.tracking.change_detection import (
     N_CHECKPOINTS,
     ChangeHypothesis,
     add_to_sums,
-    begun,
     recent_loop_change,
     threshold,
     unexplained_loop_changes,
@@ -36,12 +34,12 @@ from lmshealth.tracking.filter_bank import (
     FilterBank,
     FilterModel,
     initial,
-    mixture,
     predict,
     restart,
     update,
 )
 from lmshealth.tracking.history import History, Step
+from lmshealth.tracking.published_filter import Nuisances, PublishedFilter, select_nuisances
 from lmshealth.tracking.state_space import StateSpace
 
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
@@ -140,6 +138,8 @@ class Track(Result):
     # innovations, and on all published ones where innovations are inconsistent, ``(n_epochs,)``.
     noise_scale: FloatArray
     widening: FloatArray
+    # Of the published filter, at every epoch; None of a track that was not filtered here.
+    nuisances: Nuisances | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
@@ -274,9 +274,9 @@ def track(history: History, stage: Stage | None = None) -> Track:
     >>> std = np.sqrt(np.diag(track.drift_cov[-1]))
     >>> for mode, drift, off in zip(track.modes, track.drift[-1], std):
     ...     print(f"{mode}: {drift:.1%} ± {off:.1%}")
-    roll: -5.9% ± 0.3%
+    roll: -6.0% ± 0.4%
     pitch: -5.7% ± 0.3%
-    yaw: -6.0% ± 0.3%
+    yaw: -6.1% ± 0.3%
     >>> [(event.kind, f"{track.recorded_at[event.epoch]:%d %B}") for event in track.events]
     [('alarm', '05 April')]
     """
@@ -298,7 +298,7 @@ class _Tracker:
     def __init__(self, model: FilterModel) -> None:
         self.model, self.history = model, model.space.history
         self.resets = {step.first for step in self.history.steps if step.kind == "reset"}
-        self.bank = initial(model)
+        self.bank, self.published = initial(model), PublishedFilter(model)
         # Banks after each of the last logs of the regime, and the first log of its windows.
         self.checkpoints: dict[int, FilterBank] = {}
         self.first = 1
@@ -328,12 +328,15 @@ class _Tracker:
         for k in range(len(self.history.logs)):
             if k in self.resets and k:
                 self._begin_regime(self.bank, k, anew=True)
+                self.published.begin_regime(k, self.model)
                 self.alarmed = False
             self._filter(k)
-            window = worst_window(self.sums[: k + 2], self.first)
-            if self._detect(k, *window):
-                window = worst_window(self.sums[: k + 2], self.first)
-            self._publish(k, *window)
+            self._detect(k, *worst_window(self.sums[: k + 2], self.first))
+            window, size = worst_window(self.sums[: k + 2], self.first)
+            # An older rate may hold no more, unless it is an outlier that deviates.
+            if size > constants.BEGUN_GATE and not any(j >= window for j in self.outlying):
+                self.published.reopen(window)
+            self._publish(k)
         return self._track()
 
     def _begin_regime(self, bank: FilterBank, first: int, *, anew: bool = False) -> None:
@@ -360,10 +363,11 @@ class _Tracker:
         self.nis[k], self.innovations[k] = found.nis, np.nan
         self.innovations[k, found.rows[kept]] = found.standardised[kept]
         self.bank = self.checkpoints[k] = bank.pruned()
+        self.published.select(select_nuisances(self.model, self.bank, found, k))
         self.checkpoints.pop(k - N_CHECKPOINTS, None)
 
-    def _detect(self, k: int, window: int, size: float) -> bool:
-        """Weigh a suspected change, and raise the alarm of a drift: whether a change is adopted.
+    def _detect(self, k: int, window: int, size: float) -> None:
+        """Weigh a suspected change and adopt it, and raise the alarm of a drift.
 
         The mean innovation is largest since the log `window`.
         """
@@ -384,7 +388,7 @@ class _Tracker:
                 if not change.settled(k):
                     self.open = change
                 elif self._adopt(change, k):
-                    return True
+                    return
         # A single log that deviates may be an outlier or the first after a step, and an open change
         # need not be damage: later logs decide.
         waiting = self.open is not None and not self.open.settled(k)
@@ -392,10 +396,9 @@ class _Tracker:
         lone = suspected is not None and k - suspected <= 1
         if evidence >= threshold() and not waiting and not lone:
             self._alarm(k, evidence)
-        return False
 
     def _adopt(self, change: ChangeHypothesis, k: int) -> bool:
-        """Add a change to the model and filter again from the checkpoint before it.
+        """Add a change to the model and filter again from the checkpoint before it, if adopted.
 
         A drift that is no damage, or follows an alarm, is not adopted.
         """
@@ -413,6 +416,7 @@ class _Tracker:
             before = before.padded(self.model.space.size)
         self.widening = self._widened(k, self._dof())
         self._begin_regime(before, j + 1)
+        self.published.begin_regime(j, self.model)
         for again in range(j, k + 1):
             self._filter(again)
         if change.damage:
@@ -424,7 +428,8 @@ class _Tracker:
         if self.alarmed:
             return
         self.alarmed = True
-        mean, cov = self.bank.collapse(self.size)
+        mean, cov = self.published.kalman.x[: self.size], self.published.kalman.P
+        cov = cov[: self.size, : self.size]
         contrast = self.model.space.drift
         drift = contrast @ mean
         std = np.sqrt(np.maximum(np.diag(contrast @ cov @ contrast.T), 0.0))
@@ -432,23 +437,11 @@ class _Tracker:
         mode, size, error = self.history.modes[i], float(drift[i]), float(std[i])
         self.alarms.append(Event("alarm", k, mode, "", size, error, evidence, False, k))
 
-    def _publish(self, k: int, window: int, size: float) -> None:
+    def _publish(self, k: int) -> None:
         """Record the state of log k, and the noise scale of each source."""
-        mean, cov = self.bank.collapse(self.size)
-        other, chance = None, 0.5
-        if k in self.outlying and k - 1 in self.checkpoints:
-            # As likely an outlier as the first log after a step: publish the mixture of both.
-            stepped = self.model.with_step(Step.found("step", k, len(self.history.logs)))
-            before = self.checkpoints[k - 1].padded(stepped.space.size)
-            other = update(stepped, predict(stepped, before, k), k, outliers=False)[0]
-        elif size > constants.BEGUN_GATE and window - 1 in self.checkpoints:
-            # No alarm yet, or an older rate: the rate may be another one since then.
-            before = self.checkpoints[window - 1]
-            other, evidence = begun(self.model, self.checkpoints, k, window, before)
-            chance = float(expit(evidence + logit(constants.BEGUN_PROBABILITY)))
-        if other is not None:
-            means, covs = zip((mean, cov), other.collapse(self.size), strict=True)
-            mean, cov = mixture(np.array([1 - chance, chance]), np.stack(means), np.stack(covs))
+        kalman = self.published.kalman
+        state = self.published.undecided() if k in self.outlying else (kalman.x, kalman.P)
+        mean, cov = (own[(slice(self.size),) * own.ndim] for own in state)
         contrast = self.model.space.drift
         self.mean[k], self.variance[k] = mean, cov.diagonal()
         self.drift_cov[k] = contrast @ cov @ contrast.T
@@ -498,7 +491,7 @@ class _Tracker:
             ln_damping_std=std[:, space.damping],
             drift=drift,
             drift_cov=drift_cov * widening[:, None, None] ** 2,
-            effects=_effects(space, self.bank, self.model.sources),
+            effects=_effects(space, self.published.kalman, self.bank, self.model.sources),
             events=tuple(sorted([*self.alarms, *self._step_events()], key=lambda e: e.epoch)),
             steps=space.steps,
             outliers=tuple(
@@ -512,12 +505,13 @@ class _Tracker:
             innovations=self.innovations,
             noise_scale=self.noise_scale,
             widening=widening,
+            nuisances=Nuisances.stacked(self.published.nuisances),
         )
 
     def _step_events(self) -> list[Event]:
         """List the steps, detected and declared, mode by mode."""
         space, m = self.model.space, len(self.history.modes)
-        mean, cov = self.bank.collapse()
+        mean, cov = self.published.kalman.x, self.published.kalman.P
         events: list[Event] = []
         for j, step in enumerate(space.steps):
             if step.kind == "reset":
@@ -594,11 +588,12 @@ def _widening(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Floa
     return np.asarray(np.sqrt(factor))
 
 
-def _effects(space: StateSpace, bank: FilterBank, sources: tuple[str, ...]) -> tuple[Effect, ...]:
+def _effects(
+    space: StateSpace, kalman: Any, bank: FilterBank, sources: tuple[str, ...]
+) -> tuple[Effect, ...]:
     """List the effects that are no wear, after the last log."""
     modes = space.history.modes
-    mean, cov = bank.collapse()
-    std = np.sqrt(np.maximum(np.diag(cov), 0.0))
+    mean, std = kalman.x, np.sqrt(np.maximum(np.diag(kalman.P), 0.0))
     places = [(one.name, space.regressor(j).start) for j, one in enumerate(space.regressed)]
     places += [
         (f"{step.kind}:{step.name or step.source}", space.jump(j).start)

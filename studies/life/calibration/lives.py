@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from lmshealth.prognosis import constants
-from lmshealth.prognosis.remaining_life import early_life, rate_std
+from lmshealth.life import constants
+from lmshealth.life.remaining_life import early_life, rate_std
 from numpy.typing import NDArray
 
 from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening

@@ -29,8 +29,8 @@ from functools import cache
 
 import msgspec
 import numpy as np
-from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import parameters_with_limit, passages
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.remaining_life import parameters_with_limit, passages
 
 from lmshealth.errors import NotConverged
 from lmshealth.stage.description import Stage, load_stage

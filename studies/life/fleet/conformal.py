@@ -34,10 +34,10 @@ from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
-from lmshealth.prognosis import constants, remaining_life
-from lmshealth.prognosis.fleet_prior import ended_lives
-from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import prognose
+from lmshealth.life import constants, remaining_life
+from lmshealth.life.fleet_prior import ended_lives
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.remaining_life import prognose
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from lmshealth.prognosis import constants
-from lmshealth.prognosis import life_likelihood as model
+from lmshealth.life import constants
+from lmshealth.life import likelihood as model
 from numpy.typing import NDArray
 
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging

@@ -24,15 +24,15 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
-from lmshealth.prognosis.fleet_prior import (
+from lmshealth.life.fleet_prior import (
     FleetPrior,
     MachineEvidence,
     fleet_priors,
     machine_evidence,
     needs_fleet_prior,
 )
-from lmshealth.prognosis.life_posterior import LifePosterior, fit_life
-from lmshealth.prognosis.remaining_life import passages
+from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.remaining_life import passages
 from numpy.typing import NDArray
 from scipy.stats import sem
 
