@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from lmshealth.life import constants
-from lmshealth.life.remaining_life import early_life, rate_std
 from numpy.typing import NDArray
 
+from lmshealth.life import constants
+from lmshealth.life.remaining_life import early_life, rate_std
 from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD

@@ -34,11 +34,11 @@ from typing import Any, TypeVar
 from unittest.mock import patch
 
 import numpy as np
+
 from lmshealth.life import constants, remaining_life
 from lmshealth.life.fleet_prior import ended_lives
 from lmshealth.life.posterior import LifePosterior, fit_life
 from lmshealth.life.remaining_life import prognose
-
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.claims import Claim, counted, number

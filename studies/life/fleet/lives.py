@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 import msgspec
 import numpy as np
-from lmshealth.life import constants
-from lmshealth.life import likelihood as model
 from numpy.typing import NDArray
 
+from lmshealth.life import constants
+from lmshealth.life import likelihood as model
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.stage.priors import Lognormal

@@ -24,6 +24,9 @@ from dataclasses import replace
 from functools import cache
 
 import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import sem
+
 from lmshealth.life.fleet_prior import (
     FleetPrior,
     MachineEvidence,
@@ -33,9 +36,6 @@ from lmshealth.life.fleet_prior import (
 )
 from lmshealth.life.posterior import LifePosterior, fit_life
 from lmshealth.life.remaining_life import passages
-from numpy.typing import NDArray
-from scipy.stats import sem
-
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior

@@ -26,8 +26,10 @@ from lmshealth.io.log import Metadata
 from lmshealth.modal.modes import Modes
 
 Answer = dict[str, Any]
-# How a life is assessed: as published, or, by the earlier revision alone, in a shorter way.
-PUBLISHED, WITHOUT_CHAINS, HEALTH_ALONE = "as published", "life without chains", "health alone"
+# How a life is assessed: with the chains that are published; by importance sampling, as after a log
+# that only updates a life; or, by the earlier revision alone, in a shorter way.
+PUBLISHED, IMPORTANCE = "as published", "by importance sampling"
+WITHOUT_CHAINS, HEALTH_ALONE = "life without chains", "health alone"
 _LEVELS = (np.arange(101) + 0.5) / 101  # of the quantiles that stand for draws
 _SHIPPED = "lms-y.map.csv"
 _NEVER_KM = 1e6  # for a limit that is never reached
@@ -110,7 +112,12 @@ def _shortened(how: str) -> Iterator[Answer]:
     if how == PUBLISHED:
         yield {}
         return
-    module = import_module("lmshealth.batch.assess")
+    module: Any = import_module("lmshealth.batch.assess")
+    if how == IMPORTANCE:
+        fit = module.fit_life
+        with patch.object(module, "fit_life", lambda *a, **k: fit(*a, **(k | {"chains": False}))):
+            yield {"epochs": 1}
+        return
     name = "prognose_with_posterior"
 
     def no_life(*_: Any, **__: Any) -> None:

@@ -29,9 +29,9 @@ import msgspec
 import numpy as np
 
 from lmshealth import LogEstimates, assess, identify, load_stage, read_log
-from lmshealth.life.verdict import degraded_below, verdict_of
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
+from lmshealth.life.verdict import degraded_below, verdict_of
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
