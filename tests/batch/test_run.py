@@ -276,22 +276,6 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     assert drawn == ["test-A.html"] * 2
 
 
-def test_known_parts_are_not_computed_again() -> None:
-    """Of the parts of an assessment only those whose inputs are new are computed."""
-    computed: list[int] = []
-
-    def double(x: int) -> int:
-        computed.append(x)
-        return 2 * x
-
-    first = assessing.Parts({})
-    assert list(first.map(int, double, [1, 2])) == [2, 4]
-    second = assessing.Parts(first.used)
-    assert list(second.map(int, double, [2, 3])) == [4, 6]
-    assert computed == [1, 2, 3]
-    assert len(second.used) == 2
-
-
 @pytest.mark.slow
 def test_rows_of_known_logs_are_not_made_again(
     tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
@@ -720,7 +704,7 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
     whole = assessing._assess
 
-    def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
+    def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         if readings[0].metadata.stage == "other-A":
             raise ZeroDivisionError("a mistake of ours")
         return whole(readings, *given, **options)
@@ -749,7 +733,7 @@ def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     machines: list[str] = []
     whole = assessing._assess
 
-    def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Assessment:
+    def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         machines.append(str(readings[0].metadata.stage))
         return whole(readings, *given, **options)
 

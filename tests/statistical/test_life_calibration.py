@@ -14,9 +14,10 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
+from lmshealth.life.density import LifeDensity
 from lmshealth.life.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import LifeDensity, fit_life
+from lmshealth.life.posterior import fit_life
 from lmshealth.life.remaining_life import _usage, passages
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -24,7 +25,7 @@ from studies.harness.data.histories import map_std
 from studies.harness.metrics import place
 from studies.harness.ranks import N_DRAWS
 from studies.life.calibration.lives import draw
-from studies.life.calibration.run import N_POSTERIOR, machine, quantities, true_quantities
+from studies.life.calibration.run import machine, quantities, true_quantities
 from studies.life.fleet.lives import YOUNG, draw_fleet
 from studies.life.fleet.lives import draw as draw_machine
 from studies.life.fleet.run import (
@@ -51,6 +52,8 @@ from tests.oracles import cdf_at
 from tests.statistical.evidence import uniform
 
 N_LOGS = 12
+# Lives follow the law and the map: without a change of another course, or of a mode alone.
+BY_LAW = f"{TEMPERATURE}\n[life]\nfree = 0.0\nlone_mode = 0.0\n"
 
 
 def draw_history(rng: np.random.Generator, stage: Stage) -> tuple[History, float, float]:
@@ -66,7 +69,8 @@ def draw_history(rng: np.random.Generator, stage: Stage) -> tuple[History, float
     temperature = 21 + 4 * rng.standard_normal(N_LOGS)
     drift += np.outer(temperature - 21, rng.normal(0, 1e-3, 2))
     steps = np.sqrt(np.diff(clock) / now)[:, None] * rng.standard_normal((N_LOGS - 1, 2))
-    drift[1:] += rng.choice(constants.WALK_STDS) * np.cumsum(steps, axis=0)
+    walk = rng.choice(constants.WALK_STDS, p=constants.WALK_PRIOR)
+    drift[1:] += walk * np.cumsum(steps, axis=0)
     deviation = rng.choice(constants.DEVIATION_STDS, p=constants.DEVIATION_PRIOR)
     steps = np.sqrt(np.diff(clock) / now) * rng.standard_normal(N_LOGS - 1)
     off = deviation * np.r_[0, np.cumsum(steps)]
@@ -104,7 +108,8 @@ def level_of_health(
     """Posterior probability of less health now than the truth: the law times how far it is off."""
     y, weight = integrated(density)
     drawn = rng.choice(y, n, p=weight / weight.sum())[:, None]
-    off, _ = density.deviations(drawn, np.array([density.likelihood.data.now]), rng)
+    nuisances, now = density.draw_nuisances(drawn, rng), np.array([density.likelihood.data.now])
+    off = density.deviations(drawn, nuisances, now, rng)
     return float(np.mean((1 - drawn) * np.exp(off[:, 0]) < truth))
 
 
@@ -115,8 +120,8 @@ def test_losses_by_laws_are_calibrated(
 
     Control: on the same lives a map that is taken as exact.
     """
-    honest = make_stage(tmp_path / "honest", (FADING,), model_std=0.2, tail=TEMPERATURE)
-    proud = make_stage(tmp_path / "proud", (FADING,), model_std=0.0, tail=TEMPERATURE)
+    honest = make_stage(tmp_path / "honest", (FADING,), model_std=0.2, tail=BY_LAW)
+    proud = make_stage(tmp_path / "proud", (FADING,), model_std=0.0, tail=BY_LAW)
     found, health, wrong = [], [], []
     for _ in range(claims.trials):
         history, loss, left = draw_history(rng, honest)
@@ -139,9 +144,10 @@ def test_health_off_its_law_is_calibrated(
     Control: taken never to leave its law, it is not.
     """
     monkeypatch.setattr(constants, "WALK_STDS", (1e-5, 5e-4, 1.5e-3))
+    monkeypatch.setattr(constants, "WALK_PRIOR", (0.3, 0.3, 0.4))
     monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.13))
     monkeypatch.setattr(constants, "DEVIATION_PRIOR", (0.1, 0.9))
-    stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=TEMPERATURE)
+    stage = make_stage(tmp_path, (FADING,), model_std=0.2, tail=BY_LAW)
     found, wrong = [], []
     for _ in range(claims.trials):
         history, _, left = draw_history(rng, stage)
@@ -164,8 +170,7 @@ def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Clai
     for _ in range(claims.trials):
         drawn = draw(rng, machine())
         truth = np.minimum(true_quantities(drawn, rng), horizon)
-        found = fit_life(drawn.history, machine(), int(rng.integers(1 << 32)), chains=False,
-                         n_draws=N_POSTERIOR)  # fmt: skip
+        found = fit_life(drawn.history, machine(), int(rng.integers(1 << 32)), chains=False)
         draws = np.minimum(quantities(found, drawn.now, rng), horizon)
         draws = draws[rng.permutation(len(draws))[:N_DRAWS]]
         worse = [1 - draws[:, :2], 0.8 * draws[:, 2:4], draws[:, 4:5] - 0.2, draws[:, 5:] / 4]

@@ -86,9 +86,7 @@ def pictures(made: Assessment) -> dict[str, tuple[Draw, tuple[float, float]]]:
             figures.plot_posterior, health=health, parameters=health.parameters[:2]
         ),
         "health": partial(figures.plot_health, health=health, parameter=PARAMETER, limit=limit),
-        "life": partial(
-            figures.plot_life, prognosis=prognosis, parameter=PARAMETER, health=health
-        ),
+        "life": partial(figures.plot_life, prognosis=prognosis, parameter=PARAMETER),
         "survival": partial(
             figures.plot_survival, prognosis=prognosis, service=made.service()
         ),
