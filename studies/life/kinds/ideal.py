@@ -18,7 +18,7 @@ from studies.life.kinds.worlds import N_LOGS, REFERENCE_C, Life
 # Priors: ln of a parameter now (that of the description), intercept, slope (per K), jump.
 HEALTH_STD, INTERCEPT_STD, SLOPE_STD, JUMP_STD = 0.3, 0.03, 1e-3, 0.01
 # Sizes of the map's relative errors with their probabilities, as the description states them.
-MAP_ERRORS = (0.05, 0.75), (0.15, 0.25)
+MAP_ERRORS = (0.05, 0.75), (0.10, 0.25)
 _EACH = range(len(MODES))
 _COARSE, _FINE = {1: 241, 2: 61}, {1: 241, 2: 81}
 _UNLIKELY = 1e-6  # density over its maximum beyond which the fine grid ends
