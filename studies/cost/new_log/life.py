@@ -22,6 +22,7 @@ from lmshealth.batch.assess import Machine, assess, assess_all
 from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
+from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment
@@ -101,6 +102,7 @@ def compared(updated: Assessment, fresh: Assessment, short: Assessment) -> Row:
     return {
         "apart": apart(updated.prognosis, fresh.prognosis),
         "control_apart": apart(updated.prognosis, short.prognosis),
+        "health_apart": health_apart(updated.health, fresh.health),
     }
 
 
@@ -115,6 +117,17 @@ def apart(one: Prognosis | None, other: Prognosis | None) -> float:
         # What no draw shows may have a probability of one effective draw.
         errors.append(max(travel.std() / np.sqrt(n), found.horizon / n))
     return float(abs(means[0] - means[1]) / np.hypot(*errors))
+
+
+def health_apart(one: Health | None, other: Health | None) -> float:
+    """Return how far means of any health parameter now are apart in standard errors."""
+    assert one is not None and other is not None
+    means = [found.samples[-1].mean(axis=0) for found in (one, other)]
+    variances = [
+        found.samples[-1].var(axis=0) / np.minimum(found.ess[-1], found.samples.shape[1])
+        for found in (one, other)
+    ]
+    return float(np.max(np.abs(means[0] - means[1]) / np.sqrt(np.sum(variances, axis=0))))
 
 
 if __name__ == "__main__":

@@ -8,9 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.life import constants
+from lmshealth.life.likelihood import NO_MODE, lone_kernel, scatter_prior
 from lmshealth.life.remaining_life import early_life, rate_std
-from lmshealth.stage.degradation_laws import Accelerating, HertzWear, Law, Loosening
-from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.life.scenarios import DegradationPath, list_scenarios
+from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Series, Step
@@ -22,35 +23,37 @@ N_LOGS = 60
 NOW_KM = 2000.0, 0.7
 
 
-# Lives in which the modes jump once, and how far ahead in m a life is followed step by step.
-STEPS, FINE = 0.15, 2000.0
+# Lives of which the tracker reports a step, and how far ahead in m a life is followed step by step.
+STEPS, FINE = 0.3, 2000.0
 
 
 @dataclass(frozen=True)
 class Part:
     """What really becomes of a health parameter."""
 
-    law: Law  # Of the scenario it takes
-    theta: Array  # Natural parameters of the law, lengths in m
-    begin: float  # Travel in m at which the law begins, and at which health jumps (inf: never)
-    step: float
-    jump: float  # Factor of the jump
-    off: Array  # Ln of health over its law at each log, shape ``(n_logs,)``
+    path: DegradationPath  # Of the scenario: its law, and where that and the steps begin
+    theta: Array  # Natural parameters of the path, lengths in m
+    off: Array  # Ln of health over its path at each log, shape ``(n_logs,)``
     rate: float  # Variance of it per m
 
+    @property
+    def changes(self) -> bool:
+        """Whether a law with parameters holds."""
+        return bool(self.path.law.names)
+
     def by_law(self, travel: Array) -> Array:
-        """Health by the law and the jump alone, at travels since the baseline."""
-        health = self.law.health(self.theta[None], np.maximum(travel - self.begin, 0.0))[0]
-        return np.asarray(health * np.where(travel >= self.step, self.jump, 1.0))
+        """Health by the law and the steps alone, at travels since the baseline."""
+        return self.path.health(self.theta[None], travel)[0]
 
     def left(self, rng: np.random.Generator, now: float, limit: float, horizon: float) -> float:
         """Follow the parameter from now on until its limit, in m; inf past the horizon."""
         left = self._left_by_law(rng, now, limit, horizon)
-        if left <= 0 or not self.law.names:
+        if left <= 0 or not self.changes:
             return left
         if left <= horizon:
-            left *= rng.lognormal(0.0, rate_std(self.law) * np.sqrt(np.log2(1 + left / now)))
-        proven = now + early_life(self.law, limit, rng)
+            law = self.path.law
+            left *= rng.lognormal(0.0, rate_std(law) * np.sqrt(np.log2(1 + left / now)))
+        proven = now + early_life(self.path.law, limit, rng)
         hazard = rng.gamma(constants.UNSEEN_ONSETS) / proven
         onset = rng.exponential() / hazard if hazard > 0 else np.inf
         growth = constants.UNSEEN_GROWTH
@@ -61,10 +64,13 @@ class Part:
         self, rng: np.random.Generator, now: float, limit: float, horizon: float
     ) -> float:
         """Follow the parameter by its law and its deviation alone."""
-        start = limit * np.exp(-self.off[-1]) / (self.jump if now >= self.step else 1.0)
-        closed = self.begin + self.law.passage(self.theta[None], np.array([start]))[0] - now
+        start = limit * np.exp(-self.off[-1])
+        closed = float(self.path.passage(self.theta[None], start)[0]) - now
+        # A parameter that gains may have been below the limit before.
+        if closed <= 0 and self.by_law(np.array([now]))[0] > start:
+            return np.inf
         if self.rate == 0 or closed <= 0:
-            return float(closed) if closed <= horizon else np.inf
+            return closed if closed <= horizon else np.inf
         ahead = np.arange(0.0, horizon, FINE)
         walk = np.cumsum(np.sqrt(self.rate * FINE) * rng.standard_normal(ahead.size - 1))
         with np.errstate(divide="ignore"):
@@ -79,6 +85,7 @@ class Life:
 
     history: History
     parts: tuple[Part, ...]
+    lone: int  # Index of the mode that moves alone, or `NO_MODE`
 
     @property
     def now(self) -> float:
@@ -90,8 +97,8 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     """Draw a life of 60 logs, in which roll and pitch are seen.
 
     In half of the lives a second source sees pitch. A twentieth of estimates and temperatures is
-    missing; now and then the servo is retuned, the second source's sensor is changed, or health
-    jumps.
+    missing; now and then the servo is retuned, the sensor of the second source is changed, or the
+    tracker reports a step, which is true as often as the estimator's prior has it.
     """
     names = machine.informative[:2]
     travel = _travel(rng)
@@ -104,12 +111,12 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     covariates, steps = _covariates(rng), _steps(rng, series)
     if first is not None:
         steps = tuple(sorted([*steps, Step.found("step", first, N_LOGS)], key=lambda s: s.first))
-    level = _modes(rng, machine, names, clock, _path(machine, clock, parts))
+    level, lone = _modes(rng, machine, names, clock, _path(machine, clock, parts))
     level += _covariate_effects(rng, machine, covariates, len(names))
     mode = np.array([names.index(one.mode) for one in series])
     values = level[:, mode] + _offsets(rng, series, mode, steps)
     cov = _covariance(rng, mode)
-    scale = rng.choice(constants.NOISE_SCALES, p=constants.NOISE_SCALE_PRIOR)
+    scale = rng.choice(constants.NOISE_SCALES, p=shares(machine, "noise_scale"))
     noise = np.linalg.cholesky(cov) @ rng.standard_normal((N_LOGS, mode.size, 1))
     r = len(series)
     both = np.zeros((N_LOGS, 2 * r, 2 * r))
@@ -119,7 +126,7 @@ def draw(rng: np.random.Generator, machine: Stage) -> Life:
     history = make_history(
         names, travel, estimates, series=series, covariates=covariates, steps=steps, missing=missing
     )
-    return Life(history, parts)
+    return Life(history, parts, lone)
 
 
 def _travel(rng: np.random.Generator) -> Array:
@@ -133,46 +140,34 @@ def _parts(
 ) -> tuple[Part, ...]:
     """Draw scenarios and deviations from their priors, until a life stays inside the map."""
     assert machine.modal_map is not None
-    step = np.inf if first is None else float(clock[first - 1 : first + 1].mean())
+    steps = () if first is None else (float(clock[first - 1 : first + 1].mean()),)
+    now, free = float(clock[-1]), machine.description.life.free
+    scenarios = list_scenarios(machine.parameters, steps, now, free)
+    weights = np.array([one.weight for one in scenarios])
     while True:
-        deviation = rng.choice(constants.DEVIATION_STDS, p=constants.DEVIATION_PRIOR)
-        rate = deviation**2 / clock[-1]
-        parts = tuple(_part(rng, one, clock, step, rate) for one in machine.parameters)
+        scenario = scenarios[rng.choice(weights.size, p=weights / weights.sum())]
+        theta = scenario.split(scenario.natural(scenario.draw(rng, 1))[0])
+        pairs = zip(scenario.paths, theta, strict=True)
+        deviation = rng.choice(constants.DEVIATION_STDS, p=shares(machine, "deviation"))
+        parts = tuple(part_of(rng, path, own, float(deviation), clock) for path, own in pairs)
         with np.errstate(divide="ignore"):
             if machine.modal_map.inside(np.log(_path(machine, clock, parts))).all():
                 return parts
 
 
-def _part(
-    rng: np.random.Generator, parameter: ParameterSpec, clock: Array, step: float, rate: float
+def part_of(
+    rng: np.random.Generator, path: DegradationPath, theta: Array, deviation: float, clock: Array
 ) -> Part:
-    """Draw what becomes of a parameter: its law, where that begins, and how health wanders."""
-    weight = np.array([law.weight for law in parameter.laws])
-    law = parameter.laws[rng.choice(weight.size, p=weight / weight.sum())]
-    anew = np.isfinite(step) and law.names and rng.random() < 0.5
+    """Draw how health wanders about a path, with a standard deviation by the last log."""
+    rate = deviation**2 / float(clock[-1])
     steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
-    return Part(
-        law=law,
-        theta=_of_law(rng, law),
-        begin=step if anew else 0.0,
-        step=step,
-        jump=float(np.exp(constants.STEP_PRIOR.std * rng.standard_normal())),
-        off=np.cumsum(steps),
-        rate=float(rate),
-    )
+    return Part(path, theta, np.cumsum(steps), rate)
 
 
-def _of_law(rng: np.random.Generator, law: Law) -> Array:
-    """Draw the natural parameters of a law, lengths in m."""
-    first, second = rng.uniform(size=(2, 1))
-    if isinstance(law, Accelerating):
-        wear = [1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
-        return np.concatenate([*wear, law.slow.quantile(rng.uniform(size=1))])
-    if isinstance(law, HertzWear):
-        return np.concatenate([1000 * law.life_km.quantile(first), law.exponent.quantile(second)])
-    if isinstance(law, Loosening):
-        return np.concatenate([law.floor.quantile(first), 1000 * law.life_km.quantile(second)])
-    return np.empty(0)
+def shares(stage: Stage, field: str) -> Array:
+    """Return the prior of the walk, the noise scale or the deviation, of sum 1."""
+    weight = np.array(getattr(scatter_prior(stage), field))
+    return np.asarray(weight / weight.sum())
 
 
 def _path(machine: Stage, clock: Array, parts: tuple[Part, ...]) -> Array:
@@ -184,8 +179,11 @@ def _path(machine: Stage, clock: Array, parts: tuple[Part, ...]) -> Array:
 
 def _modes(
     rng: np.random.Generator, machine: Stage, names: tuple[str, ...], clock: Array, path: Array
-) -> Array:
-    """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
+) -> tuple[Array, int]:
+    """Ln f of the modes: health through a map that is wrong, and what moves without health.
+
+    Last the index of the mode that moves alone, or `NO_MODE`.
+    """
     x = np.log(path)
     level, wrong_by = machine.drift(x, names), map_std(rng, machine)
     for j in range(x.shape[1]):
@@ -193,10 +191,32 @@ def _modes(
         alone[:, j] = x[:, j]
         error = wrong_by * rng.standard_normal(len(names))
         level = level + error * machine.drift(alone, names)
-    walk = rng.choice(constants.WALK_STDS) * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
-    level = level + np.cumsum(walk[:, None] * rng.standard_normal(level.shape), axis=0)
+    moved, lone = without_health(rng, machine, clock, len(names))
     known = np.log([mode.frequency_hz for mode in machine.modes if mode.name in names])
-    return np.asarray(level + known + constants.INTERCEPT_STD * rng.standard_normal(len(names)))
+    return np.asarray(level + moved + known), lone
+
+
+def without_health(
+    rng: np.random.Generator, stage: Stage, clock: Array, n_modes: int
+) -> tuple[Array, int]:
+    """Draw intercepts, random walks, and the drift of a mode that moves alone.
+
+    Of ln f at each log, ``(n_logs, n_modes)``, and the index of that mode, or `NO_MODE`.
+    """
+    which, alone = rng.random(), stage.description.life.lone_mode
+    lone = int(which / alone) if which < n_modes * alone else NO_MODE
+    if lone == NO_MODE:
+        walk = rng.choice(constants.WALK_STDS, p=shares(stage, "walk"))
+    else:
+        stds, weights = zip(*constants.LONE_WALKS, strict=True)
+        walk = rng.choice(stds, p=weights)
+    steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
+    drift = np.cumsum(steps[:, None] * rng.standard_normal((clock.size, n_modes)), axis=0)
+    if lone != NO_MODE:
+        cov = constants.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]))
+        # It is 0 at the baseline: no Cholesky factor.
+        drift[:, lone] += rng.multivariate_normal(np.zeros(clock.size), cov, method="eigh")
+    return drift + constants.INTERCEPT_STD * rng.standard_normal(n_modes), lone
 
 
 def _covariates(rng: np.random.Generator) -> dict[str, Array]:

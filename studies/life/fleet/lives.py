@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.life import constants
-from lmshealth.life import likelihood as model
+from lmshealth.life.likelihood import scatter_prior
+from lmshealth.life.scenarios import DegradationPath, laws_of
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import make_history, map_std
-from studies.life.calibration.lives import Part
+from studies.life.calibration.lives import Part, part_of, shares, without_health
 
 Array = NDArray[np.float64]
 
@@ -73,7 +74,7 @@ def draw_fleet(rng: np.random.Generator, stage: Stage) -> Stage:
         msgspec.structs.replace(wear, life_km=life_km, weight=share),
         msgspec.structs.replace(none, weight=1 - share),
     )
-    parameters = model.scatter_prior(stage)
+    parameters = scatter_prior(stage)
     scatter = []
     for name in ScatterPrior.__slots__:
         own = np.array(getattr(parameters, name))
@@ -118,7 +119,7 @@ def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
     }
     names = fleet.informative[:2]
     std = rng.uniform(3e-4, 2e-3) * np.exp(0.3 * rng.standard_normal((n, 2)))
-    scale = rng.choice(constants.NOISE_SCALES, p=_shares(fleet, "noise_scale"))
+    scale = rng.choice(constants.NOISE_SCALES, p=shares(fleet, "noise_scale"))
     values = _modes(rng, fleet, names, clock, path)
     for one in regressors(covariates, fleet):
         values += np.outer(one.values, one.prior_std * rng.standard_normal(2))
@@ -132,17 +133,11 @@ def draw(rng: np.random.Generator, fleet: Stage, age: Age) -> Life:
 
 def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, Array]:
     """Draw what becomes of the preload, and the path of ln health parameters that this makes."""
-    preload = fleet.parameters[0]
-    weight = np.array([law.weight for law in preload.laws])
-    law = preload.laws[rng.choice(weight.size, p=weight / weight.sum())]
-    theta = np.empty(0)
-    if isinstance(law, HertzWear):
-        first, second = rng.uniform(size=(2, 1))
-        theta = np.r_[1000 * law.life_km.quantile(first), law.exponent.quantile(second)]
-    deviation = rng.choice(constants.DEVIATION_STDS, p=_shares(fleet, "deviation"))
-    rate = float(deviation**2 / clock[-1])
-    steps = np.sqrt(rate * np.diff(clock, prepend=0.0)) * rng.standard_normal(clock.size)
-    part = Part(law, theta, 0.0, np.inf, 1.0, np.cumsum(steps), rate)
+    laws, weight = zip(*laws_of(fleet.parameters[0], fleet.description.life.free), strict=True)
+    path, now = DegradationPath(laws[rng.choice(len(laws), p=weight)], 0.0, ()), float(clock[-1])
+    theta = path.natural(path.draw(rng, 1, now), now)[0]
+    deviation = rng.choice(constants.DEVIATION_STDS, p=shares(fleet, "deviation"))
+    part = part_of(rng, path, theta, float(deviation), clock)
     with np.errstate(divide="ignore"):
         ln_preload = np.log(part.by_law(clock)) + part.off
     return part, np.column_stack([ln_preload, np.zeros(clock.size)])
@@ -151,17 +146,9 @@ def _part(rng: np.random.Generator, fleet: Stage, clock: Array) -> tuple[Part, A
 def _modes(
     rng: np.random.Generator, fleet: Stage, names: tuple[str, ...], clock: Array, path: Array
 ) -> Array:
-    """Ln f of the modes: health through a map that is wrong, an intercept, and a random walk."""
+    """Ln f of the modes: health through a map that is wrong, and what moves without health."""
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
     error = map_std(rng, fleet) * rng.standard_normal(len(names))
-    level = (1 + error) * fleet.drift(path, names)
-    walk = rng.choice(constants.WALK_STDS, p=_shares(fleet, "walk"))
-    steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
-    level = level + np.cumsum(steps[:, None] * rng.standard_normal(level.shape), axis=0)
+    moved, _ = without_health(rng, fleet, clock, len(names))
     known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])
-    return np.asarray(level + known + constants.INTERCEPT_STD * rng.standard_normal(len(names)))
-
-
-def _shares(fleet: Stage, field: str) -> Array:
-    weight = np.array(getattr(model.scatter_prior(fleet), field))
-    return np.asarray(weight / weight.sum())
+    return np.asarray((1 + error) * fleet.drift(path, names) + moved + known)

@@ -54,7 +54,6 @@ N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 4, LEAST: 2}, 12
 # Fleets with a prior from another fleet too.
 FOREIGN_FLEETS, TIMES = 20, 5.0
 ENOUGH = 5  # fleets, of which a mean has a standard error
-N_POSTERIOR = 2000
 DESCRIPTION, LEARNED, LAWS, KNOWN = "description", "learned", "learned, laws alone", "known"
 WORN, FOREIGN = "only the worn teach", "another fleet teaches"
 WAYS = (DESCRIPTION, LEARNED, LAWS, KNOWN, WORN, FOREIGN)
@@ -101,7 +100,7 @@ def one(kind: str, number: int) -> Row:
     mature = evidence_of(rng, fleet, kind, number)
     worn = {
         k: evidence for k, evidence in mature.items()
-        if evidence.laws["guide_preload"]["hertz-wear"].posterior >= SEEN_TO_WEAR
+        if evidence.laws["guide_preload"]["none"].posterior <= 1 - SEEN_TO_WEAR
     }  # fmt: skip
     sources = {LEARNED: mature, WORN: worn}
     if number < FOREIGN_FLEETS:
@@ -134,7 +133,7 @@ def evidence_of(
 
 def posterior(drawn: Life, stage: Stage, number: int) -> LifePosterior:
     """Fit a life under a prior."""
-    return fit_life(drawn.history, stage, [SEED, number], chains=False, n_draws=N_POSTERIOR)
+    return fit_life(drawn.history, stage, [SEED, number], chains=False)
 
 
 def learned_prior(
