@@ -66,10 +66,13 @@ prior = { kind = "lognormal", median = 1.0, sigma = 0.3 }
 limit = { below = 0.6 }
 law = { kind = "linear", rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 } }
 """
-FOOT = """
+NO_LAW = 'law = { kind = "none" }\n'
+STILL_MOUNT = MOUNT[: MOUNT.index("[parameter.law]")] + NO_LAW
+SEEN_BY_NONE = """
 name = "foot"
 prior = { kind = "lognormal", median = 1.0, sigma = 0.2 }
 """
+FOOT = SEEN_BY_NONE + NO_LAW
 TEMPERATURE = """
 [[covariate]]
 name = "temperature_c"

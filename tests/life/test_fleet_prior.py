@@ -36,11 +36,11 @@ from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from lmshealth.tracking.history import History
 from tests.lives import (
-    FOOT,
     FREQUENCY,
     LAWS_ALONE,
-    MOUNT,
     PRELOAD,
+    SEEN_BY_NONE,
+    STILL_MOUNT,
     make_history,
     make_stage,
     true_drift,
@@ -49,9 +49,8 @@ from tests.lives import make_prognosis as prognosis_with
 
 NONE = '{ kind = "none" }'
 WEAR_OR_NOT = PRELOAD.replace("law = {", "law = [{").replace("} }\n", "} }, " + NONE + "]\n")
-STILL_MOUNT = MOUNT[: MOUNT.index("[parameter.law]")]
 # Which no mode sees, though it has a limit and a law.
-LIMITED_FOOT = FOOT + (
+LIMITED_FOOT = SEEN_BY_NONE + (
     "limit = { below = 0.8 }\n"
     'law = { kind = "hertz-wear", life_km = { kind = "lognormal", median = 8000, sigma = 1.0 } }\n'
 )

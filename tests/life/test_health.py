@@ -26,10 +26,10 @@ from lmshealth.tracking.track import Track
 from tests.lives import (
     AXES,
     FADING,
-    FOOT,
     FREQUENCY,
     LAWS_ALONE,
     PRELOAD,
+    SEEN_BY_NONE,
     make_history,
     make_stage,
     make_track,
@@ -40,7 +40,7 @@ from tests.lives import (
 NAMES = ("guide_preload", "mount_stiffness")
 TRAVEL = np.linspace(0.0, 2.5e6, 12)
 COV = np.array([[1e-6, 4e-7], [4e-7, 2e-6]])
-FADING_FOOT = FOOT + (
+FADING_FOOT = SEEN_BY_NONE + (
     'law = { kind = "linear", rate_per_km = { kind = "normal", mean = 0.0, std = 2e-4 } }\n'
 )
 
@@ -320,9 +320,17 @@ def test_drifts_that_are_not_enough_are_refused(stage: Stage, tmp_path: Path) ->
         infer_drifts(read(make_track(np.zeros((3, 0)), np.zeros((3, 0, 0)))), stage, 1)
     with pytest.raises(NotEnoughData, match="no epoch has a drift of any"):
         infer_drifts(table([]), stage, 1)
+
+
+@pytest.mark.usefixtures("unchained")
+def test_drifts_without_an_odometer_may_be_of_any_change(fading: Stage) -> None:
+    """Health is that of the drift, whatever travel the laws would need, and no travel is claimed."""
+    drift = true_drift(("guide_preload",), np.log([0.9]))[:2]
     bare = replace(table([drift]), travel=np.full(2, np.nan))
-    with pytest.raises(NotEnoughData, match="odometer"):
-        infer_drifts(bare, stage, 1)
+    found = infer_drifts(bare, fading, 1)
+    low, high = found.latest(0.005)[0], found.latest(0.995)[0]
+    assert low < 0.9 < high < low + 0.1
+    assert np.isnan(found.travel).all()
 
 
 # What is published

@@ -27,6 +27,7 @@ from tests.lives import (
     MOUNT,
     PRELOAD,
     SENSITIVITY,
+    STILL_MOUNT,
     TEMPERATURE,
     make_history,
     make_stage,
@@ -342,10 +343,9 @@ def test_laws_without_parameters_take_no_coordinate(tmp_path: Path) -> None:
 
 def test_a_parameter_without_law_does_not_deviate(tmp_path: Path) -> None:
     """A parameter that only keeps its value adds nothing to the covariance, seen or not."""
-    still = MOUNT[: MOUNT.index("[parameter.law]")]
     history = rough_history(np.random.default_rng(13))
     alone = LifeLikelihood.of(history, make_stage(tmp_path / "one", (PRELOAD,)))
-    with_constant = LifeLikelihood.of(history, make_stage(tmp_path / "two", (PRELOAD, still)))
+    with_constant = LifeLikelihood.of(history, make_stage(tmp_path / "two", (PRELOAD, STILL_MOUNT)))
     free = LifeLikelihood.of(history, make_stage(tmp_path / "three", (PRELOAD, MOUNT)))
     deviation = alone.covariance.deviation
     np.testing.assert_allclose(with_constant.covariance.deviation, deviation, rtol=1e-9)
@@ -671,8 +671,7 @@ def test_points_of_the_grid_are_drawn_by_their_weight(
 
 def test_only_what_has_a_law_deviates(tmp_path: Path, with_deviation: LifeSetting) -> None:
     """A parameter that keeps its value is never off it, nor will be, seen by the modes or not."""
-    still = MOUNT[: MOUNT.index("[parameter.law]")]
-    stage = make_stage(tmp_path, (FADING, still, FOOT))
+    stage = make_stage(tmp_path, (FADING, STILL_MOUNT, FOOT))
     density = density_of(rough_history(np.random.default_rng(16)), stage)
     now, y = np.array([density.likelihood.data.now]), coordinates(density, 50)
     rng = np.random.default_rng(3)

@@ -38,6 +38,7 @@ from tests.lives import (
     MOUNT,
     PRELOAD,
     START,
+    STILL_MOUNT,
     TEMPERATURE,
     cut,
     make_history,
@@ -46,7 +47,6 @@ from tests.lives import (
 )
 
 KNOWN_USAGE = LAWS_ALONE + "[usage]\nkm_per_day = 20\nhorizon_km = 5000\n"
-STILL_MOUNT = MOUNT[: MOUNT.index("[parameter.law]")]
 FADING_OR_NOT = FADING.replace("law = {", "law = [{").replace("} }\n", "} }, { kind = 'none' }]\n")
 LIMITED_FOOT = FOOT + "limit = { below = 0.8 }\n"
 

@@ -211,15 +211,16 @@ def test_the_prior_of_a_line_with_a_jump_integrates_to_one(begin: float) -> None
 
 @pytest.mark.parametrize("begin", [0.0, 0.5e6])
 @pytest.mark.parametrize("law", [WEAR, LOOSE, FREE], ids=["hertz-wear", "loosening", "free"])
-def test_priors_of_two_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
+def test_priors_of_several_coordinates_integrate_to_one(law: AnyLaw, begin: float) -> None:
     """Wear and loosening, restarted or not, by quadrature on a grid of coordinates."""
     scenario = one_scenario(DegradationPath(law, begin, ()))
     y = scenario.draw(np.random.default_rng(3), 20_000)
     low, high = y.min(axis=0) - 2, y.max(axis=0) + 2
-    axes = [np.linspace(a, b, 1201) for a, b in zip(low, high, strict=True)]
-    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
+    n = {2: 1201, 3: 101}[low.size]
+    axes = [np.linspace(a, b, n) for a, b in zip(low, high, strict=True)]
+    grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, low.size)
     density = np.exp(scenario.log_prior(grid))
-    cell = float(np.prod((high - low) / 1200))
+    cell = float(np.prod((high - low) / (n - 1)))
     # The floor's prior has edges, at which a grid is rough.
     assert density.sum() * cell == pytest.approx(1, abs=3e-3)
     mean = density @ grid * cell
