@@ -83,8 +83,7 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
     filters. Running-in, by which rates of the bank decay, enters as noise of its size.
     """
     own, share, space = bank.hyperparameters, bank.weight, model.space
-    changing = np.where(own.healthy, 0.0, share) if not own.healthy.all() else share
-    changing = changing / changing.sum()
+    changing = share if own.healthy.all() else np.where(own.healthy, 0.0, share)
     spread = own.wander_variance
     wander = float(share @ spread)
     decays = np.where(own.rate_decay > 0, share, 0.0)
@@ -95,7 +94,7 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
     weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
     return Nuisances(
         level_walk=_geometric(share, own.level_walk**2),
-        rate_walk=_geometric(changing, own.rate_walk**2),
+        rate_walk=_geometric(changing / changing.sum(), own.rate_walk**2),
         settling=share @ own.settling**2,
         running_in=running_in,
         wander=np.array(wander),
@@ -203,14 +202,11 @@ class PublishedFilter:
         trial.x, trial.P = self._before[k]
         trial.predict(F=move, Q=noise)
         matrix = space.matrix(k)[rows]
-        off = np.where(
-            self.nuisances[k].weight[rows] < 0.5, model.values[k, rows] - matrix @ trial.x, 0.0
-        )
-        half = off**2 / 2
-        r = len(space.history.series)
-        at = np.where(rows < r, space.level.start, space.damping.start) + model.mode_of[rows]
+        half = (model.values[k, rows] - matrix @ trial.x) ** 2 / 2
+        half[self.nuisances[k].weight[rows] >= 0.5] = 0.0
+        first = np.where(rows < len(space.history.series), space.level.start, space.damping.start)
         jump = np.zeros(space.size)
-        np.maximum.at(jump, at, half)
+        np.maximum.at(jump, first + model.mode_of[rows], half)
         trial.P = trial.P + np.diag(jump)
         errors = self._errors(k, weighted=False) + np.diag(half)
         trial.update(model.values[k, rows], R=errors, H=matrix)
@@ -242,19 +238,15 @@ class PublishedFilter:
             settling = own.settling * space.settling[k] + own.running_in * own.moved
             fresh, damping = (1 - own.wander_keep**2) * own.wander, constants.DAMPING_WALK**2 * tick
             variances = np.array([own.level_walk * tick, settling, *drive, fresh, damping])
-            noise[: wander.stop, : wander.stop] = (variances @ model.noise).reshape(
-                wander.stop, wander.stop
-            )
-        reopens = (s.first == k and (s.kind == "reset" or not s.declared) for s in space.steps)
-        if k and (
-            own.reopened or any(reopens)
-        ):  # the rate has its prior again since the log before
-            fresh_rate = move[:, space.rate]
-            prior = constants.PUBLISHED_RATE_STD**2 * model.together
-            noise += fresh_rate @ prior @ fresh_rate.T
-        for j, step in enumerate(space.steps):
-            if step.first == k:
-                begin_step(space, noise[None], step, j)
+            size = wander.stop
+            noise[:size, :size] = (variances @ model.noise).reshape(size, size)
+        begun = [(j, step) for j, step in enumerate(space.steps) if step.first == k]
+        if k and (own.reopened or any(s.kind == "reset" or not s.declared for _, s in begun)):
+            # Since the log before, the rates have their prior again.
+            moved = move[:, space.rate]
+            noise += constants.PUBLISHED_RATE_STD**2 * moved @ model.together @ moved.T
+        for j, step in begun:
+            begin_step(space, noise[None], step, j)
         if k in space.history.baselines:
             for part in (move, noise, noise.T):
                 part[space.base] = part[space.level]
