@@ -324,7 +324,8 @@ def infer_drifts(
     """
     if not stage.parameters:
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
-    if not np.isfinite(drifts.travel).all():
+    has_odometer = bool(np.isfinite(drifts.travel).all())
+    if not has_odometer:
         # Without an odometer the laws say nothing about how far they have come.
         stage = stage.with_laws({one.name: ANY_CHANGE for one in stage.parameters})
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
@@ -348,6 +349,8 @@ def infer_drifts(
         name: np.concatenate([getattr(one, name) for one in found])
         for name in (*names, "at_edge", *CHECKS)
     }
+    if not has_odometer:
+        joined["travel"] = np.full(len(found), np.nan)
     return replace(
         found[-1],
         recorded_at=tuple(one.recorded_at[0] for one in found),

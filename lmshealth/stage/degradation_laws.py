@@ -340,7 +340,7 @@ class Free(Law, frozen=True, tag="free", tag_field="kind", kw_only=True):
             change = per_power * power * _settled(bend * power)
         # Far beyond now the change has no bound; nor has what it was far from there.
         change = np.where(np.isnan(change), -_LARGEST_LN, change)
-        return np.exp(np.clip(change, -_LARGEST_LN, _LARGEST_LN))
+        return np.asarray(np.exp(np.clip(change, -_LARGEST_LN, _LARGEST_LN)))
 
     def passage(self, theta: FloatArray, limit: FloatArray) -> FloatArray:
         """Return the travel at the limit, inf where the change settles above it."""
