@@ -324,7 +324,7 @@ def test_drifts_that_are_not_enough_are_refused(stage: Stage, tmp_path: Path) ->
 
 @pytest.mark.usefixtures("unchained")
 def test_drifts_without_an_odometer_may_be_of_any_change(fading: Stage) -> None:
-    """Health is that of the drift, whatever travel the laws would need, and no travel is claimed."""
+    """Health is that of the drift, whatever travel the laws would need; no travel is claimed."""
     drift = true_drift(("guide_preload",), np.log([0.9]))[:2]
     bare = replace(table([drift]), travel=np.full(2, np.nan))
     found = infer_drifts(bare, fading, 1)

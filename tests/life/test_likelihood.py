@@ -99,7 +99,9 @@ def healths(scenario: Scenario, y: FloatArray, clock: FloatArray) -> FloatArray:
             elif path.law.kind == "loosening":
                 health = own[0] + (1 - own[0]) * np.exp(-since / own[1])
             elif path.law.kind == "free":
-                health = np.exp(own[0] * since ** own[1])
+                bent = own[2] * since ** own[1]
+                settled = -np.expm1(-bent) / bent if bent else 1.0
+                health = np.exp(own[0] * since ** own[1] * settled)
             else:
                 health = 1.0
             for k, step in enumerate(path.steps):

@@ -94,39 +94,59 @@ def test_draws_follow_the_prior(law: AnyLaw) -> None:
 
 @pytest.mark.parametrize("now", [1e4, NOW])
 def test_a_free_change_by_now_is_normal_whenever_now_is(now: float) -> None:
-    """Ln health now is N(0, std) in both directions, and ln of the exponent N(0, its sigma)."""
-    law = Free(std=0.2, exponent_sigma=0.4)
+    """Ln health now is N(0, std), in both directions; exponent and bend have their priors.
+
+    On the way it is that of the formula.
+    """
+    law = Free(std=0.2, exponent_sigma=0.4, bend_std=1.5)
     y = law.draw(np.random.default_rng(5), 20_000, now)
     theta = law.natural(y, now)
     change = np.log(law.health(theta, np.array([0.0, now / 4, now])))
     assert (change[:, 0] == 0).all()
     assert stats.kstest(change[:, 2], stats.norm(0, 0.2).cdf).pvalue > 1e-4
     assert stats.kstest(change[:, 2], stats.norm(0, 0.22).cdf).pvalue < 1e-4  # negative control
-    assert stats.kstest(np.log(theta[:, 1]), stats.norm(0, 0.4).cdf).pvalue > 1e-4
-    np.testing.assert_allclose(change[:, 1], change[:, 2] * 0.25 ** theta[:, 1], rtol=1e-9)
-    assert abs(np.mean(y[:, 0] * y[:, 1])) < 4.5 / np.sqrt(20_000)
-    # The density is that of the draws: its mean is minus the entropy of two standard normals.
+    b, c = theta[:, 1], theta[:, 2] * now ** theta[:, 1]
+    assert stats.kstest(np.log(b), stats.norm(0, 0.4).cdf).pvalue > 1e-4
+    assert stats.kstest(c, stats.norm(0, 1.5).cdf).pvalue > 1e-4
+    share = (1 - np.exp(-c * 0.25**b)) / (1 - np.exp(-c))
+    np.testing.assert_allclose(change[:, 1], change[:, 2] * share, rtol=1e-7)
+    assert np.abs(np.corrcoef(y.T)[np.triu_indices(3, 1)]).max() < 4.5 / np.sqrt(20_000)
+    # The density is that of the draws: its mean is minus the entropy of three standard normals.
     value = law.log_prior(y, now)
-    assert abs(value.mean() + np.log(2 * np.pi * np.e)) < 5 * value.std() / np.sqrt(20_000)
+    assert abs(value.mean() + 1.5 * np.log(2 * np.pi * np.e)) < 5 * value.std() / np.sqrt(20_000)
+
+
+def test_a_free_change_without_a_bend_is_a_power() -> None:
+    """At a bend of 0, and next to it, the formula has no gap."""
+    y = np.array([[1.0, 0.6, bend] for bend in (0.0, 1e-12, 1e-7, -1e-7)])
+    travel = NOW * np.array([0.2, 1.0, 3.0])
+    change = np.log(FREE.health(FREE.natural(y, NOW), travel))
+    known = 0.15 * (travel / NOW) ** np.exp(0.5 * 0.6)
+    np.testing.assert_allclose(change, np.tile(known, (4, 1)), rtol=1e-6)
 
 
 def test_the_prior_of_a_free_change_integrates_to_one() -> None:
     """By quadrature on a grid of its coordinates."""
-    axis = np.linspace(-8, 8, 401)
-    grid = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
-    total = np.exp(FREE.log_prior(grid, NOW)).sum() * (axis[1] - axis[0]) ** 2
+    axis = np.linspace(-7, 7, 71)
+    grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+    total = np.exp(FREE.log_prior(grid, NOW)).sum() * (axis[1] - axis[0]) ** 3
     assert total == pytest.approx(1, abs=1e-9)
 
 
 def test_a_free_change_ends_where_it_loses_and_never_where_it_gains() -> None:
-    """Losses reach a limit, gains none, however far; a limit of 1 or more is reached at once."""
+    """Losses that do not settle above a limit reach it, gains none; one of 1 is reached at once."""
     theta = FREE.natural(FREE.draw(np.random.default_rng(6), 2000, NOW), NOW)
-    loses = theta[:, 0] < 0
+    per_power, _, bend = theta.T
+    loses = per_power < 0
     assert 900 < loses.sum() < 1100
+    # Where it settles, at r / k.
+    floor = np.where(bend > 0, per_power / np.where(bend > 0, bend, 1.0), -np.inf)
+    ends = loses & (floor < np.log(0.8))
+    assert (loses & ~ends).sum() > 100
     passage = FREE.passage(theta, np.array(0.8))
-    np.testing.assert_array_equal(np.isfinite(passage), loses)
-    at = FREE.health(theta[loses], passage[loses, None])[:, 0]
-    np.testing.assert_allclose(at, 0.8, rtol=1e-9)
+    np.testing.assert_array_equal(np.isfinite(passage), ends)
+    at = FREE.health(theta[ends], passage[ends, None])[:, 0]
+    np.testing.assert_allclose(at, 0.8, rtol=1e-7)
     assert (FREE.health(theta[~loses], np.array([NOW, 9 * NOW])) >= 1).all()
     np.testing.assert_array_equal(FREE.passage(theta, np.array(1.0)), 0.0)
 
