@@ -76,25 +76,24 @@ def test_every_figure_is_of_a_record() -> None:
 
 def test_figures_follow_the_record(copied: Path) -> None:
     """Another record gives other figures, in the table of claims and in the overview."""
-    path = copied / "life" / "fleet" / "conformal.json"
+    path = copied / "inputs" / "damaged" / "result.json"
     record = json.loads(path.read_text())
-    row = record["ways"]["program"]["late"]["calibrated"]
-    assert row["outlive"] == 16
-    claim = "running machines that outlive the calibrated travel: late, program"
-    assert f"| {claim} | 16 of 16 |" in summary.group_page("life")
-    row["outlive"] = 11
+    assert record["damaged_told_right"] == 329
+    claim = "damaged logs of 73 kinds refused with the right reason"
+    assert f"| {claim} | 329 of 329 |" in summary.group_page("inputs")
+    record["damaged_told_right"] = 211
     path.write_text(json.dumps(record))
-    assert f"| {claim} | 11 of 16 |" in summary.group_page("life")
-    assert f"{claim}: 11 of 16" in summary.overview()
+    assert f"| {claim} | 211 of 329 |" in summary.group_page("inputs")
+    assert f"{claim}: 211 of 329" in summary.overview()
 
 
 def test_a_missing_record_is_reported(copied: Path) -> None:
     """A study without a record is named as such, and claims nothing."""
-    (copied / "health" / "detectability.json").unlink()
-    part = summary.group_page("health").split("### detectability")[1].split("###")[0]
+    (copied / "track" / "beam.json").unlink()
+    part = summary.group_page("track").split("### beam")[1].split("###")[0]
     assert "**Not recorded**" in part
     assert "|" not in part
-    (line,) = [one for one in summary.overview().splitlines() if "[health/detectability]" in one]
+    (line,) = [one for one in summary.overview().splitlines() if "[track/beam]" in one]
     assert line.endswith("|  |  |  | no |")
 
 

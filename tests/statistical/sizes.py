@@ -51,13 +51,6 @@ TESTS = {
     "test_modes_that_cross_are_not_swapped": Part(30, ("swaps, named by order", "swaps, unnamed")),
     "test_healthy_lives_raise_no_alarms": Part(100, ("alarms",), control=10),
     "test_drifts_of_damaged_lives_cover": Part(100, ("drift, damaged lives",)),
-    # Health at one epoch.
-    "test_health_is_calibrated": Part(300, ("preload, grid", "mount, grid")),
-    "test_chains_are_as_calibrated_as_grids": Part(10, ("chains",)),
-    "test_the_fit_is_seldom_improbable": Part(300, ("fit",), control=30),
-    "test_a_shared_guide_is_calibrated": Part(
-        36, ("shared preload", "mount of X beside it", "mount of Y beside it")
-    ),
     # Lives of another plant, by kind.
     "test_health_of_lives_that_wear_is_held": Part(12, ("preload that wears",)),
     "test_a_mode_that_moves_alone_is_named": Part(
