@@ -33,7 +33,7 @@ from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.history import History, Series, Step
 from lmshealth.tracking.track import Effect, Event, Track
-from tests.lives import health_of
+from tests.lives import health_of, plain_nuisances
 
 MODES = ("roll", "pitch", "yaw")
 PARAMETERS = ("guide_preload", "mount_stiffness")
@@ -117,6 +117,7 @@ def make_track(history: History, truth: FloatArray, seed: int = 2) -> Track:
         outliers=(),
         innovations=rng.standard_normal((n, 2 * m)),
         widening=np.ones(n),
+        nuisances=plain_nuisances(n, len(history.series)),
     )
 
 
@@ -181,7 +182,7 @@ def make_prognosis(
         ),
         laws=(),
         chi_square=121.4,
-        degrees_of_freedom=115,
+        degrees_of_freedom=115.0,
         walk=8e-4,
         noise_scale=1.02,
         deviation=0.0,

@@ -26,6 +26,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History, Series, Step, StepKind
+from lmshealth.tracking.published_filter import Nuisances
 from lmshealth.tracking.track import Track
 
 MODES = ("roll", "pitch", "yaw")
@@ -305,6 +306,23 @@ def cut(history: History, n: int) -> History:
     return history.first_logs(n)
 
 
+def plain_nuisances(n: int, n_series: int) -> Nuisances:
+    """Make the nuisances of a machine whose modes hardly move by themselves, of one source."""
+    none, one = np.zeros(n), np.ones(n)
+    return Nuisances(
+        level_walk=1e-6 * one,
+        rate_walk=0.01 * one,
+        settling=none,
+        running_in=none,
+        wander=none,
+        wander_keep=none,
+        scales=np.ones((n, 1)),
+        moved=none,
+        weight=np.ones((n, 2 * n_series)),
+        reopened=np.zeros(n, dtype=bool),
+    )
+
+
 def make_track(drift: FloatArray, cov: FloatArray) -> Track:
     """Make a track of given drifts ``(n, m)`` with covariances ``(n, m, m)``."""
     n, m = drift.shape
@@ -331,6 +349,7 @@ def make_track(drift: FloatArray, cov: FloatArray) -> Track:
         innovations=np.zeros((n, 2 * m)),
         noise_scale=np.ones((n, 1)),
         widening=np.ones(n),
+        nuisances=plain_nuisances(n, m),
     )
 
 
@@ -418,7 +437,7 @@ def make_prognosis(remaining: FloatArray, usage: FloatArray, *, horizon: float =
         curve_quantiles=np.full((5, 3, 1), 0.8),
         laws=(),
         chi_square=10.0,
-        degrees_of_freedom=10,
+        degrees_of_freedom=10.0,
         walk=1e-3,
         noise_scale=1.0,
         deviation=0.0,

@@ -18,7 +18,7 @@ from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.data import clock_and_steps, with_clock
 from lmshealth.life.ensemble_sampling import rank_r_hat
-from lmshealth.life.likelihood import diagonal
+from lmshealth.life.likelihood import default_scatter, diagonal
 from lmshealth.life.posterior import LifePosterior, LoneMode, fit_life
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import ANY_CHANGE, Stage
@@ -329,6 +329,10 @@ def infer_drifts(
         # Without an odometer the laws say nothing about how far they have come.
         stage = stage.with_laws({one.name: ANY_CHANGE for one in stage.parameters})
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
+    # Their covariances are those of a filter, which has allowed for scatter already.
+    scatter = default_scatter()
+    walk, scale = _first_of(scatter.walk), _first_of(scatter.noise_scale)
+    stage = replace(stage, scatter=replace(scatter, walk=walk, noise_scale=scale))
     histories = {k: _of_drifts(drifts, stage, k) for k in range(len(drifts.recorded_at))}
     usable = [k for k, one in histories.items() if one is not None]
     if not usable:
@@ -358,6 +362,11 @@ def infer_drifts(
         seed=tuple(np.atleast_1d(seed).tolist()),
         **joined,
     )
+
+
+def _first_of(weights: tuple[float, ...]) -> tuple[float, ...]:
+    """Return weights of which only the first is above 0."""
+    return (1.0, *(0.0 for _ in weights[1:]))
 
 
 def _of_drifts(drifts: Drifts, stage: Stage, k: int) -> History | None:

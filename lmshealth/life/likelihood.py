@@ -203,6 +203,8 @@ class Grid(Rows):
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
             zip(constants.DEVIATION_STDS, prior.deviation, strict=True),
         ):
+            if p * q * r == 0:
+                continue
             factor = covariance.factor(walk, scale, deviation, lone)
             u, basis_q, basis_r = _reduced(data, basis, factor)
             target = basis_q.T @ u
@@ -400,8 +402,11 @@ def _reduced(
 
 def scatter_prior(stage: Stage) -> ScatterPrior:
     """Return the prior of walk, noise scale and deviation: the fleet's, or the default."""
-    if stage.scatter is not None:
-        return stage.scatter
+    return default_scatter() if stage.scatter is None else stage.scatter
+
+
+def default_scatter() -> ScatterPrior:
+    """Return the prior of walk, noise scale and deviation of any machine."""
     values = (constants.WALK_PRIOR, constants.NOISE_SCALE_PRIOR, constants.DEVIATION_PRIOR)
     return ScatterPrior(*values)
 

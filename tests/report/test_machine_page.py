@@ -270,7 +270,7 @@ def test_one_parameter_without_limit(make: Maker, tmp_path: Path) -> None:
     )
     text = words(one(tmp_path, replace(assessment, stage=stage, health=single, prognosis=None)))
     assert "sets no limit" in text
-    assert "Last epoch: guide preload" in text
+    assert "Now: guide preload" in text
 
 
 @pytest.mark.usefixtures("blank")
@@ -493,7 +493,8 @@ def test_numbers_of_a_page_agree_and_are_grounded(make: Maker, tmp_path: Path) -
     odometer = f"{worn.history.travel[-1] / 1000:,.0f}".replace(",", "\u202f")
     assert f"odometer {odometer}\u202fkm" in text
     assert f"largest drift: {drift:.2f}\u202f%" in text
-    assert f"<td>{worn.prognosis.ess:.0f}</td>" in text
+    assert worn.health is not None
+    assert f"<td>{worn.health.ess[-1, 0]:.0f}</td>" in text
     still = replace(worn, prognosis=replace(worn.prognosis, ess=np.inf, r_hat=1.0))
     text = write_report(tmp_path / "b", [still], ())[0].read_text()
     assert "<td>no chains needed</td>" in text and "<td>inf</td>" not in text
