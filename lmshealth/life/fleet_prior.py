@@ -300,7 +300,8 @@ def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawE
         before = np.array(getattr(scatter_prior(stage), field))
         after = np.zeros(before.size)
         for one, weight in zip(life.scenarios, weights, strict=True):
-            values = np.unique(getattr(one.density.likelihood.grid, field))
+            whole = one.density.likelihood.grid
+            values = np.unique(getattr(whole, field)[whole.lone == NO_MODE])
             has = np.equal.outer(values, getattr(one.density.grid, field))
             # A mode that moves alone has a random walk of its own.
             own = weight * (one.density.grid.lone == NO_MODE)

@@ -312,8 +312,8 @@ def infer_drifts(
 
     Drifts that a filter has made of the logs are not independent from epoch to epoch, so that they
     are no data of a life. The prior is that of `infer` at the travel of the epoch; without an
-    odometer parameters may change by as much as their priors in the description allow. The last
-    epoch is drawn by emcee, the others by importance sampling.
+    odometer parameters may change by as much as their priors in the description allow. Importance
+    sampling draws them: two moments leave directions in which a chain would take very long.
 
     Raises
     ------
@@ -344,9 +344,8 @@ def infer_drifts(
     for k in [usable[i] for i in _thinned(len(usable), epochs)]:
         history = histories[k]
         assert history is not None
-        chains = k == usable[-1]
         own = (*np.atleast_1d(seed).tolist(), k)
-        life = fit_life(history, stage, own, chains=chains, min_logs=2)
+        life = fit_life(history, stage, own, chains=False, min_logs=2)
         found.append(health_of(life, history, stage, [1]))
     names = ("travel", "chains", "informed", "prior_width", "identifiable", "correlation", "fit")
     joined: dict[str, Any] = {

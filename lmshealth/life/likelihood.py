@@ -24,7 +24,7 @@ from lmshealth.tracking.history import History
 
 # Lives of the prior per scenario that the nodes are chosen by, and the drift in ln f that the QR
 # decomposition may leave in the norm of all of them: of 99 % of other lives the drifts are met
-# within 3e-6, a thirtieth of the error of the best estimates.
+# within 3e-5, a fraction of the error of the best estimates.
 _N_EXAMPLES, _RESIDUAL = 300, 1e-4
 # Distance in ln f of the last drift of a life from that of the logs from which it counts less.
 _NEAR = 0.003
