@@ -11,10 +11,8 @@ Method
     of 2e-4 to 1e-3: an alarm should be raised by the eighth, and in healthy lives none. The code
     before one filter published its states (``--before``) gets the same lives, kind by kind in
     turns.
-Answer
-    ANSWER
 Run time
-    RUNTIME
+    Twenty minutes on one processor.
 """
 
 from __future__ import annotations

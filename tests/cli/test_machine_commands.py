@@ -186,7 +186,7 @@ def test_drifts_become_health(drifts: Path, tmp_path: Path) -> None:
     table = pd.read_csv(out)
     assert tuple(table.columns[:11]) == TABLES["health"].names[:11]
     sampler = table.groupby("recorded_at")["sampler"].unique()
-    assert [list(one) for one in sampler] == [["importance"], ["emcee"]]
+    assert [list(one) for one in sampler] == [["importance"], ["importance"]]
     last = table[table["recorded_at"].str.startswith("2026-03-03")].set_index(
         ["stage", "parameter"]
     )

@@ -278,7 +278,7 @@ def test_an_epoch_of_drifts_is_that_of_a_grid(
             errors.append(abs(share - level) / np.sqrt(level * (1 - level) / n))
     assert max(errors[::2]) < 5
     assert max(errors[1::2]) > 5  # negative control
-    assert found.sampler == ("importance", "emcee")
+    assert found.sampler == ("importance", "importance")
 
 
 @pytest.mark.usefixtures("unchained")
