@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from functools import partial
 from itertools import count
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from scipy import fft
 
 from lmshealth import identify, infer_drifts, load_stage, prognose, run
 from lmshealth.batch.ingest import Settings
+from lmshealth.life import likelihood
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
@@ -101,8 +103,12 @@ def test_chains(race: Race, stage: Stage) -> None:
 
 def test_walker_of_a_life(race: Race, stage: Stage) -> None:
     """A walker of a life takes a twentieth of a loop over filterpy with the same likelihood."""
-    ways = two_ways(degrading_life(stage, 100, np.random.default_rng(0)), stage, 64, LOOPED)
+    life = degrading_life(stage, 100, np.random.default_rng(0))
+    ways = two_ways(life, stage, 64, LOOPED)
     # Up to a constant, which is that of the grid's prior, and what few nodes leave.
+    with patch.multiple(likelihood, _RESIDUAL=1e-9, _NEAR=1e9):
+        exact = two_ways(life, stage, 64, LOOPED)
+    assert np.ptp(exact.ours()[:LOOPED] - exact.by_filterpy()) < 1e-5
     assert np.ptp(ways.ours()[:LOOPED] - ways.by_filterpy()) < 0.05
     race(
         lambda: [ways.ours() for _ in range(20)] and 20 * ways.walkers,
