@@ -11,8 +11,16 @@ Method
     of 2e-4 to 1e-3: an alarm should be raised by the eighth, and in healthy lives none. The code
     before one filter published its states (``--before``) gets the same lives, kind by kind in
     turns.
+Answer
+    The drift of linear wear is 0.997 ± 0.001 times the true one, that of slow wear 0.989 ± 0.004;
+    90 % intervals hold 90 % of wear, 93 % of slow wear and 93 % of healthy lives, before 91, 92
+    and 97 % (99.7 % of quiet ones: the mixture took them for constant). All 100 lives of fast wear
+    raise their alarm in time, before as well. Of 300 healthy lives 2 raise one, before 22, all of
+    which run in: their decays are between those that the bank had. A weak prior of rates makes
+    intervals of quiet lives 2.4 times as wide, and the code before is not biased in these lives
+    either.
 Run time
-    Twenty minutes on one processor.
+    A quarter of an hour on one processor that others use as well; groups are kept as they end.
 """
 
 from __future__ import annotations
@@ -24,6 +32,7 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack
+from itertools import product
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -52,7 +61,8 @@ JUDGED, LOW, HIGH = ("wear", "slow wear", "healthy"), 0.86, 0.94
 LINEAR, SLOWLY = "linear wear is shown without bias (1 %)", "slow wear is shown to 3 %"
 HOLD = "90 % intervals hold 86 to 94 % of each kind"
 FASTLY, NONE = "fast wear raises an alarm by the eighth log", "healthy lives raise none"
-NOT_MET: dict[str, str] = {}
+# Folders of the code by revision; the present one has no name.
+CODES = {"": str(ROOT)}
 PLACES, REACH = (0.5, 0.7, 1.0), stats.norm.ppf(0.95)
 
 
@@ -126,9 +136,13 @@ def of_kind(kind: str, n: int) -> Row:
     return {"rows": np.array(rows).tolist(), "alarms": alarms, "cpu_s": time.process_time() - start}
 
 
-def by_code(code: str, group: str, n: int) -> dict[str, Row]:
-    """Track lives of a group of kinds by the code in a folder, in a process of its own."""
-    env = os.environ | {"PYTHONPATH": code, "PYTHONSAFEPATH": "1", "OPENBLAS_NUM_THREADS": "1"}
+def by_code(revision: str, group: str, n: int) -> dict[str, Row]:
+    """Track lives of a group of kinds by the code of a revision, in a process of its own."""
+    env = os.environ | {
+        "PYTHONPATH": CODES[revision],
+        "PYTHONSAFEPATH": "1",
+        "OPENBLAS_NUM_THREADS": "1",
+    }
     command = [sys.executable, __file__, "--group", group, "--lives", str(n)]
     done = subprocess.run(command, env=env, check=True, capture_output=True, text=True)
     found: dict[str, Row] = json.loads(done.stdout)
@@ -168,16 +182,16 @@ def main() -> None:
         return
     rows: dict[str, dict[str, Row]] = {"now": {}, "before": {}}
     with TemporaryDirectory() as folder, ExitStack() as stack:
-        codes = {"now": str(ROOT)}
+        revisions = {"now": ""}
         if not study.quick:
+            revisions["before"] = study.options.before
             old = checkout(study.options.before, Path(folder) / "code")
-            codes["before"] = str(stack.enter_context(old))
-        for group, n in LIVES.items():
-            for name, code in codes.items():
-                parts = by_code(code, group, 3 if study.quick else n)
-                rows[name] |= {kind: summary([part]) for kind, part in parts.items()}
-                rows[name][group] = summary(list(parts.values()))
-    study.conclude({**rows, "passed": verdicts(rows["now"])}, not_met=NOT_MET, quick_may_fail=True)
+            CODES[study.options.before] = str(stack.enter_context(old))
+        for (group, n), (name, revision) in product(LIVES.items(), revisions.items()):
+            parts = study.trials.once(by_code, revision, group, 3 if study.quick else n)
+            rows[name] |= {kind: summary([part]) for kind, part in parts.items()}
+            rows[name][group] = summary(list(parts.values()))
+    study.conclude({**rows, "passed": verdicts(rows["now"])}, quick_may_fail=True)
 
 
 def verdicts(rows: dict[str, Row]) -> dict[str, bool]:
