@@ -82,7 +82,7 @@ def test_drawn_machines(root: Path) -> None:
     assert healthy["nominal"]["alarm"]["hits"] == 0
     for group in (answer["machines"], answer["control"]):
         assert not group["refused"]
-        for what, count in (("epoch", 2), ("now", 2), ("left", 3)):
+        for what, count in (("now", 2), ("left", 3)):
             assert [row[1]["n"] for row in group[what].values()] == [group["n"]] * count
     corrected = answer["modes"]["corrected"]
     assert corrected["found"]["hits"] == corrected["found"]["n"] > 0
