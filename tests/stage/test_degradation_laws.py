@@ -115,7 +115,9 @@ def test_a_free_change_by_now_is_normal_whenever_now_is(now: float) -> None:
     )
     # The density is that of the draws: its mean is minus the entropy of three standard normals.
     value = law.log_prior(y, now)
-    assert abs(value.mean() + 1.5 * np.log(2 * np.pi * np.exp(1.0))) < 5 * value.std() / np.sqrt(20_000)
+    assert abs(value.mean() + 1.5 * np.log(2 * np.pi * np.exp(1.0))) < 5 * value.std() / np.sqrt(
+        20_000
+    )
 
 
 def test_a_free_change_without_a_bend_is_a_power() -> None:
