@@ -7,17 +7,21 @@ is exact and a test can compare with the formula itself.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from itertools import product
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from threadpoolctl import threadpool_info
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Metadata
+from lmshealth.life import constants
 from lmshealth.life.health import Health
 from lmshealth.life.likelihood import NO_MODE
 from lmshealth.life.posterior import LoneMode
@@ -99,6 +103,21 @@ name = "payload_kg"
 reference = 50.0
 prior_std = 0.0005
 """
+
+
+@contextmanager
+def four_settings() -> Iterator[None]:
+    """Average lives over two walks and two deviations alone, of one noise scale."""
+    small: dict[str, Any] = {
+        "WALK_STDS": (1e-5, 1.5e-3),
+        "WALK_PRIOR": (0.5, 0.5),
+        "NOISE_SCALES": (1.0,),
+        "NOISE_SCALE_PRIOR": (1.0,),
+        "DEVIATION_STDS": (0.0, 0.01),
+        "DEVIATION_PRIOR": (0.5, 0.5),
+    }
+    with patch.multiple(constants, **small):
+        yield
 
 
 def true_drift(names: Sequence[str], x: FloatArray) -> FloatArray:

@@ -71,3 +71,9 @@ class Rows:
 def stack(values: ComplexArray) -> FloatArray:
     """Stack real above imaginary parts."""
     return np.concatenate([values.real, values.imag])
+
+
+def diagonal(matrices: FloatArray) -> FloatArray:
+    """Return the diagonals of ``(..., n, n)`` matrices as a writeable view."""
+    view: FloatArray = np.einsum("...ii->...i", matrices)
+    return view

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.seeds import stream
 from lmshealth._private.tables import TABLES
@@ -18,7 +18,7 @@ from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.data import clock_and_steps, with_clock
 from lmshealth.life.ensemble_sampling import rank_r_hat
-from lmshealth.life.likelihood import default_scatter, diagonal
+from lmshealth.life.likelihood import default_scatter
 from lmshealth.life.posterior import LifePosterior, LoneMode, fit_life
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import ANY_CHANGE, Stage
@@ -343,7 +343,7 @@ def infer_drifts(
         raise BadStage(f"{stage.name}: no [[parameter]] to infer")
     has_odometer = bool(np.isfinite(drifts.travel).all())
     if not has_odometer:
-        # Without an odometer the laws say nothing about how far they have come.
+        # The state of a law follows from its travel, which is not known without an odometer.
         stage = stage.with_laws({one.name: ANY_CHANGE for one in stage.parameters})
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
     # Their covariances are those of a filter, which has allowed for scatter already.

@@ -12,7 +12,7 @@ from typing import Self
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows, diagonal
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.data import LifeData
@@ -29,6 +29,7 @@ _N_EXAMPLES, _RESIDUAL = 300, 1e-4
 # Distance in ln f of the last drift of a life from that of the logs from which it counts less.
 _NEAR = 0.003
 _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed at a time
+_ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 _CACHED = 2_000_000  # whitened drifts that are computed at a time
 
 NO_MODE = -1
@@ -185,6 +186,10 @@ class Grid(Rows):
     def of(cls, data: LifeData, covariance: LifeCovariance, basis: NodeBasis) -> Self:
         """Whiten data at all points of the grid."""
         points, prior = [], scatter_prior(data.stage)
+        # Intercepts and coefficients are few: a root of their covariance has few columns.
+        size, vectors = np.linalg.eigh(covariance.fixed)
+        some = size > _ROUNDING * size[-1]
+        root = vectors[:, some] * np.sqrt(size[some])
         n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
         # A mode that moves alone needs others that do not.
         alone *= n_modes > 1
@@ -211,8 +216,8 @@ class Grid(Rows):
             log_weight = np.log(p * q * r) - np.sum(np.log(np.diag(factor)))
             design = basis_r.T.reshape(n_modes, -1, target.size)
             rest = np.sum(u**2) - np.sum(target**2)
-            known = solve_triangular(factor, covariance.fixed, lower=True)
-            fixed = np.trace(solve_triangular(factor, known, lower=True, trans=1))
+            # The trace of Σ⁻¹ times the fixed part.
+            fixed = np.sum(solve_triangular(factor, root, lower=True) ** 2)
             values = (design, target, rest, log_weight, data.y.size - fixed)
             points.append((walk, scale, deviation, lone, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
@@ -355,12 +360,6 @@ class LifeLikelihood:
             rows[:, :, k * p : (k + 1) * p] = white[:, k, :, 1:]
             rows[:, :, -1] -= white[:, k, :, 0]
         return rows
-
-
-def diagonal(matrices: FloatArray) -> FloatArray:
-    """Return the diagonals of ``(..., n, n)`` matrices as a writeable view."""
-    view: FloatArray = np.einsum("...ii->...i", matrices)
-    return view
 
 
 def ln_health(

@@ -32,7 +32,7 @@ from lmshealth.tracking.history import History
 if TYPE_CHECKING:
     from xarray import DataTree
 
-_STEP = 1 << 20  # of the random stream: beyond the epochs of health
+_STEP = 1 << 20  # of the random stream
 _N_SETTINGS, _N_LONE, _N_PRIOR = 500, 50, 2000
 _NONE = np.zeros(0, dtype=int)
 _CHECKS = ("ess_bulk", "ess_tail", "r_hat")
@@ -162,7 +162,7 @@ class LifePosterior:
         Of lives that stay inside the map, with deviations from their laws.
         """
         data = self.data
-        spread = np.array(expected_squares(scatter_prior(data.stage).deviation))
+        spread = expected_squares(scatter_prior(data.stage).deviation)
         scenarios = data.scenarios
         weights = np.array([one.weight for one in scenarios])
         sizes = np.ceil(_N_PRIOR * weights / weights.sum()).astype(int).tolist()
@@ -303,16 +303,10 @@ def fit_life(
             scenarios = _sampled_scenarios(weighted, seeds[1], n_kept, least)
             judge = _change(likelihood, drawn, scenarios)
         rng, now = np.random.default_rng(off_seed), np.array([likelihood.data.now])
-        draws, settings = [], []
-        for one in scenarios:
-            y, density, (_, point) = one.mixture_draws, one.density, one.nuisances
-            off = density.deviations(y, one.nuisances, now, rng)[:, 0]
-            by_law = one.scenario.health(one.scenario.natural(y), now)[:, 0]
-            rate = density.grid.deviation[point, None] ** 2 / now * likelihood.data.free
-            columns = (by_law * np.exp(off), off, rate, density.grid.lone[point, None])
-            shape = (constants.N_ENSEMBLES, one.n_mixture_draws, -1)
-            draws.append([part.reshape(shape) for part in columns])
-            settings.append(density.settings(y[:: max(1, y.shape[0] // _N_SETTINGS)]))
+        draws = [_drawn_now(one, now, rng) for one in scenarios]
+        some = [one.mixture_draws for one in scenarios]
+        some = [y[:: max(1, y.shape[0] // _N_SETTINGS)] for y in some]
+        settings = [one.density.settings(y) for one, y in zip(scenarios, some, strict=True)]
         lone_modes = _lone_modes(likelihood, scenarios)
     health, off, rate, lone = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
     share = np.array([one.n_mixture_draws for one in scenarios]) / n_kept
@@ -338,6 +332,19 @@ def fit_life(
         start=start,
         seed=tuple(np.atleast_1d(seed).tolist()),
     )
+
+
+def _drawn_now(
+    one: ScenarioPosterior, now: FloatArray, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Return health, off, rate and lone mode of the draws of a scenario, as `LifePosterior`."""
+    y, density, (_, point) = one.mixture_draws, one.density, one.nuisances
+    off = density.deviations(y, one.nuisances, now, rng)[:, 0]
+    by_law = one.scenario.health(one.scenario.natural(y), now)[:, 0]
+    rate = density.grid.deviation[point, None] ** 2 / now * density.likelihood.data.free
+    columns = (by_law * np.exp(off), off, rate, density.grid.lone[point, None])
+    shape = (constants.N_ENSEMBLES, one.n_mixture_draws, -1)
+    return [part.reshape(shape) for part in columns]
 
 
 def _change(

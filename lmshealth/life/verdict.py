@@ -93,8 +93,9 @@ def judge(
         ``step`` after an undeclared step of the modes since the baseline. ``not-enough-data``
         if there are fewer logs than a baseline needs, if no life of the parameters explains the
         logs, or if no parameter is informed; ``why`` then reports alarms. ``alarm`` or ``no-alarm``
-        of tracked modes if the description has no parameter. Otherwise what most draws say: a set
-        of degraded parameters; without any, ``outside-map`` if a mode moved alone, or ``healthy``.
+        of tracked modes if the description has no parameter. Otherwise the state of most draws: a
+        set of degraded parameters; without any, ``outside-map`` if a mode moved alone, or
+        ``healthy``.
 
     Examples
     --------

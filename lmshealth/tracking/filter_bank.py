@@ -14,7 +14,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._private.arrays import BoolArray, FloatArray, Rows
+from lmshealth._private.arrays import BoolArray, FloatArray, Rows, diagonal
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import Step
 from lmshealth.tracking.state_space import StateSpace
@@ -318,7 +318,7 @@ def update(
     crossed[:, -1] -= value
     total = matrix @ crossed[:, :-1] + errors
     if model.unknown[k]:
-        _diagonal(total)[:] += model.extra[k, rows]
+        diagonal(total)[:] += model.extra[k, rows]
     centre, cov = mixture(bank.weight, -crossed[:, -1], total)
     standardised = centre / np.sqrt(cov.diagonal())
     updated, outlying = _condition(bank, crossed, total), np.zeros(rows.size)
@@ -329,7 +329,7 @@ def update(
         for mask, chance, gross in hypotheses:
             wider = total.copy()
             more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
-            _diagonal(wider)[:] += np.where(mask, more, 0.0)
+            diagonal(wider)[:] += np.where(mask, more, 0.0)
             other = _condition(bank, crossed, wider)
             found.append(replace(other, log_weight=other.log_weight + np.log(chance)))
         updated, share = _merged(found)
@@ -433,9 +433,3 @@ def _correlation(common: float, n: int) -> FloatArray:
 def _add(state: FloatArray, rows: slice, variance: FloatArray, correlation: FloatArray) -> None:
     """Add correlated variances ``(n,)`` to a diagonal block of the covariances of states."""
     state[:, rows, rows] += variance[:, None, None] * correlation
-
-
-def _diagonal(matrices: FloatArray) -> FloatArray:
-    """Return the diagonals of ``(n, size, size)`` matrices as a writeable view."""
-    view: FloatArray = np.einsum("nii->ni", matrices)
-    return view

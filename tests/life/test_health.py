@@ -30,6 +30,7 @@ from tests.lives import (
     LAWS_ALONE,
     PRELOAD,
     SEEN_BY_NONE,
+    four_settings,
     make_history,
     make_stage,
     make_track,
@@ -48,13 +49,7 @@ FADING_FOOT = SEEN_BY_NONE + (
 @pytest.fixture(scope="module", autouse=True)
 def small_grid() -> Iterator[None]:
     """Average over two walks and two deviations: checks hold for any of them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "WALK_STDS", (1e-5, 1.5e-3))
-        patch.setattr(constants, "WALK_PRIOR", (0.5, 0.5))
-        patch.setattr(constants, "NOISE_SCALES", (1.0,))
-        patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(constants, "DEVIATION_STDS", (0.0, 0.01))
-        patch.setattr(constants, "DEVIATION_PRIOR", (0.5, 0.5))
+    with four_settings():
         yield
 
 

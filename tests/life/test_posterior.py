@@ -31,6 +31,7 @@ from tests.lives import (
     MOUNT,
     PRELOAD,
     SENSITIVITY,
+    four_settings,
     make_history,
     make_stage,
     threads,
@@ -49,13 +50,7 @@ MOUNT_OR_NOT = MOUNT[: MOUNT.index("[parameter.law]")] + (
 @pytest.fixture(scope="module", autouse=True)
 def small_grid() -> Iterator[None]:
     """Average over two walks, two deviations and one noise scale: checks hold for any of them."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(constants, "WALK_STDS", (1e-5, 1.5e-3))
-        patch.setattr(constants, "WALK_PRIOR", (0.5, 0.5))
-        patch.setattr(constants, "NOISE_SCALES", (1.0,))
-        patch.setattr(constants, "NOISE_SCALE_PRIOR", (1.0,))
-        patch.setattr(constants, "DEVIATION_STDS", (0.0, 0.01))
-        patch.setattr(constants, "DEVIATION_PRIOR", (0.5, 0.5))
+    with four_settings():
         yield
 
 

@@ -230,8 +230,10 @@ def claims(answered: Row) -> Iterator[Claim]:
                 met=fine(*(f"{name} {what}" for what in OF_HEALTH)),
             )
         if right := row["right"]:
-            told = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))
-            beside = f"{number(row['promised'])} by their probabilities; {_sure(row)}; all: {told}"
+            counts = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))
+            beside = (
+                f"{number(row['expected'])} by their probabilities; {_sure(row)}; all: {counts}"
+            )
             if old_right := was["right"]:
                 beside += f"; code before: {_share(old_right)} right, {_sure(was)}"
             what, n = f"verdicts that are right: {kind}", right["n"]

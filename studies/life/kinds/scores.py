@@ -23,13 +23,13 @@ def scored(kind: str, number: int, answer: Row) -> Row:
     life = life_of(kind, number)
     rng = np.random.default_rng([SEED, number])
     truth = dict(zip(PARAMETERS, life.ln_health[-1].tolist(), strict=True))
-    says, word = life.says, answer["verdict"]
+    right, word = life.right_verdicts, answer["verdict"]
     wait = _wait(answer["service"])
     row: Row = {
         "share": life.share,
         "verdict": word,
         "probability": answer["probability"],
-        "right": None if not says else word in says and _names(life, answer["why"]),
+        "right": None if not right else word in right and _names(life, answer["why"]),
         "surely_degraded": word in _DEGRADED and (answer["probability"] or 0.0) > SURE,
         "soon": wait is not None and wait <= SOON_DAYS,
         "late": wait is not None and life.left_days < wait,
@@ -86,7 +86,7 @@ def summarised(rows: Sequence[Row]) -> Row:
         "n": len(rows),
         "verdicts": dict(Counter(row["verdict"] for row in rows)),
         "right": _share([row["right"] for row in clear]),
-        "promised": float(sum(row["probability"] for row in sure)),
+        "expected": float(sum(row["probability"] for row in sure)),
         "surely_degraded": _share([row["surely_degraded"] for row in rows]),
         "soon": _share([row["soon"] for row in rows]),
         "late": _share([row["late"] for row in rows if row["left"]]),

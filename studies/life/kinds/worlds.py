@@ -112,7 +112,7 @@ class Life:
         return np.log1p(-self.size * self.course)
 
     @property
-    def says(self) -> tuple[str, ...]:
+    def right_verdicts(self) -> tuple[str, ...]:
         """Return the verdicts that are right; none where a loss is close to being one."""
         if self.world.lone:
             return ("outside-map",)
