@@ -122,11 +122,6 @@ def test_the_other_machine_keeps_its_stiffness(followed: Followed) -> None:
 
 
 @pytest.mark.study
-@pytest.mark.xfail(
-    strict=True,
-    reason="the last four intervals lie 0.02 to 0.08 % above 1: logs cut from one recording have "
-    "an error in common, by which they do not scatter",
-)
 def test_the_other_machine_is_inside_its_intervals(followed: Followed) -> None:
     """The 90 % intervals of the stiffness that it keeps hold 1 at every log."""
     own = stiffness(followed.folder, "bench-A")
