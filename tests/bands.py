@@ -12,14 +12,21 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, bin_spectra, fit_cluster
+from lmshealth.modal.ambient.cluster_fit import (
+    BinnedSpectra,
+    bin_spectra,
+    fit_modes,
+    fit_strengths,
+)
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
+from lmshealth.modal.ambient.excitation import Colour
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
-from lmshealth.modal.ambient.whittle import Likelihood, lay_out
+from lmshealth.modal.ambient.whittle import Likelihood, Marginal, lay_out
 from lmshealth.modal.modes import Rejection
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
+from lmshealth.stage.constants import BAND_HALF_WIDTH
 from tests.oracles import channel_covariance
 from tests.signals import Mode, accelerations, make_log
 
@@ -160,12 +167,28 @@ def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, BinnedSpectra]:
     return spectra, bin_spectra(spectra, 75.0, 165.0, 0.8)
 
 
+def started(
+    spectra: LogSpectra, binned: BinnedSpectra, targets: Sequence[Target]
+) -> tuple[Target, ...]:
+    """Start targets with the strengths of the levels, and the signs of the cross spectra."""
+    strengths = np.sqrt(fit_strengths(binned, targets)[0][:, : len(targets)])
+    found = []
+    for target, size in zip(targets, strengths.T, strict=True):
+        low, high = target.band(1.5)
+        near = sum(s.band(low, high).matrix.real.sum(axis=0) for s in spectra.spectra)
+        sign = np.where(near[size.argmax()] < 0, -1.0, 1.0)
+        found.append(replace(target, amplitude=(size.clip(1e-9 * size.max()) * sign) + 0j))
+    return tuple(found)
+
+
 def fit_spectra(
     spectra: LogSpectra, binned: BinnedSpectra, targets: Sequence[Target]
 ) -> tuple[ClusterModes | None, dict[str, Rejection]]:
-    """Return published modes and rejections."""
-    result = fit_cluster(spectra, binned, tuple(targets))
-    return result.modes, result.rejected
+    """Return credible modes and rejections."""
+    low = min(target.band(BAND_HALF_WIDTH)[0] for target in targets)
+    high = max(target.band(BAND_HALF_WIDTH)[1] for target in targets)
+    result = fit_modes(spectra, binned, started(spectra, binned, targets), (low, high))
+    return result.credible, result.rejected
 
 
 def fit(
@@ -187,3 +210,8 @@ def both(seed: int = 1, n: int = 60_000, noise: float = 0.5, psd: float = 1.0) -
     """Return two channels that show both modes, each of them one better."""
     modes = [Mode(105.0, 0.015, psd, (1.0, -0.3)), Mode(125.0, 0.02, psd, (0.4, 1.0))]
     return accelerations(np.random.default_rng(seed), modes, n, RATE, noise)
+
+
+def as_if_white(_: Likelihood, __: np.ndarray, white: Marginal, *___: float) -> Colour:
+    """Leave the posterior as it is for a white force."""
+    return Colour(white.mean, white.cov, 0.0)

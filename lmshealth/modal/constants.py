@@ -39,8 +39,9 @@ SEARCHABLE = 20.0
 # Differences from the description that search and map do not explain: of frequency, factor of
 # damping (beyond two standard deviations), and modal assurance criterion.
 OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8
-# Log likelihood that a named mode gains over a missed mode and an unknown resonance.
-NAME_GAIN = 3.5
+# Log likelihood that a named mode gains over a missed mode and an unknown resonance, where it has
+# moved as much as all have in common.
+NAME_GAIN = 4.6
 # Largest factor between the damping ratio found and the one described.
 DAMPING_SPAN = 6.0
 # Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
@@ -94,12 +95,12 @@ SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.
 PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
 PRIOR_FLOOR = (5.0, 2.0, 1.0)
-# Standard deviation of the static response of a mode over its receptance: 0 where the force acts on
-# the moving body, -1 where the base moves and the acceleration is absolute (without a description).
-PRIOR_STATIC = 1.0
-# Of the share of a floor that is coherent with the modes and with other floors (in units of the
-# floor), and of its bend: marginalised over these widths, of which the fit uses the last.
+# Standard deviations of priors that are marginalised over these widths, of which the fit uses the
+# last: the share of a floor that is coherent with the modes and with other floors (in units of the
+# floor), its bend, and the static response of a mode over its receptance: 0 where the force acts on
+# the moving body, -1 where the base moves and the acceleration is absolute.
 WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0)
+WIDTHS_STATIC = (0.03, 0.2, 1.0)
 
 # Frequency responses
 

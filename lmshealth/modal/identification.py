@@ -1,8 +1,8 @@
 """Identification of modes under ambient excitation, with and without a stage description.
 
-Channels of one log share the excitation, so that their errors are dependent: one Whittle
-likelihood holds all channels, fitted cluster by cluster (`fit_cluster`). The two drivers differ in
-where the start values come from, how modes are named and what happens to modes that are too close.
+Lines are masked, a search of all channels finds what resonates, groups of resonances are fitted by
+one Whittle likelihood of all channels, as channels of one log share the excitation, and what is
+credible is published. A description says where to look, and names what was found.
 """
 
 from collections.abc import Callable, Sequence
@@ -15,32 +15,26 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_fit import (
-    bin_cluster,
-    fit_cluster,
-    fit_modes,
-    locate,
-    needed_ordinates,
-    shows_more,
-)
+from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_modes, needed_ordinates
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     FittedSpectrum,
     drop_duplicates,
-    merge_close_modes,
-    refuse_close_modes,
+    join_surplus,
+    separate,
 )
-from lmshealth.modal.ambient.search import Found, halves, neighbourhood, search, split_groups
+from lmshealth.modal.ambient.search import (
+    Found,
+    halves,
+    neighbourhood,
+    search,
+    similar,
+    split_groups,
+)
 from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
-from lmshealth.modal.naming import assign, likeness, name_together
-from lmshealth.modal.targets import (
-    Target,
-    check_band,
-    choose_targets,
-    clusters,
-    limit_channels,
-)
+from lmshealth.modal.naming import name_resonances
+from lmshealth.modal.targets import Target, check_band, choose_targets, limit_channels
 from lmshealth.signal.segments import Segment, find_phases, stationary, with_few_lengths
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
@@ -52,11 +46,12 @@ from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND_HALF_WIDTH, LEAST_RESOLUTION
 from lmshealth.stage.description import Stage
 
-# Without a description spectra reach up to this multiple of the band: further than flanks do.
+# Spectra reach up to this multiple of the band: further than flanks do.
 _CEILING = 4.0
-# Without a description fits reach so many damping ratios from the outer modes: floors of real
-# machines are not simple.
-_REACH = 6.0
+# A fit reaches as far from its outer modes as they stand above the noise, in damping ratios within
+# these limits: less costs information about floors, bends and static responses, up to half of the
+# whole, and further away the floors of real machines are not as simple as the likelihood assumes.
+_LEAST_REACH, _MOST_REACH = 6.0, 24.0
 # A band whose ends have a larger ratio than the first is searched in parts up to the second, as no
 # simple floors hold over it; each is searched up to the third ratio beyond its ends, and the edges
 # are shifted up to the fourth where no mode is.
@@ -148,33 +143,29 @@ def read_ambient(
     """Identify modes as `identify` does; return them with the spectra and their fit."""
     check_band(log, band)
     log = limit_channels(log, channels)
-    used = log.channels
-    targets, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
+    hints, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
     while True:
         try:
-            stretches, whole = _transform(log, used, targets, band)
+            stretches, whole = _transform(log, log.channels, hints, band)
             break
         except BadLog as error:
-            targets, refusal = _without_narrowest(targets, error)
+            hints, refusal = _without_narrowest(hints, error)
             short.append(refusal)
-    tested: list[tuple[str, float, float]] = []
-    sought: tuple[Found, ...] = ()
-    if stage is None:
-        explore = partial(_explore, log, used, stretches, whole, band, progress)
-        sought, tested, fits = explore()
-        if suspected := _lines_at_modes(fits):
-            sought, tested, fits = explore(suspected)
-    else:
-        fits, known, more = _fit_described(whole, targets, _TOP * log.sample_rate)
-    refused = [*short, *(refusal for fit in fits for refusal in fit.refusals(log.name))]
-    left_out = [
-        Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
-        for part in sought
-        for name in part.left_out
-    ]
-    rejected, found = refused, [fit.modes for fit in fits if fit.modes is not None]
-    fitted = tuple(one.fitted for one in found)
-    masked = [line for one in found for line in one.lines]
+    spans = _spans(log, whole.duration, hints, band)
+    tested = _thomson_lines(log, stretches, spans)
+    explore = partial(_explore, whole, spans, hints, [f for _, f, _ in tested], log, progress)
+    sought, fits = explore(())
+    if suspected := _lines_at_modes(fits):
+        sought, fits = explore(suspected)
+    # Modes of the description outside the band take part where they are searched for.
+    every = () if stage is None else choose_targets(stage)
+    near = tuple(t for t in every if any(low <= t.frequency <= high for low, high in spans))
+    fits = join_surplus(drop_duplicates(fits), len(near))
+    resonances = [one.modes for fit in fits if (one := fit.resonances) is not None]
+    named = name_resonances(merge(resonances, (), (), whole.channels), near, log.name)
+    fits = [separate(fit, named.names) for fit in fits]
+    fitted = [fit.modes for fit in fits if fit.modes is not None]
+    masked = [line for one in fitted for line in one.lines]
     seen = [*tested, *whole.removed_lines, *masked]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / whole.duration)
     lines += tuple(
@@ -182,19 +173,30 @@ def read_ambient(
         for part in sought
         for h in part.harmonics
     )
-    if stage is None:
-        found = drop_duplicates(found)
-        anything = any(one.names for one in found)
-        refused = left_out if anything else [*left_out, _nothing_found(log, lines, refused)]
-    used_ones = {name for part in sought for name in part.spectra.channels}
-    shown = tuple(name for name in whole.channels if stage is not None or name in used_ones)
-    modes = merge([one.modes for one in found], lines, (*log.refused, *refused), shown)
-    modes = numbered(modes) if stage is None else modes
-    reading = AmbientReading(modes, whole, fitted, tuple(rejected), sought)
-    widths = [2 * target.damping_ratio * target.frequency for target in targets]
-    if stage is None or not more or whole.duration * min(widths) < constants.SEARCHABLE:
-        return reading
-    return _with_undescribed(log, reading, known, targets)
+    credible = [one.modes for fit in fits if (one := fit.credible) is not None]
+    unlike = set.intersection(*({*part.left_out} for part in sought))
+    shown = tuple(name for name in whole.channels if name not in unlike)
+    rejected = [
+        Refusal(log.name, why.reason, why.detail, mode=name, frequency=why.frequency)
+        for fit in fits
+        for name, why in fit.rejected.items()
+    ]
+    refused = [
+        Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
+        for part in sought
+        for name in part.left_out
+    ]
+    modes = merge(credible, lines, (*log.refused, *refused, *short), shown)
+    if stage is not None:
+        modes = named.publish(modes, hints, {row.mode: row for row in rejected})
+    elif modes.names:
+        modes = numbered(modes)
+    else:
+        nothing = _nothing_found(log, lines, rejected)
+        modes = replace(modes, refused=(*modes.refused, nothing))
+    return AmbientReading(
+        modes, whole, tuple(one.fitted for one in fitted), tuple(rejected), sought
+    )
 
 
 def _without_narrowest(
@@ -210,23 +212,6 @@ def _without_narrowest(
     named = Refusal(error.log, error.reason, error.detail, mode=least.name)
     others = tuple(target for target in targets if target is not least)
     return others, replace(named, frequency=least.frequency)
-
-
-def _with_undescribed(
-    log: Log, described: AmbientReading, known: Sequence[Target], targets: tuple[Target, ...]
-) -> AmbientReading:
-    """Search for all resonances near described modes, and name them together."""
-    bands = [(*target.band(BAND_HALF_WIDTH), target.search) for target in targets]
-    low = min(low * (1 - search) for low, _, search in bands)
-    high = max(high * (1 + search) for _, high, search in bands)
-    try:
-        found = read_ambient(log, band=(low, min(high, _TOP * log.sample_rate)))
-    except BadLog:  # too short for a search
-        return described
-    named = name_together(found.modes, described.modes, known, targets, log.name)
-    if named is described.modes:
-        return described
-    return replace(found, modes=named, rejected=named.refused)
 
 
 def _transform(
@@ -307,41 +292,19 @@ def _lines_at_modes(fits: Sequence[ClusterFit]) -> list[float]:
     return suspected
 
 
-def _explore(
-    log: Log,
-    used: tuple[Channel, ...],
-    stretches: Sequence[Segment],
-    whole: LogSpectra,
-    band: tuple[float, float] | None,
-    progress: Callable[[str, int, int], None],
-    suspected: Sequence[float] = (),
-) -> tuple[tuple[Found, ...], list[tuple[str, float, float]], list[ClusterFit]]:
-    """Search a band for modes and fit them; return both, and the lines of Thomson's test."""
-    sought, tested = _search(log, used, stretches, whole, band, progress, suspected)
-    groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
-    for part in sought:
-        for group in split_groups(part.modes):
-            near = neighbourhood(group, part.modes)
-            groups[near] = part, (*groups.get(near, (part, ()))[1], *group)
-    fits: list[ClusterFit] = []
-    for k, (near, (part, group)) in enumerate(groups.items()):
-        progress("fitting", k, len(groups))
-        fits += _fit_group(part, group, near, _TOP * log.sample_rate)
-    progress("fitting", len(groups), len(groups))
-    return sought, tested, fits
-
-
-def _search(
-    log: Log,
-    channels: tuple[Channel, ...],
-    stretches: Sequence[Segment],
-    spectra: LogSpectra,
-    band: tuple[float, float] | None,
-    progress: Callable[[str, int, int], None],
-    suspected: Sequence[float],
-) -> tuple[tuple[Found, ...], list[tuple[str, float, float]]]:
-    """Search the parts of the band for modes, and the band for the lines of Thomson's test."""
-    duration, usable = spectra.duration, constants.USABLE * log.sample_rate
+def _spans(
+    log: Log, duration: float, hints: Sequence[Target], band: tuple[float, float] | None
+) -> list[tuple[float, float]]:
+    """Return the bands in Hz that are searched, ascending: where hints may be, or the whole."""
+    usable = constants.USABLE * log.sample_rate
+    if hints:
+        ends = [(*hint.band(BAND_HALF_WIDTH), hint.search) for hint in hints]
+        spans: list[tuple[float, float]] = []
+        for low, high in sorted((a * (1 - search), b * (1 + search)) for a, b, search in ends):
+            if spans and low <= spans[-1][1]:
+                low, high = spans[-1][0], max(spans.pop()[1], high)
+            spans.append((low, high))
+        return [(low, min(high, _TOP * log.sample_rate)) for low, high in spans]
     low, high = band or (20 / duration, usable)
     low, high = max(low, 2 / duration), min(high, usable)
     n = max(0.0, (high - low) * duration)
@@ -352,28 +315,73 @@ def _search(
             f"{duration:.3g} s at {log.sample_rate:g} Hz hold {n:.0f} Fourier frequencies from "
             f"{low:.4g} to {high:.4g} Hz; needed are at least {constants.LEAST_FREQUENCIES}",
         )
+    return [(low, high)]
+
+
+def _thomson_lines(
+    log: Log, stretches: Sequence[Segment], spans: Sequence[tuple[float, float]]
+) -> list[tuple[str, float, float]]:
+    """Return channel, frequency in Hz and amplitude of the lines of Thomson's test."""
     longest = max(stretches, key=lambda s: s.stop - s.start)
-    tested = [
+    return [
         (channel.name, *line)
-        for channel in channels
-        for line in find_lines(channel, (longest,), log.sample_rate, (low, high)).tolist()
+        for channel in log.channels
+        for span in spans
+        for line in find_lines(channel, (longest,), log.sample_rate, span).tolist()
     ]
-    frequencies = [frequency for _, frequency, _ in tested]
-    cut = spectra.each(lambda spectrum: spectrum.without(frequencies))
-    edges = _edges(low, high, 20 / duration)
+
+
+def _explore(
+    whole: LogSpectra,
+    spans: Sequence[tuple[float, float]],
+    hints: tuple[Target, ...],
+    lines: list[float],
+    log: Log,
+    progress: Callable[[str, int, int], None],
+    suspected: Sequence[float],
+) -> tuple[tuple[Found, ...], list[ClusterFit]]:
+    """Search bands for modes, with lines in Hz masked, and fit these."""
+    cut = whole.each(lambda spectrum: spectrum.without(lines))
+    sought = _search(cut, spans, hints, lines, progress, suspected)
+    groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
+    for part in sought:
+        for group in split_groups(part.modes):
+            near = neighbourhood(group, similar(group, part.modes))
+            groups[near] = part, (*groups.get(near, (part, ()))[1], *group)
+    fits: list[ClusterFit] = []
+    for k, (near, (part, group)) in enumerate(groups.items()):
+        progress("fitting", k, len(groups))
+        fits += _fit_group(part, group, near, _TOP * log.sample_rate)
+    progress("fitting", len(groups), len(groups))
+    return sought, fits
+
+
+def _search(
+    spectra: LogSpectra,
+    spans: Sequence[tuple[float, float]],
+    hints: tuple[Target, ...],
+    lines: list[float],
+    progress: Callable[[str, int, int], None],
+    suspected: Sequence[float],
+) -> tuple[Found, ...]:
+    """Search all bands for modes, a wide one in parts."""
+    ends = [
+        (pair, span) for span in spans for pair in pairwise(_edges(*span, 20 / spectra.duration))
+    ]
     parts: list[Found] = []
-    for k, (first, last) in enumerate(pairwise(edges)):
-        progress("searching", k, len(edges) - 1)
-        ends = max(low, first / _BEYOND), min(high, last * _BEYOND)
-        part = search(cut, *ends, frequencies, suspected)
+    for k, ((first, last), (low, high)) in enumerate(ends):
+        progress("searching", k, len(ends))
+        reach = max(low, first / _BEYOND), min(high, last * _BEYOND)
+        own = tuple(hint for hint in hints if reach[0] <= hint.frequency <= reach[1])
+        part = search(spectra, *reach, lines, suspected, own)
         number = 1 + sum(len(one.modes) for one in parts)
         modes = [replace(t, name=f"mode_{i}") for i, t in enumerate(part.modes, number)]
-        if parts:
+        if first > low:
             first = _between((*parts[-1].modes, *modes), first)
             parts[-1] = replace(parts[-1], band=(parts[-1].band[0], first))
         parts.append(replace(part, band=(first, last), modes=tuple(modes)))
-    progress("searching", len(edges) - 1, len(edges) - 1)
-    return tuple(parts), tested
+    progress("searching", len(ends), len(ends))
+    return tuple(parts)
 
 
 def _edges(low: float, high: float, least: float) -> list[float]:
@@ -393,48 +401,6 @@ def _between(modes: Sequence[Target], edge: float) -> float:
     return float(near[distance.argmax()]) if f.size else edge
 
 
-def _fit_described(
-    spectra: LogSpectra, targets: tuple[Target, ...], top: float
-) -> tuple[list[ClusterFit], list[Target], bool]:
-    """Locate, fit and name described modes.
-
-    Returns the fits, their resonances, and whether the spectra show more near the targets, or one
-    resonance is so wide that it may stand for two.
-    """
-    searched, fits, known, wide = [], [], [], False
-    damping = {target.name: target.damping_ratio for target in targets}
-    for cluster in clusters(targets):
-        binned = bin_cluster(spectra, cluster, targets, top, searched=True)
-        around, located = locate(binned, cluster)
-        fit = fit_cluster(spectra, around, located)
-        searched.append(binned)
-        fits.append(_named(fit, cluster))
-        if fit.modes is not None:
-            modes = fit.modes.modes
-            values = np.stack([modes.frequency, modes.damping_ratio], axis=1).tolist()
-            known += [Target("", f, zeta, 0.0) for f, zeta in values]
-            ratio = modes.damping_ratio / [damping[name] for name in modes.names]
-            wide |= bool((ratio > constants.WIDE).any())
-    return fits, known, wide or any(shows_more(binned, known, targets) for binned in searched)
-
-
-def _named(fit: ClusterFit, cluster: tuple[Target, ...]) -> ClusterFit:
-    """Name the resonances of a cluster, and reject close modes."""
-    found = fit.modes
-    if found is not None and found.names:
-        # A mode may have started at the frequency of another.
-        ln_f = found.modes.ln_frequency
-        order = sorted(range(ln_f.size), key=lambda i: (ln_f[i], found.names[i]))
-        shapes = likeness(found.modes.select(order), cluster)
-        in_order = np.exp(ln_f[order]).tolist()
-        assigned, ambiguous = assign(in_order, cluster, shapes=shapes, complete=True)
-        names = {found.names[i]: name for i, name in zip(order, assigned, strict=True) if name}
-        # Without either no assignment keeps the order within the searches.
-        if names or ambiguous:
-            fit = ClusterFit(found.rename(names), fit.rejected | ambiguous)
-    return refuse_close_modes(fit)
-
-
 def _fit_group(
     found: Found, group: tuple[Target, ...], near: tuple[Target, ...], top: float
 ) -> list[ClusterFit]:
@@ -442,7 +408,7 @@ def _fit_group(
 
     Where that does not converge the group is fitted alone, and then in parts.
     """
-    targets = found.modes
+    targets = similar(group, found.modes)
     own = {t.name for t in group if found.within(t.frequency)}
     if not own:  # nothing to publish: they explain what reaches into the band, or left the spectra
         return []
@@ -454,7 +420,10 @@ def _fit_group(
         high = (targets[last + 1].frequency * near[-1].frequency) ** 0.5
     # At least twice the ordinates that the fit needs.
     least = needed_ordinates(len(near)) / found.spectra.duration
-    reach = [max(_REACH * t.damping_ratio * t.frequency, least) for t in near]
+    reach = [
+        max(float(np.clip(found.skirt(t), _LEAST_REACH, _MOST_REACH)) * t.bandwidth / 2, least)
+        for t in near
+    ]
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
@@ -462,23 +431,20 @@ def _fit_group(
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]
-    rejected = {name: why for name, why in fit.rejected.items() if name in own}
+    fit = fit.keep(own)
     if fit.modes is None:
-        return [ClusterFit(None, rejected)]
-    modes = merge_close_modes(fit.modes)
-    published = []
-    rows = zip(modes.names, modes.modes.frequency.tolist(), modes.modes.dispersion, strict=True)
-    for name, f, dispersion in rows:
+        return [fit]
+    rejected, modes = dict(fit.rejected), fit.modes.modes
+    kept = []
+    for name, f, scatter in zip(modes.names, modes.frequency, modes.dispersion, strict=True):
         # A mode may move out of the band, to explain what reaches into it.
-        if name not in own or not found.within(f):
+        if not found.within(f):
             continue
-        harmonic = any(h.low <= f <= h.high for h in found.harmonics)
-        if harmonic and dispersion > constants.LOOSE_FIT:
+        kept.append(name)
+        if scatter > constants.LOOSE_FIT and any(h.low <= f <= h.high for h in found.harmonics):
             detail = f"{f:.5g} Hz is not as steady as noise, and in the band of a line that wanders"
-            rejected[name] = Rejection("line-not-mode", detail, f)
-        else:
-            published.append(name)
-    return [ClusterFit(modes.keep(published), rejected)]
+            rejected.setdefault(name, Rejection("line-not-mode", detail, float(f)))
+    return [replace(fit, rejected=rejected).keep(kept)]
 
 
 def _nothing_found(log: Log, lines: tuple[Line, ...], rejected: list[Refusal]) -> Refusal:

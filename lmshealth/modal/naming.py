@@ -6,23 +6,22 @@ or name competes for (`name_response`): tracking assigns the rest.
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
-from functools import partial
-from itertools import combinations
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import softmax
 from scipy.stats import norm
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.modes import Modes, Rejection, merge
+from lmshealth.modal.modes import Modes, Rejection
 from lmshealth.modal.targets import Target
-from lmshealth.stage.constants import BAND_HALF_WIDTH
 from lmshealth.stage.description import Stage
+
+# Steps of the common shift of ln f over which assignments are summed.
+_COMMON_SHIFTS = 121
 
 
 def assign(
@@ -33,59 +32,45 @@ def assign(
     shapes: FloatArray | None = None,
     complete: bool = False,
     undescribed: bool = False,
-    clear: float = constants.CLEAR_NAME,
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
-    """Assign resonances to targets by the posterior of all order-preserving assignments.
-
-    The prior of an assignment is that of its shifts of ln f (`shift_cost`) and a gain for every
-    pair. Pairs outside the search, or with another damping where it is given, are excluded.
-    Resonances, in Hz, and targets ascend; ``shapes`` holds the modal assurance criterion of each
-    pair, NaN where it is unknown. ``complete`` states that every resonance is a target,
-    ``undescribed`` that some are none: then dampings count, and the machine is as likely at its
-    description as worn. A name needs the probability ``clear``.
+    """Assign resonances to targets by `pairing_probability`, whose arguments these are.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
     and the targets that are not assigned but may be one of the resonances.
     """
-    n, m = len(frequency), len(targets)
-    if complete and n == m:
-        return tuple(target.name for target in targets), {}
-    ln_f = np.log(np.asarray(frequency, dtype=float))
-    nominal = np.log([target.frequency for target in targets])
-    search = np.array([target.search for target in targets])
-    shift = ln_f[:, None] - nominal
-    admissible = np.abs(shift) <= np.log1p(search)
-    if damping is not None:
-        ratio = np.array(damping)[:, None] / [target.damping_ratio for target in targets]
-        admissible &= np.abs(np.log(ratio)) < np.log(constants.DAMPING_SPAN)
-    unlike = np.zeros((n, m))
-    if undescribed and damping is not None:
-        unlike += np.log1p(0.5 * (np.log(ratio) / constants.DAMPING_PRIOR) ** 2)
-    if shapes is not None:
-        unlike += np.log1p(0.5 * np.nan_to_num((1 - shapes) / constants.SHAPE_PRIOR) ** 2)
-    pairings = [
-        (list(one), list(other))
-        for k in range(n if complete else 0, min(n, m) + 1)
-        for one in combinations(range(n), k)
-        for other in combinations(range(m), k)
-        if admissible[one, other].all()
-    ]
-    probability = np.zeros((n, m))
-    weights = []
-    for some, sought in pairings:
-        weight = len(some) * constants.NAME_GAIN - unlike[some, sought].sum()
-        if some:
-            weight -= shift_cost(shift[some, sought][None], search[sought], len(some))[0]
-            weight += undescribed * _standing_gain(shift[some, sought], search[sought])
-        weights.append(weight)
-    for pairing, weight in zip(pairings, softmax(weights) if weights else (), strict=True):
-        probability[pairing] += weight
-    names = tuple(
-        targets[int(np.argmax(row))].name if row.size and row.max() >= clear else ""
+    probability = pairing_probability(
+        frequency,
+        targets,
+        damping=damping,
+        shapes=shapes,
+        complete=complete,
+        undescribed=undescribed,
+    )
+    names = clear_names(probability, targets, constants.CLEAR_NAME)
+    return names, _ambiguous(frequency, targets, probability, names, complete=complete)
+
+
+def clear_names(
+    probability: FloatArray, targets: Sequence[Target], least: float
+) -> tuple[str, ...]:
+    """Return the names that resonances have with at least this probability, else an empty one."""
+    return tuple(
+        targets[int(np.argmax(row))].name if row.size and row.max() >= least else ""
         for row in probability
     )
+
+
+def _ambiguous(
+    frequency: Sequence[float],
+    targets: Sequence[Target],
+    probability: FloatArray,
+    names: tuple[str, ...],
+    *,
+    complete: bool,
+) -> dict[str, Rejection]:
+    """Return the targets without a name that may be one of the resonances."""
     # With complete assignments a named resonance cannot be another target as well.
-    open_ = [i for i in range(n) if not (complete and names[i])]
+    open_ = [i for i, name in enumerate(names) if not (complete and name)]
     ambiguous = {}
     for j, target in enumerate(targets):
         rivals = [i for i in open_ if probability[i, j] > constants.UNLIKELY_NAME]
@@ -93,14 +78,69 @@ def assign(
             odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
             ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
-    return names, ambiguous
+    return ambiguous
 
 
-def _standing_gain(shift: FloatArray, search: FloatArray) -> float:
-    """Return the gain in log prior where the machine may stand at its description, not be worn."""
+def pairing_probability(
+    frequency: Sequence[float],
+    targets: Sequence[Target],
+    *,
+    damping: Sequence[float] | None = None,
+    shapes: FloatArray | None = None,
+    complete: bool = False,
+    undescribed: bool = False,
+) -> FloatArray:
+    """Return the probability that each resonance is each target, ``(n_resonances, n_targets)``.
+
+    It is that of all assignments that keep the order of frequencies, of which the shifts of ln f
+    are normal about a common one, and every pair gains. Pairs outside the search, or with another
+    damping where it is given, are excluded. Resonances, in Hz, and targets ascend; ``shapes`` holds
+    the modal assurance criterion of each pair, NaN where it is unknown. ``complete`` states that
+    every resonance is a target, ``undescribed`` that some are none: then dampings count, and the
+    machine is as likely at its description as worn.
+    """
+    n, m = len(frequency), len(targets)
+    if not n or not m:
+        return np.zeros((n, m))
+    ln_f = np.log(np.asarray(frequency, dtype=float))
+    search = np.array([target.search for target in targets])
+    shift = ln_f[:, None] - np.log([target.frequency for target in targets])
+    admissible = np.abs(shift) <= np.log1p(search)
+    gain = np.full((n, m), constants.NAME_GAIN)
+    if damping is not None:
+        ratio = np.array(damping)[:, None] / [target.damping_ratio for target in targets]
+        admissible &= np.abs(np.log(ratio)) < np.log(constants.DAMPING_SPAN)
+        if undescribed:
+            gain -= np.log1p(0.5 * (np.log(ratio) / constants.DAMPING_PRIOR) ** 2)
+    if shapes is not None:
+        gain -= np.log1p(0.5 * np.nan_to_num((1 - shapes) / constants.SHAPE_PRIOR) ** 2)
+    reach = float(np.log1p(search.max()))
+    common = np.linspace(-reach, reach, _COMMON_SHIFTS)
     scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
-    worn, new = norm.logpdf(shift.mean(), scale=scales)
-    return float(np.logaddexp(0.0, new - worn) - np.log(2))
+    prior = norm.pdf(common[:, None], scale=scales) @ [1.0, float(undescribed)]
+    apart = (shift - common[:, None, None]) / (search * constants.OWN_SHIFT)
+    weight = np.where(admissible, np.exp(gain - 0.5 * apart**2), 0.0)
+    before = _sums_before(weight, complete=complete)
+    after = _sums_before(weight[:, ::-1, ::-1], complete=complete)[:, ::-1, ::-1]
+    joint = np.einsum("c,cij,cij,cij->ij", prior, before[:, :n, :m], weight, after[:, 1:, 1:])
+    total = float(prior @ before[:, n, m])
+    return np.asarray(joint / total) if total > 0 else np.zeros((n, m))
+
+
+def _sums_before(weight: FloatArray, *, complete: bool) -> FloatArray:
+    """Sum the weights of all assignments of the first i resonances to the first j targets.
+
+    The weight of an assignment is the product of those of its pairs, ``(..., n, m)``; the result
+    has shape ``(..., n + 1, m + 1)``. In a complete assignment no resonance is without a target.
+    """
+    *others, n, m = weight.shape
+    total = np.zeros((*others, n + 1, m + 1))
+    total[..., 0, :] = 1.0
+    for i in range(n):
+        total[..., i + 1, 1:] = np.cumsum(total[..., i, :-1] * weight[..., i, :], axis=-1)
+        if not complete:
+            total[..., i + 1, :] += total[..., i, :]
+    return total
 
 
 def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) -> str:
@@ -151,93 +191,115 @@ def assurance(a: NDArray[Any], b: NDArray[Any]) -> FloatArray:
     return np.asarray(np.abs(a.conj() @ b.T) ** 2 / np.where(several & (power > 0), power, np.nan))
 
 
-def name_together(
-    found: Modes, described: Modes, known: Sequence[Target], targets: Sequence[Target], log: str
-) -> Modes:
+@dataclass(frozen=True, slots=True, eq=False)
+class Named:
+    """Names of the resonances of a log, and why described modes have none."""
+
+    names: dict[str, str]  # of described modes, by the provisional names of resonances
+    doubtful: frozenset[str]  # described modes whose resonance may be another one
+    ambiguous: dict[str, Rejection]  # by described mode
+    undescribed: frozenset[str]  # provisional names of resonances that are likely no described mode
+    targets: tuple[Target, ...]
+    log: str
+
+    def publish(
+        self, modes: Modes, wanted: Sequence[Target], rejected: dict[str, Refusal]
+    ) -> Modes:
+        """Return the wanted ones of credible modes, and refuse those that are not there.
+
+        ``rejected`` are the resonances of the log that are not credible, by provisional name.
+        """
+        by_name = {target.name: target for target in wanted}
+        index = [i for i, name in enumerate(modes.names) if self.names.get(name) in by_name]
+        named = modes.select(index)
+        names = tuple(self.names[name] for name in named.names)
+        flags = tuple(
+            " ".join(flag for flag in (own, *self._flags(by_name[name], f, zeta)) if flag)
+            for own, name, f, zeta in zip(
+                named.flags, names, named.frequency, named.damping_ratio, strict=True
+            )
+        )
+        refused = [self._refuse(t, rejected, modes) for t in wanted if t.name not in names]
+        for i, name in enumerate(modes.names):
+            f, zeta = float(modes.frequency[i]), float(modes.damping_ratio[i])
+            if name in self.names or name not in self.undescribed:
+                continue
+            detail = (
+                f"a resonance at {f:.5g} Hz, damping {100 * zeta:.2g} %, is not clearly any "
+                "described mode: describe it, or correct the description"
+            )
+            refused.append(
+                Refusal(self.log, "undescribed", detail, mode=f"{f:.5g} Hz", frequency=f)
+            )
+        return replace(named, names=names, flags=flags, refused=(*modes.refused, *refused))
+
+    def _flags(self, target: Target, f: float, zeta: float) -> Iterator[str]:
+        """Yield the flags of a named mode that follow from its description."""
+        shift = abs(np.log(f / target.frequency)) / np.log1p(target.search)
+        ratio = abs(np.log(zeta / target.damping_ratio)) / np.log(constants.DAMPING_SPAN)
+        if shift > constants.AT_BOUND or ratio > constants.AT_BOUND:
+            yield "at-bound"
+        if target.name in self.doubtful:
+            yield "doubtful-name"
+
+    def _refuse(self, target: Target, rejected: dict[str, Refusal], modes: Modes) -> Refusal:
+        """Return why a described mode is not published."""
+        given = {name: own for own, name in self.names.items()}
+        near = [
+            row
+            for row in rejected.values()
+            if row.frequency is not None and is_near(target, row.frequency)
+        ]
+        if (own := rejected.get(given.get(target.name, ""))) is not None:
+            return replace(own, mode=target.name)
+        if target.name in self.ambiguous:
+            reason, detail, _ = self.ambiguous[target.name]
+            return Refusal(self.log, reason, detail, mode=target.name)
+        if near:
+            closest = min(near, key=lambda row: abs(np.log(row.frequency / target.frequency)))
+            return replace(closest, mode=target.name)
+        f = target.frequency
+        there = [x for x in modes.frequency.tolist() if is_near(target, x)]
+        detail = f"no resonance near {f:.4g} Hz in any channel; excite it more or record longer"
+        if there:
+            detail = (
+                f"every resonance near {f:.4g} Hz is more likely another mode; correct the "
+                "description, or excite this mode"
+            )
+        return Refusal(self.log, "not-excited", detail, mode=target.name, frequency=f)
+
+
+def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named:
     """Name all resonances of a log, of which some may be no described mode.
 
-    Estimates of described modes remain where nothing more was found in their band; the others are
-    biased by what their fit lacks, and replaced by those of the search.
-
-    ``found`` is of a search without a description, ``described`` of the fit of described modes
-    only, which is returned if the search found no more; ``known`` are the resonances of that fit,
-    published or not, ``targets`` the described modes, ascending in frequency.
+    Fewer than there are described modes are all taken for such modes: then the machine may as well
+    have moved as stand at its description, and a lonely resonance is not named by guessing.
     """
-    near = [any(is_near(target, f) for target in targets) for f in found.frequency.tolist()]
-    found = found.select(np.flatnonzero(near).tolist())
-    more = _unexplained(found, known)
-    if not more:
-        return described
-    reach = BAND_HALF_WIDTH * np.maximum(
-        described.damping_ratio[:, None], found.damping_ratio[more]
+    near = [i for i, f in enumerate(both.frequency.tolist()) if any(is_near(t, f) for t in targets)]
+    both = both.select(near)
+    fewer, more = len(near) < len(targets), len(near) > len(targets)
+    frequency = both.frequency.tolist()
+    probability = pairing_probability(
+        frequency,
+        targets,
+        damping=both.damping_ratio.tolist(),
+        shapes=likeness(both, targets),
+        complete=fewer,
+        undescribed=not fewer,
     )
-    off = np.abs(described.ln_frequency[:, None] - found.ln_frequency[more])
-    alone = (off > reach).all(axis=1)
-    kept = described.select(np.flatnonzero(alone).tolist())
-    rest = described.select(np.flatnonzero(~alone).tolist())
-    rest = rest.select(_apart(rest, found.ln_frequency))
-    found = found.select(_apart(found, kept.ln_frequency))
-    parts = [replace(one, names=("",) * len(one.names)) for one in (kept, found, rest)]
-    both = merge(parts, described.lines, (), described.shape_channels)
-    values: Any = {"damping": both.damping_ratio.tolist(), "shapes": likeness(both, targets)}
-    assigned = partial(assign, both.frequency.tolist(), targets, **values, undescribed=True)
-    names, ambiguous = assigned()
-    sure, _ = assigned(clear=constants.SURE_NAME)
-    flags = tuple(
-        f"{own} doubtful-name".strip() if name and not certain else own
-        for own, name, certain in zip(both.flags, names, sure, strict=True)
+    names = clear_names(probability, targets, constants.CLEAR_NAME)
+    sure = clear_names(probability, targets, constants.SURE_NAME)
+    likely = probability.sum(axis=1) > 0.5
+    return Named(
+        names={own: name for own, name in zip(both.names, names, strict=True) if name},
+        doubtful=frozenset(names) - frozenset(sure) if more else frozenset(),
+        ambiguous=_ambiguous(frequency, targets, probability, names, complete=fewer),
+        undescribed=frozenset(
+            own for own, there in zip(both.names, likely, strict=True) if not there
+        ),
+        targets=targets,
+        log=log,
     )
-    index = [i for i, name in enumerate(names) if name]
-    unnamed = both.select([i for i, name in enumerate(names) if not name])
-    missing = [target for target in targets if target.name not in names]
-    refused = _refuse_unnamed(described, unnamed, missing, ambiguous, log)
-    return replace(both, names=names, flags=flags, refused=refused).select(index)
-
-
-def _unexplained(found: Modes, known: Sequence[Target]) -> list[int]:
-    """Return the modes that are not the nearest of a known one within a half-power bandwidth."""
-    explained = set()
-    for one in known:
-        off = np.abs(found.ln_frequency - np.log(one.frequency))
-        relative = off / (found.damping_ratio + one.damping_ratio)
-        if relative.size and relative.min() < 1:
-            explained.add(int(relative.argmin()))
-    return [i for i in range(len(found.names)) if i not in explained]
-
-
-def _apart(modes: Modes, ln_f: FloatArray) -> list[int]:
-    """Return the modes that are further than their half-power bandwidth from all of others."""
-    off = np.abs(modes.ln_frequency[:, None] - ln_f)
-    return np.flatnonzero((off > 2 * modes.damping_ratio[:, None]).all(axis=1)).tolist()
-
-
-def _refuse_unnamed(
-    described: Modes,
-    unnamed: Modes,
-    missing: Sequence[Target],
-    ambiguous: dict[str, Rejection],
-    log: str,
-) -> tuple[Refusal, ...]:
-    """Return refusals of channels, of described modes without a resonance, and the reverse."""
-    before = {one.mode: one for one in described.refused}
-    refused = [one for one in described.refused if not one.mode]
-    for target in missing:
-        f = target.frequency
-        detail = (
-            f"every resonance near {f:.4g} Hz is more likely another mode; correct the "
-            "description, or excite this mode"
-        )
-        why = ambiguous.get(target.name, Rejection("not-excited", detail, f))
-        own = Refusal(log, why.reason, why.detail, mode=target.name, frequency=why.frequency)
-        refused.append(own if target.name in ambiguous else before.get(target.name, own))
-    for f, zeta in zip(unnamed.frequency.tolist(), unnamed.damping_ratio.tolist(), strict=True):
-        detail = (
-            f"a resonance at {f:.5g} Hz, damping {100 * zeta:.2g} %, is not clearly any described "
-            "mode: describe it, or correct the description"
-        )
-        name = f"{f:.5g} Hz"
-        refused.append(Refusal(log, "undescribed", detail, mode=name, frequency=f))
-    return tuple(refused)
 
 
 class Difference(NamedTuple):

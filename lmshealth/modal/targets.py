@@ -22,11 +22,16 @@ class Target:
     frequency: float  # start value in Hz
     damping_ratio: float  # start value
     search: float  # half width of the search, as a fraction of the frequency
-    nominal: float | None = None  # described frequency in Hz, once the start value is another
+    narrow: bool = False  # whether it may be as narrow as a line, as one is described there
     # Described acceleration of channels by name, in any unit; empty where it is not described.
     shape: Mapping[str, float] = field(default_factory=dict, compare=False)
     # Root of the PSD of the modal force in each channel of the log, with the signs of the shape.
     amplitude: ComplexArray | None = field(default=None, compare=False)
+
+    @property
+    def bandwidth(self) -> float:
+        """Half-power bandwidth in Hz."""
+        return 2 * self.damping_ratio * self.frequency
 
     def band(self, widths: float) -> tuple[float, float]:
         """Return the band in Hz within so many damping ratios of the frequency."""

@@ -54,7 +54,6 @@ def test_modes_are_looked_for_as_they_are_described_and_in_order() -> None:
     assert [target.name for target in found] == ["roll", "pitch", "yaw"]
     roll = found[0]
     assert (roll.frequency, roll.damping_ratio, roll.search) == (105.0, 0.02, 0.15)
-    assert roll.nominal is None
 
 
 def test_a_band_takes_the_modes_inside_it_ends_included() -> None:

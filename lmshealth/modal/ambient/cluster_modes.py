@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import NamedTuple
@@ -10,10 +10,12 @@ from typing import NamedTuple
 import numpy as np
 
 from lmshealth._private.arrays import ComplexArray, FloatArray
-from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection
 from lmshealth.signal.spectra import CrossSpectrum
+
+# Reasons of rejections that leave a resonance.
+_RESONANT = ("poor-fit", "too-uncertain")
 
 
 class LineEstimate(NamedTuple):
@@ -54,66 +56,92 @@ class ClusterModes:
         index = [i for i, name in enumerate(self.names) if name in kept]
         return replace(self, modes=self.modes.select(index), clarity=self.clarity[index])
 
-    def rename(self, names: dict[str, str]) -> ClusterModes:
-        """Keep the modes that get a new name."""
-        kept = self.keep(names)
-        named = replace(kept.modes, names=tuple(names[name] for name in kept.names))
-        return replace(kept, modes=named)
-
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterFit:
     """Result of the fit of a cluster."""
 
-    # those published, possibly only lines; None where nothing was fitted
-    modes: ClusterModes | None
-    rejected: dict[str, Rejection]  # by the names of the modes that are not published
+    modes: ClusterModes | None  # all that were fitted, possibly only lines; None if none was
+    rejected: dict[str, Rejection]  # by the names of the modes that are not credible
 
-    def refusals(self, log: str) -> list[Refusal]:
-        """Return the rejections as refusals of a log, except of names that were assigned."""
-        assigned = () if self.modes is None else self.modes.names
-        return [
-            Refusal(log, why.reason, why.detail, mode=name, frequency=why.frequency)
-            for name, why in self.rejected.items()
-            if name not in assigned
-        ]
+    @property
+    def credible(self) -> ClusterModes | None:
+        """Modes that are not rejected."""
+        if self.modes is None:
+            return None
+        return self.modes.keep(name for name in self.modes.names if name not in self.rejected)
+
+    @property
+    def resonances(self) -> ClusterModes | None:
+        """Modes that are credible, or would be with more data: those that compete for names."""
+        if self.modes is None:
+            return None
+        none = [name for name, why in self.rejected.items() if why.reason not in _RESONANT]
+        return self.modes.keep(name for name in self.modes.names if name not in none)
+
+    def keep(self, names: Iterable[str]) -> ClusterFit:
+        """Forget modes, and their rejections."""
+        kept = set(names)
+        rejected = {name: why for name, why in self.rejected.items() if name in kept}
+        return ClusterFit(None if self.modes is None else self.modes.keep(kept), rejected)
 
 
-def refuse_close_modes(fit: ClusterFit) -> ClusterFit:
-    """Reject pairs of named modes that the data do not separate.
+def separate(fit: ClusterFit, described: Container[str]) -> ClusterFit:
+    """Leave no pair of modes that the data do not separate.
 
-    The rejection quotes their common frequency and damping with a standard deviation that covers
-    both.
+    Two described modes are rejected: the rejection quotes their common frequency and damping with a
+    standard deviation that covers both. Any other pair is replaced by one mode with the flag
+    ``cluster``, under the name of the described one.
     """
-    modes, rejected = fit.modes, fit.rejected
-    while modes is not None and (pair := _closest(modes)) is not None:
-        i, j = pair
-        names = [modes.names[k] for k in pair]
-        f = np.sort(modes.modes.frequency[[i, j]])
-        mean = _common(modes, i, j).modes.select([i])
-        detail = (
-            f"resonances at {f[0]:.5g} and {f[1]:.5g} Hz cannot be separated; their mean is "
-            f"{mean.frequency[0]:.5g} ± {mean.frequency_std[0]:.2g} Hz, damping "
-            f"{100 * mean.damping_ratio[0]:.2g} %: record longer, or in a channel that they move "
-            "differently"
-        )
-        rejected = rejected | dict.fromkeys(
-            names, Rejection("too-close", detail, float(mean.frequency[0]))
-        )
-        modes = modes.keep(name for name in modes.names if name not in names)
-    return ClusterFit(modes, rejected)
+    while (pair := _closest(fit)) is not None:
+        one, other = sorted(pair, key=lambda name: name not in described)
+        if other in described:
+            too_close = dict.fromkeys(pair, _too_close(fit, one, other))
+            fit = replace(fit, rejected=fit.rejected | too_close)
+        else:
+            fit = _joined(fit, one, other)
+    return fit
 
 
-def merge_close_modes(modes: ClusterModes) -> ClusterModes:
-    """Replace pairs that the data do not separate by one mode with the flag ``cluster``."""
-    while (pair := _closest(modes)) is not None:
-        second = modes.names[pair[1]]
-        modes = _common(modes, *pair).keep(name for name in modes.names if name != second)
-    return modes
+def join_surplus(fits: Sequence[ClusterFit], most: int) -> list[ClusterFit]:
+    """Join pairs that the data do not separate while there are more modes than described ones."""
+    fits = list(fits)
+    n = sum(len(one.names) for fit in fits if (one := fit.credible) is not None)
+    for k, fit in enumerate(fits):
+        while n > most and (pair := _closest(fit)) is not None:
+            fit = _joined(fit, *pair)
+            n -= 1
+        fits[k] = fit
+    return fits
 
 
-def _closest(found: ClusterModes) -> tuple[int, int] | None:
-    """Return a pair of modes that are too close; None where there is none."""
+def _joined(fit: ClusterFit, one: str, other: str) -> ClusterFit:
+    """Put the mean of two modes in the place of the first."""
+    assert fit.modes is not None
+    names = fit.modes.names
+    common = _common(fit.modes, names.index(one), names.index(other))
+    return replace(fit, modes=common).keep({*names, *fit.rejected} - {other})
+
+
+def _too_close(fit: ClusterFit, one: str, other: str) -> Rejection:
+    assert fit.modes is not None
+    i, j = (fit.modes.names.index(name) for name in (one, other))
+    f = np.sort(fit.modes.modes.frequency[[i, j]])
+    mean = _common(fit.modes, i, j).modes.select([i])
+    detail = (
+        f"resonances at {f[0]:.5g} and {f[1]:.5g} Hz cannot be separated; their mean is "
+        f"{mean.frequency[0]:.5g} ± {mean.frequency_std[0]:.2g} Hz, damping "
+        f"{100 * mean.damping_ratio[0]:.2g} %: record longer, or in a channel that they move "
+        "differently"
+    )
+    return Rejection("too-close", detail, float(mean.frequency[0]))
+
+
+def _closest(fit: ClusterFit) -> tuple[str, str] | None:
+    """Return the names of a pair of credible modes that are too close; None without one."""
+    found = fit.credible
+    if found is None:
+        return None
     f, zeta = found.modes.frequency, found.modes.damping_ratio
     shapes = found.modes.shapes / found.fitted.unit
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
@@ -121,7 +149,7 @@ def _closest(found: ClusterModes) -> tuple[int, int] | None:
         apart = abs(f[i] - f[j]) / (zeta[i] * f[i] + zeta[j] * f[j])
         alike = float(shapes[i] @ shapes[j]) ** 2 > constants.ALIKE_MAC
         if apart < (constants.SEPARATION_ALIKE if alike else constants.SEPARATION):
-            return i, j
+            return found.names[i], found.names[j]
     return None
 
 
@@ -142,17 +170,30 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
     return replace(found, modes=common.widened("cluster", cov + np.diag(apart)))
 
 
-def drop_duplicates(found: list[ClusterModes]) -> list[ClusterModes]:
-    """Drop modes within half a half-power bandwidth of a clearer one of another cluster."""
+def drop_duplicates(fits: Sequence[ClusterFit]) -> list[ClusterFit]:
+    """Drop modes within half a half-power bandwidth of a clearer one of another cluster.
+
+    Two modes of one cluster are those that its fit separates.
+    """
     rows = [
-        (float(clarity), float(ln_f), float(zeta), name)
-        for one in found
+        (float(clarity), float(ln_f), float(zeta), k, name)
+        for k, fit in enumerate(fits)
+        if (one := fit.credible) is not None
         for clarity, ln_f, zeta, name in zip(
             one.clarity, one.modes.ln_frequency, one.modes.damping_ratio, one.names, strict=True
         )
     ]
-    kept: list[tuple[float, float, float, str]] = []
+    kept: list[tuple[float, float, float, int, str]] = []
+    dropped: set[str] = set()
     for row in sorted(rows, reverse=True):
-        if all(abs(row[1] - other[1]) > 0.5 * (row[2] + other[2]) for other in kept):
+        if all(
+            row[3] == other[3] or abs(row[1] - other[1]) > 0.5 * (row[2] + other[2])
+            for other in kept
+        ):
             kept.append(row)
-    return [one.keep(row[3] for row in kept) for one in found]
+        else:
+            dropped.add(row[4])
+    return [
+        fit if fit.modes is None else fit.keep({*fit.modes.names, *fit.rejected} - dropped)
+        for fit in fits
+    ]

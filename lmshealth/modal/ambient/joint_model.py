@@ -16,6 +16,8 @@ from lmshealth.modal.ambient.whittle import receptance, response
 _LEAST_GAIN, _HALVINGS = 0.3, 5
 # Median of the square of a normal variable.
 _MEDIAN_SQUARE = 0.455
+# Mean of the residual over the floor below which a channel has less noise than any floor.
+_LITTLE = 0.5
 # In units of the median density of a channel. Channels of hardly any noise would else be judged by
 # the errors of the model, and the selection of modes by the rounding of the processor.
 LEAST_FLOOR = 1e-4
@@ -129,11 +131,17 @@ class JointModel:
         return np.asarray(b @ part.r @ np.swapaxes(b.conj(), 1, 2))
 
     def dispersions(self) -> FloatArray:
-        """Return the dispersion of the residual of each channel given the others; 1 for noise."""
+        """Return the dispersion of the residual of each channel given the others; 1 for noise.
+
+        A channel with less noise than the least floor scatters less than its floor says.
+        """
         g = self._inverse
-        ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / np.einsum("kaa->ka", g).real
+        precision = np.einsum("kaa->ka", g).real
+        ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / precision
         squares = self.data.count[:, None] * (ratio - 1) ** 2
-        return np.asarray(np.median(squares, axis=0) / _MEDIAN_SQUARE)
+        scatter = np.median(squares, axis=0) / _MEDIAN_SQUARE
+        level = self.data.count @ ratio / self.data.count.sum()
+        return np.where(level < _LITTLE, np.minimum(scatter, 1.0), scatter)
 
     @cached_property
     def misfit(self) -> float:

@@ -19,6 +19,7 @@ from scipy.special import comb
 
 from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.modal import constants
+from lmshealth.modal.ambient.hints import candidates_at
 from lmshealth.modal.ambient.joint_model import (
     LEAST_FLOOR,
     BandData,
@@ -29,6 +30,7 @@ from lmshealth.modal.ambient.joint_model import (
 from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, near_lines
 from lmshealth.modal.ambient.whittle import response
+from lmshealth.modal.naming import is_near
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
@@ -66,6 +68,17 @@ class Found:
         """Return whether a frequency in Hz lies in the band."""
         return self.band[0] <= frequency <= self.band[1]
 
+    def skirt(self, target: Target) -> float:
+        """Return how far from its resonance a mode stands above the noise, in damping ratios.
+
+        It is that of the channel that shows it furthest.
+        """
+        model = self.model
+        mode = int(np.abs(model.f - target.frequency).argmin())
+        place = int(np.abs(model.data.frequency - target.frequency).argmin())
+        floor = model.floor @ model.data.basis[:, place]
+        return float((np.abs(model.phi[:, mode]) / (2 * model.zeta[mode] * np.sqrt(floor))).max())
+
     def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
         """Return the spectra from low to high Hz, with the other modes as foreign."""
         cut = self.spectra.each(lambda spectrum: spectrum.band(low, high))
@@ -82,34 +95,45 @@ def search(
     high: float,
     lines: Sequence[float] = (),
     suspected: Sequence[float] = (),
+    hints: tuple[Target, ...] = (),
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    Lines are masked in the spectra. There may be further ones where ``suspected``. Channels that no
-    common modes explain are left out.
+    Lines are masked in the spectra. There may be further ones where ``suspected``. Described modes
+    are ``hints`` where to look. Channels that no common modes explain are left out.
     """
     every = spectra.channels
+    # A silent channel shows nothing, and is not unlike the others.
+    level = sum(s.powers().sum(axis=0) for s in spectra.spectra)
+    silent = [name for name, power in zip(every, level, strict=True) if not power > 0]
+    spectra = spectra.select([c for c, name in enumerate(every) if name not in silent] or [0])
     while True:
-        model, harmonics, after, poles = _explain(spectra, low, high, suspected)
+        model, harmonics, after, poles = _explain(spectra, low, high, suspected, hints)
         kept = _consistent(model)
         if len(kept) == len(spectra.channels):
             break
         spectra = spectra.select(kept)
+    model = _without_splits(model, len(hints)) if hints else model
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
-    wide = (width > LINE_WIDTH) & (width * model.f * spectra.duration > 1)
-    wide &= ~(near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH))
+    light = [hint for hint in hints if 2 * hint.damping_ratio < _FOOT * LINE_WIDTH]
+    narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
+    wide = (width > LINE_WIDTH) & ~(
+        near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH)
+    )
+    wide = (wide | narrow) & (width * model.f * spectra.duration > 1)
     modes = tuple(
         Target(
             f"mode_{number}",
             float(model.f[i]),
             float(model.zeta[i]),
             max(0.02, 4 * float(model.zeta[i])),
+            narrow=bool(narrow[i]),
             amplitude=(model.phi[:, i] * model.data.scale).astype(np.complex128),
         )
         for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
     )
-    left_out = tuple(name for name in every if name not in after.channels)
+    left_out = tuple(name for name in every if name not in (*after.channels, *silent))
     return Found(modes, harmonics, after, model, (low, high), left_out, poles)
 
 
@@ -118,6 +142,7 @@ def _explain(
     low: float,
     high: float,
     suspected: Sequence[float],
+    hints: tuple[Target, ...],
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -127,6 +152,7 @@ def _explain(
         candidates = [
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
+        candidates += candidates_at(spectra, hints, high)
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
         model = _select(_start(_bin(spectra, candidates, low, high), candidates).refined(6))
         harmonic = find_harmonic(model, recording, harmonics, suspected)
@@ -139,6 +165,28 @@ def _explain(
             )
         else:
             spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=harmonic.expected))
+
+
+def _without_splits(model: JointModel, most: int) -> JointModel:
+    """Drop the weaker pole of pairs that no fit separates, while there are more than ``most``.
+
+    One described mode whose channels move out of phase is explained better by several poles of real
+    shapes, of which none is the mode.
+    """
+    while model.f.size > most:
+        width, power = model.f * model.zeta, np.sum(model.phi**2, axis=0)
+        alike = (model.phi.T @ model.phi) ** 2 > constants.ALIKE_MAC * np.outer(power, power)
+        limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
+        apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
+        np.fill_diagonal(apart, np.inf)
+        i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+        if apart[i, j] > 1:
+            break
+        weaker = i if power[i] / model.zeta[i] < power[j] / model.zeta[j] else j
+        f = float(model.f[weaker])
+        model = model.without(int(weaker))
+        model = model.refined(3, model.nearest(f)).refined(2)
+    return model
 
 
 def _consistent(model: JointModel) -> list[int]:
@@ -238,11 +286,38 @@ def _excesses(model: JointModel) -> list[tuple[float, float, float, FloatArray]]
 
 
 def split_groups(targets: tuple[Target, ...]) -> list[tuple[Target, ...]]:
-    """Group neighbours whose bands overlap; groups of too many are split at the widest gap."""
+    """Group neighbours whose bands overlap and whose bandwidths are similar.
+
+    A narrow peak near a broad resonance would need the finest resolution over the whole band.
+    Groups of too many are split at the widest gap.
+    """
     bands = [target.band(BAND_HALF_WIDTH) for target in targets]
     apart = [upper[0] >= lower[1] for lower, upper in pairwise(bands)]
     edges = [0, *(1 + np.flatnonzero(apart)).tolist(), len(targets)]
-    return [small for a, b in pairwise(edges) for small in _small(targets[a:b])]
+    return [
+        small
+        for a, b in pairwise(edges)
+        for alike in _by_bandwidth(targets[a:b])
+        for small in _small(alike)
+    ]
+
+
+def _by_bandwidth(group: tuple[Target, ...]) -> list[tuple[Target, ...]]:
+    """Split a group into those that are similar, beginning with the widest."""
+    found = []
+    while group:
+        widest = max(target.bandwidth for target in group)
+        alike = tuple(t for t in group if t.bandwidth * constants.SIMILAR_BANDWIDTH > widest)
+        group = tuple(t for t in group if t not in alike)
+        found.append(alike)
+    return found
+
+
+def similar(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tuple[Target, ...]:
+    """Return a group with all targets of similar bandwidths, ascending in frequency."""
+    least = max(t.bandwidth for t in group) / constants.SIMILAR_BANDWIDTH
+    most = min(t.bandwidth for t in group) * constants.SIMILAR_BANDWIDTH
+    return tuple(t for t in targets if t in group or least < t.bandwidth < most)
 
 
 def _small(group: tuple[Target, ...]) -> list[tuple[Target, ...]]:

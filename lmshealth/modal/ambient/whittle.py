@@ -90,6 +90,11 @@ class Layout:
         return list(range(self.n_poles - 3 * self.n_channels + 2, self.n_poles, 3))
 
     @cached_property
+    def statics(self) -> list[int]:
+        """Static responses of the modes."""
+        return list(range(2 * self.n_modes, 3 * self.n_modes)) if self.has_static else []
+
+    @cached_property
     def shapes(self) -> slice:
         """Unknowns of the shapes."""
         return slice(self.forces.stop, self.forces.stop + len(self.shape))
@@ -168,7 +173,7 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
 
 
 # Newton decrement, a square in standard deviations, below which the search ends, and most steps.
-_ARRIVED, _MOST_STEPS = 1e-5, 100
+_ARRIVED, _MOST_STEPS = 1e-5, 60
 # First and least radius of the trust region, and shares of the expected gain: steps count above
 # the first share, the radius shrinks below the second and grows above the third.
 _FIRST_RADIUS, _LEAST_RADIUS, _ACCEPTED, _POOR, _GOOD = 0.3, 1e-9, 0.15, 0.25, 0.75
@@ -188,6 +193,7 @@ class Likelihood:
     spread: float  # half width of the band in ln f
     bumps: FloatArray = field(default_factory=lambda: np.empty((2, 0)))  # centres, widths in Hz
     bump_std: float = 1.0  # standard deviation of the prior of their heights
+    narrowest: float = 0.0  # half-power bandwidth in Hz below which a pole is a line
     # Models at the latest unknowns, by the bytes of these.
     _latest: dict[bytes, list[_Point]] = field(default_factory=dict, init=False, repr=False)
 
@@ -201,7 +207,7 @@ class Likelihood:
         return np.concatenate(
             [
                 np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
-                np.full(lay.has_static * lay.n_modes, constants.PRIOR_STATIC),
+                np.full(lay.has_static * lay.n_modes, constants.WIDTHS_STATIC[-1]),
                 np.tile(constants.PRIOR_FLOOR, lay.n_channels),
                 forces,
                 np.full(len(lay.shape), constants.PRIOR_SHAPE),
@@ -278,13 +284,17 @@ class Likelihood:
         return _Point(self, p, at)
 
     def minimise(self, start: FloatArray) -> FloatArray:
-        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``."""
+        """Find the posterior mode by Newton's method in a trust region, from ``(n_unknowns,)``.
+
+        The search ends where a pole becomes a line: it would take many steps to no damping.
+        """
         p, radius, found = start, _FIRST_RADIUS, self._finite_derivatives(start)
         if found is None:
             return start
         value, (slope, curvature) = self.value(start), found
         for _ in range(_MOST_STEPS):
-            if radius < _LEAST_RADIUS:  # what is gained is below the rounding of the value
+            # Of a small radius what is gained is below the rounding of the value.
+            if radius < _LEAST_RADIUS or self.collapsed(p):
                 break
             newton = _newton_step(slope, curvature)
             if newton is not None and -float(slope @ newton) < _ARRIVED:
@@ -302,6 +312,11 @@ class Likelihood:
             else:
                 radius /= 4
         return p
+
+    def collapsed(self, p: FloatArray) -> list[int]:
+        """Return the modes whose poles are lines."""
+        bandwidth = 2 * np.exp(p[: 2 * self.layout.n_modes].reshape(2, -1).sum(axis=0))
+        return np.flatnonzero(bandwidth < self.narrowest).tolist()
 
     def _finite_derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray] | None:
         """Return `derivatives`; None where they overflow."""
@@ -591,8 +606,8 @@ class Marginal(NamedTuple):
 def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     """Return mean and covariance of ``[ln f, ln ζ]`` by Laplace's approximation.
 
-    The posterior is averaged over the widths of the priors of coherence and bends of floors,
-    weighted by their evidence (README.md). ``p`` is near the posterior mode.
+    The posterior is averaged over the widths of the priors of coherence and bends of floors and of
+    static responses, weighted by their evidence (README.md). ``p`` is near the posterior mode.
     """
     n, layout = 2 * likelihood.layout.n_modes, likelihood.layout
     gradient, hessian = likelihood.derivatives(p)
@@ -606,7 +621,7 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     decrement = float(gradient @ step)
     evidence = 0.5 * decrement - likelihood.value(p) - np.log(np.diag(root)).sum()
     p = p - step
-    groups = (layout.shared, layout.common, layout.bends)
+    groups = (layout.shared, layout.common, layout.bends, layout.statics)
     index = np.array([unknown for group in groups for unknown in group], dtype=int)
     precision = np.linalg.inv(cov[np.ix_(index, index)])
     follow = cov[:n, index] @ precision  # regression of ln f and ln ζ on these unknowns
@@ -629,7 +644,19 @@ def _narrow(
     Returns the log evidence of each choice over the widest, shape ``(n_choices,)``, and means and
     covariances of the unknowns, ``(n_choices, n)`` and ``(n_choices, n, n)``.
     """
-    choices = (constants.WIDTHS_SHARED, constants.WIDTHS_COMMON, constants.WIDTHS_BEND)
+    choices = [
+        choice if n else choice[-1:]
+        for choice, n in zip(
+            (
+                constants.WIDTHS_SHARED,
+                constants.WIDTHS_COMMON,
+                constants.WIDTHS_BEND,
+                constants.WIDTHS_STATIC,
+            ),
+            sizes,
+            strict=True,
+        )
+    ]
     widths = np.array(list(product(*choices)))
     widest = np.array([choice[-1] for choice in choices])
     # Precision of the narrower prior less that of the prior in ``precision``.

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -13,12 +12,10 @@ from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     ClusterModes,
     drop_duplicates,
-    merge_close_modes,
-    refuse_close_modes,
+    separate,
 )
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
-from lmshealth.modal.targets import Target
 from tests.bands import PITCH, RATE, ROLL, both, fit, found
 from tests.signals import Mode, acceleration_log, make_stage
 
@@ -49,8 +46,8 @@ def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
 ) -> None:
     """What is too close is refused by name, with both frequencies and where they stand together."""
     fit = brought_to(apart, found(both()), shapes)
-    result = refuse_close_modes(ClusterFit(fit, {}))
-    kept, rejected = result.modes, result.rejected
+    result = separate(ClusterFit(fit, {}), ("roll", "pitch"))
+    kept, rejected = result.credible, result.rejected
     assert kept is not None
     assert (set(rejected) == {"roll", "pitch"}) is close
     assert (len(kept.names) == 0) is close
@@ -63,8 +60,14 @@ def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
 def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     """One mode for both, half of their distance in its standard deviation, and flagged."""
     fit = brought_to(0.5, found(both()), ALIKE)
-    kept = merge_close_modes(fit)
+    kept = separate(ClusterFit(fit, {}), ()).credible
+    assert kept is not None
     assert list(kept.names) == ["roll"]
+    # It has the name of the one that is described.
+    described = separate(ClusterFit(fit, {}), ("pitch",)).credible
+    assert described is not None
+    assert list(described.names) == ["pitch"]
+    assert described.modes.estimate[0] == pytest.approx(kept.modes.estimate[0])
     assert kept.modes.flags == ("cluster",)
     assert kept.modes.estimate[0] == pytest.approx(fit.modes.estimate[:2].mean())
     half = (fit.modes.estimate[1] - fit.modes.estimate[0]) / 2
@@ -75,16 +78,25 @@ def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     assert kept.modes.cov.shape == (2, 2)
 
 
+def renamed(fit: ClusterModes, *names: str) -> ClusterModes:
+    """Give modes other names."""
+    return replace(fit, modes=replace(fit.modes, names=names))
+
+
 def test_of_a_mode_that_two_parts_of_a_band_find_the_clearer_is_kept() -> None:
-    """The same fit twice, once less clear: its modes are dropped; modes elsewhere are kept."""
-    clear = found(both()).rename({"roll": "mode_1", "pitch": "mode_2"})
-    again = replace(clear, clarity=clear.clarity / 2).rename(
-        {"mode_1": "mode_3", "mode_2": "mode_4"}
-    )
-    far = again.rename({"mode_3": "mode_5", "mode_4": "mode_6"})
+    """The same fit twice, once less clear: its modes are dropped; modes elsewhere are kept.
+
+    Two modes of one fit are kept however close they are.
+    """
+    clear = renamed(found(both()), "mode_1", "mode_2")
+    again = renamed(replace(clear, clarity=clear.clarity / 2), "mode_3", "mode_4")
+    far = renamed(again, "mode_5", "mode_6")
     far = replace(far, modes=replace(far.modes, ln_frequency=far.modes.ln_frequency + 1))
-    kept = [one.names for one in drop_duplicates([again, clear, far])]
-    assert kept == [(), ("mode_1", "mode_2"), ("mode_5", "mode_6")]
+    close = renamed(brought_to(0.3, far, UNLIKE), "mode_7", "mode_8")
+    close = replace(close, modes=replace(close.modes, ln_frequency=close.modes.ln_frequency - 3))
+    fits = drop_duplicates([ClusterFit(one, {}) for one in (again, clear, far, close)])
+    kept = [one.names for fit in fits if (one := fit.modes) is not None]
+    assert kept == [(), ("mode_1", "mode_2"), ("mode_5", "mode_6"), ("mode_7", "mode_8")]
 
 
 @pytest.mark.slow
@@ -178,15 +190,10 @@ def test_too_few_ordinates_tell_no_dispersion() -> None:
         assert np.isfinite(_dispersion(*left, between, reach / (2 * between))[0]) == enough
 
 
-def flags(
-    modes: Modes, duration: float = 60.0, targets: Sequence[Target] = (ROLL, PITCH)
-) -> list[list[str]]:
+def flags(modes: Modes, duration: float = 60.0) -> list[list[str]]:
     """List the flags of both modes."""
     values = zip(modes.frequency, modes.damping_ratio, modes.dispersion, strict=True)
-    return [
-        _flags(target, *value, duration, unsteady=False).split()
-        for target, value in zip(targets, values, strict=True)
-    ]
+    return [_flags(*value, duration, unsteady=False).split() for value in values]
 
 
 def test_a_good_fit_has_no_flags() -> None:
@@ -198,20 +205,13 @@ def test_a_good_fit_has_no_flags() -> None:
 
 
 def test_each_flag_has_its_own_reason() -> None:
-    """Resolution, bounds of frequency and damping, and dispersion raise flags, also together."""
+    """Resolution and dispersion raise flags, also together."""
     modes = found(both()).modes
     # Half-power bandwidths of 3.15 and 5 Hz: a second holds 3.15 and 5 ordinates.
     assert flags(modes, 1.0) == [["resolution-limited"], []]
     assert flags(replace(modes, dispersion=np.array([np.nan, 1.6]))) == [[], ["loose-fit"]]
-    far = replace(modes, ln_frequency=TRUTH[:2] + np.array([0.95 * np.log1p(0.15), 0.0]))
-    heavy = replace(modes, ln_damping=np.log([0.015, 0.02 * 5.8]))
-    assert flags(far) == [["at-bound"], []]
-    assert flags(heavy) == [[], ["at-bound"]]
-    worst = replace(far, dispersion=np.array([2.0, 1.0]))
-    assert flags(worst, 1.0) == [["resolution-limited", "at-bound", "loose-fit"], []]
-    # The described frequency counts, not the start value in this log.
-    moved = [replace(t, frequency=1.14 * t.frequency, nominal=t.frequency) for t in (ROLL, PITCH)]
-    assert flags(modes, targets=moved) == [[], []]
+    worst = replace(modes, dispersion=np.array([2.0, 1.0]))
+    assert flags(worst, 1.0) == [["resolution-limited", "loose-fit"], []]
 
 
 @pytest.mark.slow

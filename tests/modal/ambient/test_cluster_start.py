@@ -13,8 +13,8 @@ from lmshealth.modal.ambient.cluster_fit import (
     bin_spectra,
     fit_strengths,
     incoherent_fit,
-    locate,
 )
+from lmshealth.modal.ambient.hints import locate
 from lmshealth.modal.targets import Target
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 from tests.signals import (
