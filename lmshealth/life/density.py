@@ -9,6 +9,7 @@ from scipy.special import softmax
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
+from lmshealth.life.importance_sampling import log_sum_exp
 from lmshealth.life.likelihood import Grid, LifeLikelihood
 from lmshealth.life.scenarios import Scenario
 
@@ -38,9 +39,7 @@ class LifeDensity:
         total[possible] = np.where(within, total[possible], -np.inf)
         if within.any():
             terms = self.likelihood.terms(self.grid, x)
-            # As scipy's logsumexp, at a tenth of its time for so few points.
-            flat = terms.reshape(-1, terms.shape[2])
-            total[np.isfinite(total)] += np.logaddexp.reduce(flat, axis=0)
+            total[np.isfinite(total)] += log_sum_exp(terms.reshape(-1, terms.shape[2]))
         return total
 
     def point_weights(self, y: FloatArray) -> FloatArray:

@@ -292,25 +292,37 @@ class LifeLikelihood:
     def conditional(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the mean of Gaussian quantities given a life and all data, and their information.
+        """Return the means of Gaussian quantities given a life and all data, and their information.
 
         That is by how much the data reduce their covariance. At the k-th point of a grid; `cross`
-        are their covariances with the data, ``(n_values, n_data)``. Shapes ``(n, n_values)`` and
-        ``(n, n_values, n_values)`` for x ``(n, ...)``.
+        are the covariances of several groups of quantities with the data, ``(n_groups, n_values,
+        n_data)``. Shapes ``(n, n_groups, n_values)`` and, within each group, ``(n, n_groups,
+        n_values, n_values)`` for x ``(n, ...)``.
         """
         point = grid[np.arange(grid.walk.size) == k]
         settings = (float(grid.walk[k]), float(grid.noise_scale[k]), float(grid.deviation[k]))
         factor = self.covariance.factor(*settings, int(grid.lone[k]))
-        a = solve_triangular(factor, cross.T, lower=True)
+        n_data = cross.shape[2]
+        a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
         u, q, _ = _reduced(self.data, self.basis, factor)
         b = a.T @ q
-        rows = self._residuals(point, x)[0]
-        r, v = rows[:, -1], map_std * rows[:, :-1]
-        solved = np.linalg.solve(np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2), v)  # M⁻¹ V
-        explained = np.einsum("nvr,nr->nv", solved, r)
-        fitted = point.target[0] - r + np.einsum("nv,nvr->nr", explained, v)
-        mean = a.T @ u - fitted @ b.T
-        return mean, a.T @ a - (b @ np.swapaxes(v, 1, 2)) @ (solved @ b.T)
+        of_group = a.T.reshape(cross.shape)
+        known = of_group @ np.swapaxes(of_group, 1, 2)
+        parts = []
+        # A few lives at a time, for the memory.
+        for one in np.array_split(x, x.shape[0] * b.size // _CACHED + 1):
+            rows = self._residuals(point, one)[0]
+            r, v = rows[:, -1], map_std * rows[:, :-1]
+            m = np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2)
+            explained = np.linalg.solve(m, v @ r[:, :, None])
+            fitted = point.target[0] - r + (np.swapaxes(v, 1, 2) @ explained)[:, :, 0]
+            # B Vᵀ M⁻¹ V Bᵀ by a root of M: of the columns of each group alone.
+            root = np.linalg.solve(np.linalg.cholesky(m), v) @ b.T
+            root = root.reshape(*root.shape[:2], *cross.shape[:2]).transpose(0, 2, 3, 1)
+            mean = (a.T @ u - fitted @ b.T).reshape(len(one), *cross.shape[:2])
+            parts.append((mean, known - root @ np.swapaxes(root, 2, 3)))
+        means, information = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return means, information
 
     def deviation(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, moments: FloatArray
@@ -324,12 +336,9 @@ class LifeLikelihood:
         unit = float(grid.deviation[k]) ** 2 / data.now
         shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)
         cross = shared[:, None] * data.sensitivity[data.mode_of].T
-        n, (n_moments, p, _) = x.shape[0], cross.shape
-        means, covs = np.empty((n, n_moments, p)), np.empty((n, n_moments, p, p))
-        for i, own in enumerate(cross):
-            means[:, i], known = self.conditional(grid, k, map_std, x, own)
-            covs[:, i] = unit * max(moments[i], 0.0) * np.diag(data.free) - known
-        return means, covs
+        mean, known = self.conditional(grid, k, map_std, x, cross)
+        variance = unit * np.maximum(moments, 0.0)[:, None, None]
+        return mean, variance * np.diag(data.free) - known
 
     def lone_drift(
         self, grid: Grid, k: int, map_std: float, x: FloatArray
@@ -341,8 +350,8 @@ class LifeLikelihood:
         data, variance = self.data, constants.LONE_STD**2
         kernel = lone_kernel(np.array([data.now]), data.clock[data.log_of], data.now)
         cross = variance * kernel * (data.mode_of == grid.lone[k])
-        mean, known = self.conditional(grid, k, map_std, x, cross)
-        return mean[:, 0], np.maximum(variance - known[:, 0, 0], 0.0)
+        mean, known = self.conditional(grid, k, map_std, x, cross[None])
+        return mean[:, 0, 0], np.maximum(variance - known[:, 0, 0, 0], 0.0)
 
     def _residuals(self, grid: Grid, x: FloatArray) -> FloatArray:
         """Return the rows V of map errors of 1, and last the whitened residuals r.
