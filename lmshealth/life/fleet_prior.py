@@ -16,11 +16,10 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import LmshealthError
 from lmshealth.life import constants
-from lmshealth.life.likelihood import NO_MODE, scatter_prior
-from lmshealth.life.posterior import LifePosterior
-from lmshealth.life.prognosis import Prognosis
-from lmshealth.life.remaining_life import identifiable_limits, prognose
-from lmshealth.life.scenarios import laws_of
+from lmshealth.life.posterior.fit import LifePosterior
+from lmshealth.life.posterior.likelihood import NO_MODE, scatter_prior
+from lmshealth.life.posterior.scenarios import laws_of
+from lmshealth.life.prognosis import Prognosis, identifiable_limits, prognose
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.degradation_laws import AnyLaw, Law
 from lmshealth.stage.description import ScatterPrior, Stage

@@ -16,10 +16,10 @@ from lmshealth._private.seeds import stream
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.data import clock_and_steps, with_clock
-from lmshealth.life.ensemble_sampling import rank_r_hat
-from lmshealth.life.likelihood import default_scatter
-from lmshealth.life.posterior import LifePosterior, LoneMode, fit_life
+from lmshealth.life.posterior.data import clock_and_steps, with_clock
+from lmshealth.life.posterior.ensemble_sampling import rank_r_hat
+from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
+from lmshealth.life.posterior.likelihood import default_scatter
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import ANY_CHANGE, Stage
 from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters

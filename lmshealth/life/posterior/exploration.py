@@ -10,15 +10,14 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.density import LifeDensity, kept_weights
-from lmshealth.life.importance_sampling import (
+from lmshealth.life.posterior.importance_sampling import (
     WeightedDraws,
     importance_sample,
     importance_sample_again,
     importance_sample_to_ess,
 )
-from lmshealth.life.likelihood import Grid, LifeLikelihood
-from lmshealth.life.scenarios import DegradationPath, Scenario
+from lmshealth.life.posterior.likelihood import Grid, LifeDensity, LifeLikelihood, kept_weights
+from lmshealth.life.posterior.scenarios import DegradationPath, Scenario
 from lmshealth.stage.degradation_laws import Free
 
 _N_ROUGH, _N_FINE = 300, 2000

@@ -12,7 +12,7 @@ from numpy.random import MT19937, RandomState
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.importance_sampling import (
+from lmshealth.life.posterior.importance_sampling import (
     LogProbability,
     Proposal,
     WeightedDraws,

@@ -1,22 +1,26 @@
-"""Likelihood of a life: health by the laws of a scenario against the ln frequencies of all logs.
+"""Likelihood of a life, and the posterior density of one scenario averaged over its nuisances.
 
-README.md has the model. Four values follow one from the other: `LifeData` (selection of the data),
+README.md has the model. Five values follow one from the other: `LifeData` (selection of the data),
 `LifeCovariance` (their covariance Σ), `NodeBasis` (nodes from which smooth drifts follow at all
-logs), and `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters).
+logs), `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters), and
+`LifeDensity`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
+from scipy.special import softmax
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows, diagonal
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.data import LifeData
-from lmshealth.life.scenarios import Scenario
+from lmshealth.life.posterior.data import LifeData
+from lmshealth.life.posterior.importance_sampling import log_sum_exp
+from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
@@ -32,8 +36,14 @@ _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed a
 _ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 _CACHED = 2_000_000  # whitened drifts that are computed at a time
 
+# Share of the posterior of the grid points that are dropped once a scenario is sampled.
+_NEGLIGIBLE = 0.01
+
 NO_MODE = -1
 """Index in place of that of a mode that moves alone: none does."""
+
+Nuisances = tuple[np.ndarray, np.ndarray]
+"""Indices of the map error and of the grid point of each draw, ``(n,)`` each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,16 +203,12 @@ class Grid(Rows):
         n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
         # A mode that moves alone needs others that do not.
         alone *= n_modes > 1
-        total = np.sum(prior.walk)
-        ways = [
-            *((q, p / total * (1 - n_modes * alone), NO_MODE) for q, p in _walks(prior)),
-            *(
-                (walk, alone * p, mode)
-                for mode in range(n_modes)
-                for walk, p in constants.LONE_WALKS
-                if alone
-            ),
-        ]
+        others = (1 - n_modes * alone) / np.sum(prior.walk)
+        walks = zip(constants.WALK_STDS, prior.walk, strict=True)
+        ways = [(walk, p * others, NO_MODE) for walk, p in walks]
+        if alone:
+            lone = product(range(n_modes), constants.LONE_WALKS)
+            ways += [(walk, alone * p, mode) for mode, (walk, p) in lone]
         for (walk, p, lone), (scale, q), (deviation, r) in product(
             ways,
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
@@ -221,10 +227,6 @@ class Grid(Rows):
             values = (design, target, rest, log_weight, data.y.size - fixed)
             points.append((walk, scale, deviation, lone, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
-
-
-def _walks(prior: ScatterPrior) -> list[tuple[float, float]]:
-    return list(zip(constants.WALK_STDS, prior.walk, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -428,6 +430,113 @@ def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
     )
 
 
-def expected_squares(weights: tuple[float, ...]) -> float:
-    """Return the prior mean of the variance of the deviation from a law over the history."""
-    return float(np.average(np.square(constants.DEVIATION_STDS), weights=weights))
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeDensity:
+    """Log posterior density of the coordinates of one scenario, averaged over a grid."""
+
+    likelihood: LifeLikelihood
+    scenario: Scenario
+    grid: Grid
+
+    def log_probability(self, y: FloatArray) -> FloatArray:
+        """Return the log posterior density, -inf outside the map, shape ``(n,)``.
+
+        Its integral is the evidence of the scenario up to a factor that all scenarios share.
+        """
+        total = self.scenario.log_prior(y)
+        possible = np.isfinite(total)
+        x, within = self.likelihood.path(self.scenario, y[possible])
+        total[possible] = np.where(within, total[possible], -np.inf)
+        if within.any():
+            terms = self.likelihood.terms(self.grid, x)
+            total[np.isfinite(total)] += log_sum_exp(terms.reshape(-1, terms.shape[2]))
+        return total
+
+    def point_weights(self, y: FloatArray) -> FloatArray:
+        """Return the probability of map errors and grid points, ``(n_map_errors, n_points, n)``.
+
+        At coordinates, of which those outside the map are left out.
+        """
+        x, inside = self.likelihood.path(self.scenario, y[np.isfinite(self.scenario.log_prior(y))])
+        if not inside.any():
+            name = self.likelihood.data.stage.name
+            raise NotEnoughData(f"{name}: no life of the prior stays inside the map")
+        return np.asarray(softmax(self.likelihood.terms(self.grid, x), axis=(0, 1)))
+
+    def weights(self, y: FloatArray) -> FloatArray:
+        """Return the probability of each grid point, averaged over coordinates, ``(n_points,)``."""
+        return np.asarray(self.point_weights(y).sum(axis=0).mean(axis=1))
+
+    def narrowed(self, y: FloatArray) -> Self:
+        """Drop grid points with together a negligible share of the posterior at coordinates."""
+        return replace(self, grid=self.grid[kept_weights(self.weights(y), _NEGLIGIBLE)])
+
+    def settings(self, y: FloatArray) -> FloatArray:
+        """Return means at coordinates of walk, noise scale, deviation, χ², and its freedom.
+
+        χ² is that at the mean of the coordinates. Its degrees of freedom are the data less all that
+        they determine: intercepts, coefficients, and coordinates.
+        """
+        weight, grid = self.point_weights(y).mean(axis=2), self.grid
+        centre = y.mean(axis=0, keepdims=True)
+        possible = np.isfinite(self.scenario.log_prior(centre))
+        x, inside = self.likelihood.path(self.scenario, centre[possible])
+        if not inside.any():
+            x, _ = self.likelihood.path(self.scenario, y[:1])
+        chi_square = float(np.sum(weight * self.likelihood.quadratic(grid, x)[0][:, :, 0]))
+        means = np.stack([grid.walk, grid.noise_scale, grid.deviation, grid.freedom])
+        walk, noise, deviation, freedom = means @ weight.sum(axis=0)
+        freedom = max(freedom - self.scenario.n_dim, 1.0)
+        return np.array([walk, noise, deviation, chi_square, freedom])
+
+    def draw_nuisances(
+        self, y: FloatArray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw a map error and a grid point for coordinates inside the support, ``(n,)`` each."""
+        # Without coordinates all draws are of one life.
+        one = y[:1] if not self.scenario.n_dim else y
+        weight = self.point_weights(one)
+        upto = np.cumsum(weight.reshape(-1, one.shape[0]), axis=0)
+        chosen = (upto < rng.uniform(size=y.shape[0])).sum(axis=0).clip(max=upto.shape[0] - 1)
+        return np.divmod(chosen, weight.shape[1])
+
+    def deviations(
+        self, y: FloatArray, nuisances: Nuisances, moments: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw the deviation of ln health from its laws at moments in m since the baseline.
+
+        For coordinates ``(n, n_dim)`` inside the support and their nuisances: ``(n, n_moments,
+        n_parameters)``, independent from moment to moment.
+        """
+        free = self.likelihood.data.free
+        off = np.zeros((y.shape[0], moments.size, free.size))
+        for own, map_std, k, x in self.by_nuisances(y, nuisances):
+            if self.grid.deviation[k] > 0:
+                mean, cov = self.likelihood.deviation(self.grid, k, map_std, x, moments)
+                # A variance of 0 may be rounded to below 0.
+                least = 1e-15 * np.eye(cov.shape[-1])
+                unit = rng.standard_normal((own.size, *mean.shape[1:], 1))
+                off[own] = mean + (np.linalg.cholesky(cov + least) @ unit)[..., 0]
+        return off * free
+
+    def by_nuisances(
+        self, y: FloatArray, nuisances: Nuisances
+    ) -> Iterator[tuple[np.ndarray, float, int, FloatArray]]:
+        """Yield the draws of each map error and grid point, for coordinates as `deviations`.
+
+        Their indices, the standard deviation of the map error, the index of the grid point, and ln
+        parameters at the nodes, of a single life where there are no coordinates.
+        """
+        x, _ = self.likelihood.path(self.scenario, y if self.scenario.n_dim else y[:1])
+        for error, k in np.unique(np.column_stack(nuisances), axis=0).tolist():
+            own = np.flatnonzero((nuisances[0] == error) & (nuisances[1] == k))
+            map_std = self.likelihood.data.stage.map_errors[error][0]
+            yield own, map_std, k, x[own] if self.scenario.n_dim else x
+
+
+def kept_weights(weight: FloatArray, loss: float) -> BoolArray:
+    """Mark the largest weights ``(n,)``, all but those that sum to less than the loss."""
+    order = np.argsort(weight)
+    kept = np.ones(weight.size, dtype=bool)
+    kept[order[np.cumsum(weight[order]) < loss]] = False
+    return kept

@@ -12,9 +12,9 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life import ensemble_sampling as sampling
-from lmshealth.life.ensemble_sampling import Sample, _start, sample
-from lmshealth.life.importance_sampling import WeightedDraws
+from lmshealth.life.posterior import ensemble_sampling as sampling
+from lmshealth.life.posterior.ensemble_sampling import Sample, _start, sample
+from lmshealth.life.posterior.importance_sampling import WeightedDraws
 
 MEAN = np.array([0.3, -1.2])
 WALKERS = 32

@@ -9,7 +9,7 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.scenarios import Scenario, list_scenarios
+from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 

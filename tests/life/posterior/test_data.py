@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lmshealth.life import constants
-from lmshealth.life.data import condense
-from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import fit_life
+from lmshealth.life.posterior.data import condense
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.likelihood import LifeLikelihood
 from lmshealth.tracking.history import Step
 from tests.lives import (
     FREQUENCY,

@@ -14,18 +14,18 @@ from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.data import LifeData
-from lmshealth.life.density import LifeDensity, Nuisances
-from lmshealth.life.ensemble_sampling import Sample, sample, thin
-from lmshealth.life.exploration import Explored, LifeStart, explore, log_probability
-from lmshealth.life.likelihood import (
+from lmshealth.life.posterior.data import LifeData
+from lmshealth.life.posterior.ensemble_sampling import Sample, sample, thin
+from lmshealth.life.posterior.exploration import Explored, LifeStart, explore, log_probability
+from lmshealth.life.posterior.likelihood import (
     NO_MODE,
+    LifeDensity,
     LifeLikelihood,
-    expected_squares,
+    Nuisances,
     ln_health,
     scatter_prior,
 )
-from lmshealth.life.scenarios import Scenario
+from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 
@@ -162,7 +162,8 @@ class LifePosterior:
         Of lives that stay inside the map, with deviations from their laws.
         """
         data = self.data
-        spread = expected_squares(scatter_prior(data.stage).deviation)
+        chances = scatter_prior(data.stage).deviation
+        spread = np.average(np.square(constants.DEVIATION_STDS), weights=chances)
         scenarios = data.scenarios
         weights = np.array([one.weight for one in scenarios])
         sizes = np.ceil(_N_PRIOR * weights / weights.sum()).astype(int).tolist()
@@ -375,16 +376,13 @@ def _lone_modes(
     data, sums = likelihood.data, np.zeros((len(likelihood.data.modes), 3))
     total = sum(one.nuisances[1].size for one in scenarios)
     for one in scenarios:
-        y, grid = one.mixture_draws, one.density.grid
-        for error, k in np.unique(np.column_stack(one.nuisances), axis=0).tolist():
-            own = np.flatnonzero((one.nuisances[0] == error) & (one.nuisances[1] == k))
-            if grid.lone[k] == NO_MODE:
-                continue
-            some = y[own[:: own.size // _N_LONE + 1]] if one.scenario.n_dim else y[:1]
-            x, _ = likelihood.path(one.scenario, some)
-            mean, variance = likelihood.lone_drift(grid, k, data.stage.map_errors[error][0], x)
-            moments = 1.0, mean.mean(), np.mean(variance + mean**2)
-            sums[grid.lone[k]] += own.size / total * np.array(moments)
+        grid = one.density.grid
+        for own, map_std, k, x in one.density.by_nuisances(one.mixture_draws, one.nuisances):
+            if grid.lone[k] != NO_MODE:
+                some = x[:: own.size // _N_LONE + 1]
+                mean, variance = likelihood.lone_drift(grid, k, map_std, some)
+                moments = 1.0, mean.mean(), np.mean(variance + mean**2)
+                sums[grid.lone[k]] += own.size / total * np.array(moments)
     found = []
     for mode, (share, first, second) in zip(data.modes, sums, strict=True):
         if share:
