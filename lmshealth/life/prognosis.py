@@ -12,18 +12,16 @@ from lmshealth._private.result import Result
 from lmshealth._private.seeds import stream
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.posterior.data import with_clock
+from lmshealth.life.posterior.data import KM, SECONDS_PER_DAY, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.scenarios import DegradationPath
 from lmshealth.stage.degradation_laws import Accelerating, Law
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
+from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History
 
 _STEP = 1 << 21  # of the random stream: beyond the epochs of health and the life
 _N_CURVE, _N_COARSE = 101, 40
-_SECONDS_PER_DAY = 86_400.0
-_KM = 1000.0
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 # Grid points up to 1.5 times the passage of the law alone, and from there to the horizon.
 _NEAR, _FAR, _BEYOND = 24, 12, 1.5
@@ -105,9 +103,8 @@ class Prognosis(Result):
     def to_columns(self) -> dict[str, Any]:
         """Return quantiles of the remaining travel, infinite beyond the horizon, of each limit."""
         left = np.maximum(self.censored(), 0.0) / 1000
-        levels = (0.05, 0.25, 0.5, 0.75, 0.95)
-        quantiles = np.quantile(left, levels, axis=0, method="inverted_cdf")
-        pairs = zip(levels, quantiles, strict=True)
+        quantiles = np.quantile(left, _LEVELS, axis=0, method="inverted_cdf")
+        pairs = zip(_LEVELS, quantiles, strict=True)
         return {
             "parameter": list(self.parameters),
             "limit": self.limits,
@@ -186,7 +183,7 @@ def prognosis_of(life: LifePosterior, history: History, stage: Stage) -> Prognos
         )
     history = with_clock(history, stage)
     seeds = stream(life.seed, _STEP).spawn(3)
-    horizon = stage.description.usage.horizon_km * _KM
+    horizon = stage.description.usage.horizon_km * KM
     since = float(history.travel[-1] - history.travel[history.baseline])
     of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds)
     remaining, half = passages(life, limited, of_passage, now=since, horizon=horizon)
@@ -275,7 +272,7 @@ def rate_std(law: Law) -> float:
 def early_life(law: Law, limit: float, rng: np.random.Generator) -> float:
     """Return the travel in m before which few machines of the description reach a limit."""
     path = DegradationPath(law, 0.0, ())
-    lives = path.passage(path.natural(path.draw(rng, _N_LIVES, _KM), _KM), limit)
+    lives = path.passage(path.natural(path.draw(rng, _N_LIVES, KM), KM), limit)
     return float(np.quantile(lives, constants.EARLY_LIFE, method="inverted_cdf"))
 
 
@@ -381,9 +378,8 @@ def _usage(
     """Draw the mean travel in m per day over the remaining life, ``(n_draws,)`` (README.md)."""
     stated = stage.description.usage.km_per_day
     if stated is not None:
-        return np.full(remaining.size, stated * _KM)
-    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    days, steps = np.diff(seconds) / _SECONDS_PER_DAY, np.diff(history.travel)
+        return np.full(remaining.size, stated * KM)
+    days, steps = np.diff(history.seconds) / SECONDS_PER_DAY, np.diff(history.travel)
     days, steps = days[days > 0], steps[days > 0]
     if days.size < 2 or steps.sum() <= 0:
         needed = "state [usage] km_per_day"
@@ -404,7 +400,5 @@ def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:
 
 def identifiable_limits(stage: Stage, modes: Sequence[str]) -> list[tuple[int, ParameterSpec]]:
     """Return the parameters with a limit that unlimited logs with some modes identify."""
-    information = identifiability_of(stage).restricted_to(modes)
-    columns = [range(len(stage.parameters))]
-    seen = identifiable_parameters([information], columns, information.prior)
+    seen = identifiability_of(stage).restricted_to(modes).identifiable()
     return [(j, p) for j, p in parameters_with_limit(stage) if seen[j]]

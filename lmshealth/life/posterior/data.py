@@ -13,7 +13,8 @@ from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 
-_SECONDS_PER_DAY, _KM, _FEW = 86_400.0, 1000.0, 3
+SECONDS_PER_DAY, KM = 86_400.0, 1000.0
+_FEW = 3  # logs at either end of a life, whose mean ln f is compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -123,8 +124,8 @@ def with_clock(history: History, stage: Stage) -> History:
         return history
     per_day = stage.description.usage.km_per_day
     assert per_day is not None  # the description has been checked
-    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    return replace(history, travel=(seconds - seconds[:1]) / _SECONDS_PER_DAY * per_day * _KM)
+    days = (history.seconds - history.seconds[:1]) / SECONDS_PER_DAY
+    return replace(history, travel=days * per_day * KM)
 
 
 def condense(history: History, most: int) -> History:
@@ -142,8 +143,7 @@ def condense(history: History, most: int) -> History:
     group_of = np.repeat(np.arange(begins.size), ends - begins)
     parts = [slice(begin, end) for begin, end in zip(begins, ends, strict=True)]
     found = [_average(history, part) for part in parts]
-    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    r = len(history.series)
+    seconds, r = history.seconds, len(history.series)
     return replace(
         history,
         logs=tuple(history.logs[end - 1] for end in ends),

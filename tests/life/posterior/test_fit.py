@@ -242,9 +242,9 @@ def test_linear_algebra_keeps_to_one_thread(
     seen: set[int] = set()
     sampled = fit._sampled_scenarios
 
-    def counting(*arguments):
+    def counting(*arguments, **options):
         seen.update(threads())
-        return sampled(*arguments)
+        return sampled(*arguments, **options)
 
     monkeypatch.setattr(fit, "_sampled_scenarios", counting)
     with threadpool_limits(2, user_api="blas"):
