@@ -23,18 +23,16 @@ class LifeData(ReadOnly):
 
     stage: Stage
     history: History  # all logs, condensed
-    # columns, modes, mode_of_series: series of the history that are used, their modes, and
-    # the mode of each, ``(n_series,)``.
+    # Series of the history that are used, their modes, and the mode of each, ``(n_series,)``.
     columns: list[int]
     modes: tuple[str, ...]
     mode_of_series: np.ndarray
-    # clock, steps: travel since the baseline in m of each log, shape ``(n_logs,)``, and step
-    # of the modes.
+    # Travel since the baseline in m of each log, shape ``(n_logs,)``, and step of the modes.
     clock: FloatArray
     steps: tuple[float, ...]
-    # rows, y: index of each datum among all series and logs, and its ln f minus the mean of
-    # its mode, shape ``(n_data,)``.
-    rows: np.ndarray
+    # Series and log of each datum, and its ln f minus the mean of its mode, shape ``(n_data,)``.
+    series_of: np.ndarray
+    log_of: np.ndarray
     y: FloatArray
 
     @classmethod
@@ -64,12 +62,12 @@ class LifeData(ReadOnly):
                 f"{history.stage}: {n_logs} logs with a mode of the map over {now / 1000:.4g} km; "
                 f"a life needs at least {min_logs} logs and some travel"
             )
-        flat = ln_f.T.ravel()
-        rows = np.flatnonzero(np.isfinite(flat))
+        series_of, log_of = np.nonzero(np.isfinite(ln_f.T))
         mode_of_series = np.array([modes.index(name) for name in of_series])
         means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
-        y = flat[rows] - means[mode_of_series[rows // clock.size]]
-        return cls(stage, history, columns, modes, mode_of_series, clock, steps, rows, y)
+        y = ln_f[log_of, series_of] - means[mode_of_series[series_of]]
+        places = (series_of, log_of, y)
+        return cls(stage, history, columns, modes, mode_of_series, clock, steps, *places)
 
     @property
     def now(self) -> float:
@@ -88,14 +86,9 @@ class LifeData(ReadOnly):
         return found
 
     @property
-    def log_of(self) -> np.ndarray:
-        """Index of the log of each datum, shape ``(n_data,)``."""
-        return np.asarray(self.rows % self.clock.size)
-
-    @property
     def mode_of(self) -> np.ndarray:
         """Index of the mode of each datum, shape ``(n_data,)``."""
-        return np.asarray(self.mode_of_series[self.rows // self.clock.size])
+        return np.asarray(self.mode_of_series[self.series_of])
 
     @property
     def scenarios(self) -> tuple[Scenario, ...]:

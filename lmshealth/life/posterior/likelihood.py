@@ -66,27 +66,35 @@ class LifeCovariance(ReadOnly):
     @classmethod
     def of(cls, data: LifeData) -> Self:
         """Compute the parts from data."""
-        history, clock = data.history, data.clock
-        n_logs, n_series = clock.size, len(data.columns)
-        cov = history.cov[history.baseline :][:, data.columns][:, :, data.columns]
-        noise = np.zeros((n_series, n_logs, n_series, n_logs))
-        for k in range(n_logs):
-            noise[:, k, :, k] = np.nan_to_num(cov[k])
-        same = np.equal.outer(data.mode_of_series, data.mode_of_series)
-        common = np.full((n_logs, n_logs), constants.INTERCEPT_STD**2)
+        history, now, log_of, series_of = data.history, data.now, data.log_of, data.series_of
+        clock = data.clock[log_of]
+        same_mode = np.equal.outer(data.mode_of, data.mode_of)
+        same_log, same_series = (np.equal.outer(one, one) for one in (log_of, series_of))
+        rows, columns = history.baseline + log_of, np.array(data.columns)[series_of]
+        reported = history.cov[rows[:, None], columns[:, None], columns]
+        common = np.full(same_mode.shape, constants.INTERCEPT_STD**2)
         for regressor in regressors(history.covariates, data.stage):
-            values = regressor.values[history.baseline :]
+            values = regressor.values[rows]
             common += regressor.prior_std**2 * np.outer(values, values)
-            common += np.diag(regressor.unknown[history.baseline :])
-        shared = np.maximum(np.minimum.outer(clock, clock), 0.0)
-        sensitivity = data.sensitivity[data.mode_of_series]
-        size, own = n_series * n_logs, np.ix_(data.rows, data.rows)
+            common += same_log * regressor.unknown[rows]
+        fixed = same_mode * common
+        # The intercept is that of a mode's first series; each further one has its own bias.
+        modes = data.mode_of_series
+        further = np.tril(np.equal.outer(modes, modes), -1).any(axis=1)
+        fixed += BIAS_STD[0] ** 2 * (same_series & further[series_of])
+        for step in history.steps:
+            if not step.changes_modes:  # retunings and changed sensors
+                concerned = [step.source in ("", one.source) for one in history.series]
+                moved = step.there[rows] & np.array(concerned)[columns]
+                fixed += JUMP_STD[step.kind][0] ** 2 * (same_mode & np.outer(moved, moved))
+        shared = np.maximum(np.minimum.outer(clock, clock), 0.0) / now
+        gram = data.sensitivity @ data.sensitivity.T
         return cls(
-            fixed=(np.kron(same, common) + _offsets(data, same))[own],
-            noise=noise.reshape(size, size)[own],
-            walk=np.kron(same, shared / data.now)[own],
-            deviation=np.kron(sensitivity @ sensitivity.T, shared / data.now)[own],
-            smooth=np.kron(same, lone_kernel(clock, clock, data.now))[own],
+            fixed=fixed,
+            noise=np.where(same_log, reported, 0.0),
+            walk=same_mode * shared,
+            deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
+            smooth=same_mode * lone_kernel(clock, clock, now),
             mode_of=data.mode_of,
         )
 
@@ -112,21 +120,6 @@ def lone_kernel(moments: FloatArray, clock: FloatArray, now: float) -> FloatArra
     parts = [np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS]
     parts.append(1.5 * least**2 * (most - least / 3))
     return np.asarray(np.mean(parts, axis=0))
-
-
-def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
-    """Return the covariance of offsets without wear: sources, retunings, changed sensors."""
-    # The intercept is that of a mode's first series; each further one has its own bias.
-    further = np.tril(same, -1).any(axis=1).astype(float)
-    total = np.kron(np.diag(further), np.full((data.clock.size,) * 2, BIAS_STD[0] ** 2))
-    for step in data.history.steps:
-        if step.changes_modes:
-            continue
-        there = step.there[data.history.baseline :].astype(float)
-        moved = [step.source in ("", data.history.series[i].source) for i in data.columns]
-        variance = JUMP_STD[step.kind][0] ** 2
-        total += np.kron(same * np.outer(moved, moved), variance * np.outer(there, there))
-    return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -404,7 +397,7 @@ def _reduced(
     """Return L⁻¹ y, and Q and R of L⁻¹ W for the nodes of all modes."""
     own = data.mode_of[:, None] == np.arange(len(data.modes))
     shapes = own[:, :, None] * basis.weights[data.log_of][:, None]
-    columns = np.column_stack([shapes.reshape(data.rows.size, -1), data.y])
+    columns = np.column_stack([shapes.reshape(data.y.size, -1), data.y])
     both = solve_triangular(factor, columns, lower=True)
     q, r = np.linalg.qr(both[:, :-1])
     return both[:, -1], q, r
