@@ -22,7 +22,7 @@ from lmshealth.life.posterior.scenarios import laws_of
 from lmshealth.life.prognosis import Prognosis, identifiable_limits, prognose
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.degradation_laws import AnyLaw, Law
-from lmshealth.stage.description import ScatterPrior, Stage
+from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.history import History
 
@@ -160,17 +160,13 @@ def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[
         return {}
     laws: dict[str, list[LawPrior]] = {name: [] for name in needy}
     for parameter in stage.parameters:
-        found: dict[str, list[LawPrior]] = {name: [] for name in needy}
+        predictives = []
         for law in parameter.laws:
             own = {name: evidence[name].laws[parameter.name][law.kind] for name in machines}
-            for name, predictive in _predictives(own, needy, len(parameter.laws)).items():
-                found[name].append(_law_prior(parameter.name, law, own[name].prior, predictive))
-        for name, priors in found.items():
-            # Estimated one by one: their probabilities are normalised.
-            total = sum(one.share[1] for one in priors)
-            for one in priors:
-                share = one.share[0], _rounded(one.share[1] / total)
-                laws[name].append(replace(one, share=share))
+            predictives.append(_predictives(own, needy, len(parameter.laws)))
+        for name in needy:
+            found = [one[name] for one in predictives]
+            laws[name] += _law_priors(parameter, evidence[name].laws[parameter.name], found)
     scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in needy}
     for field in _SCATTERS:
         columns = zip(*(evidence[name].scatter[field] for name in machines), strict=True)
@@ -241,13 +237,22 @@ def _predictive(share: FloatArray, log_posterior: FloatArray) -> _Predictive:
     return _Predictive(mean_share, float(mean), float(np.sqrt(variance)))
 
 
-def _law_prior(parameter: str, law: AnyLaw, before: float, predictive: _Predictive) -> LawPrior:
-    pace, field = None, _pace_field(law)
-    if field:
-        prior = getattr(law, field)
-        placed = prior.placed(predictive.mean, predictive.std)
-        pace = (prior, type(prior)(*map(_rounded, msgspec.structs.astuple(placed))))
-    return LawPrior(parameter, law.kind, (before, _rounded(predictive.share)), field, pace)
+def _law_priors(
+    parameter: ParameterSpec, own: Mapping[str, LawEvidence], predictives: Sequence[_Predictive]
+) -> list[LawPrior]:
+    """Return the priors of the laws of a parameter from their predictives for a machine."""
+    # Laws are estimated one by one: their probabilities are normalised.
+    shares = [_rounded(one.share) for one in predictives]
+    found = []
+    for law, share, predictive in zip(parameter.laws, shares, predictives, strict=True):
+        pace, field = None, _pace_field(law)
+        if field:
+            prior = getattr(law, field)
+            placed = prior.placed(predictive.mean, predictive.std)
+            pace = (prior, type(prior)(*map(_rounded, msgspec.structs.astuple(placed))))
+        both = own[law.kind].prior, _rounded(share / sum(shares))
+        found.append(LawPrior(parameter.name, law.kind, both, field, pace))
+    return found
 
 
 def _with_prior(law: AnyLaw, fleet: LawPrior) -> AnyLaw:

@@ -244,16 +244,14 @@ def passages(
             assert parameter.limit is not None
             path, limit = one.scenario.paths[j], parameter.limit.below / parameter.baseline
             of_health = (path, theta[j], off[:, j], rate[:, j], rng)
-            columns.append(first_passage(*of_health, now=now, limit=limit, horizon=horizon))
+            left = first_passage(*of_health, now=now, limit=limit, horizon=horizon)
             by_law = path.health(theta[j], np.array([now]))[:, 0]
-            halves.append(
-                path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
-            )
+            half = path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
             if path.law.names:
                 proven = now + early_life(path.law, limit, rng)
-                columns[-1], halves[-1] = _beyond_laws(
-                    rng, path.law, columns[-1], halves[-1], now=now, proven=proven
-                )
+                left, half = _beyond_laws(rng, path.law, left, half, now=now, proven=proven)
+            columns.append(left)
+            halves.append(half)
         first = np.argmin(columns, axis=0)[None]
         half = np.take_along_axis(np.array(halves), first, axis=0)[0]
         found = np.column_stack([*columns, np.min(columns, axis=0), half])
@@ -290,9 +288,8 @@ def _beyond_laws(
     `proven` is the travel in m without the onset of an end that no log shows yet.
     """
     ahead = np.where(np.isfinite(left), np.maximum(left, 0.0), 0.0)
-    factor = np.exp(
-        rate_std(law) * np.sqrt(np.log2(1 + ahead / now)) * rng.standard_normal(left.size)
-    )
+    spread = rate_std(law) * np.sqrt(np.log2(1 + ahead / now))
+    factor = np.exp(spread * rng.standard_normal(left.size))
     with np.errstate(over="ignore"):
         onset = proven * np.expm1(rng.exponential(size=left.size) / constants.UNSEEN_ONSETS)
     growth = constants.UNSEEN_GROWTH.quantile(rng.uniform(1e-9, 1 - 1e-9, left.size))

@@ -228,7 +228,7 @@ def explore(
         group = [
             k
             for k, one in enumerate(scenarios)
-            if bool(one.paths[0].steps) == with_steps and not excluded(one)
+            if bool(one.steps) == with_steps and not excluded(one)
         ]
         if all_.may_be_likely(group, anchors):
             all_.add(k for k in group if not scenarios[k].restarts)
@@ -262,7 +262,7 @@ def _anchors(scenarios: Sequence[Scenario]) -> list[int]:
         own = [
             k
             for k, one in enumerate(scenarios)
-            if bool(one.paths[0].steps) == with_steps and not one.restarts
+            if bool(one.steps) == with_steps and not one.restarts
         ]
         if own:
             free = (k for k in own if all(isinstance(p.law, Free) for p in scenarios[k].paths))

@@ -222,6 +222,11 @@ class Proposal(ReadOnly):
         total = np.logaddexp(kernels + np.log1p(-_WHOLE_SHARE), about_all + np.log(_WHOLE_SHARE))
         return np.asarray(total - np.sum(np.log(np.diag(self.factor))))
 
+    def move(self, points: FloatArray, rng: Any) -> tuple[FloatArray, FloatArray]:
+        """Propose points whatever the present ones are, with the log ratio that emcee asks for."""
+        proposed = self.draw(rng, len(points))
+        return proposed, self.log_density(points) - self.log_density(proposed)
+
 
 def _propose(
     draws: WeightedDraws, rng: np.random.Generator, n: int
