@@ -355,14 +355,15 @@ class LifeLikelihood:
         """
         drift = np.moveaxis(drifts(self.data, x), 1, 2)
         n_modes, n, n_paths, n_nodes = drift.shape
-        white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
-        white = white.reshape(-1, n_modes, n, n_paths, grid.target.shape[1])
-        p = n_paths - 1
-        rows = np.empty((white.shape[0], n, n_modes * p + 1, white.shape[4]))
+        (n_points, n_rows), p = grid.target.shape, n_paths - 1
+        rows = np.zeros((n_points, n, n_modes * p + 1, n_rows))
         rows[:, :, -1] = grid.target[:, None]
         for k in range(n_modes):
-            rows[:, :, k * p : (k + 1) * p] = white[:, k, :, 1:]
-            rows[:, :, -1] -= white[:, k, :, 0]
+            filled = slice((k + 1) * n_nodes)  # R is upper triangular
+            white = drift[k].reshape(-1, n_nodes) @ grid.design[:, k, :, filled]
+            white = white.reshape(n_points, n, n_paths, -1)
+            rows[:, :, k * p : (k + 1) * p, filled] = white[:, :, 1:]
+            rows[:, :, -1, filled] -= white[:, :, 0]
         return rows
 
 
