@@ -32,7 +32,6 @@ _LOG_PRIOR = -0.5 * (_MEAN**2 / (1 - _VARIANCE) + np.log(1 - _VARIANCE))
 _SHARE_EDGES = np.sin(np.linspace(0, np.pi / 2, 33)) ** 2
 # By the field that is the prior of a law's pace: the natural parameter, and its unit.
 _PACES = {"life_km": ("life_m", 1e3), "rate_per_km": ("rate_per_m", 1e-3)}
-_N_SCATTER = 500
 _SCATTERS = tuple(field.name for field in fields(ScatterPrior))
 _NO_PACE = np.zeros((1, 1))
 
@@ -295,10 +294,7 @@ def _pace_draws(life: LifePosterior, j: int, law: AnyLaw) -> tuple[FloatArray, F
 
 def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawEvidence, ...]]:
     """Return the evidence on each value of the grid of scatter, averaged over scenarios."""
-    weights = [
-        one.density.weights(one.mixture_draws[:: max(1, len(one.mixture_draws) // _N_SCATTER)])
-        for one in life.scenarios
-    ]
+    weights = [one.density.weights(one.some_draws) for one in life.scenarios]
     found = {}
     for field in _SCATTERS:
         before = np.array(getattr(scatter_prior(stage), field))

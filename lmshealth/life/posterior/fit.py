@@ -69,6 +69,11 @@ class ScenarioPosterior:
         """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
         return np.concatenate(thin(self.sample.draws, self.n_mixture_draws))
 
+    @property
+    def some_draws(self) -> FloatArray:
+        """About 500 of `mixture_draws`, for averages over their nuisances."""
+        return self.mixture_draws[:: max(1, len(self.mixture_draws) // _N_SETTINGS)]
+
     def health_by_laws(self, moments: FloatArray) -> FloatArray:
         """Return health in the mixture at moments in m since the baseline, without deviations.
 
@@ -311,9 +316,7 @@ def fit_life(
             judge = _change(drawn, scenarios, now)
         rng = np.random.default_rng(off_seed)
         draws = [_drawn_now(one, now, rng) for one in scenarios]
-        some = [one.mixture_draws for one in scenarios]
-        some = [y[:: max(1, y.shape[0] // _N_SETTINGS)] for y in some]
-        settings = [one.density.settings(y) for one, y in zip(scenarios, some, strict=True)]
+        settings = [one.density.settings(one.some_draws) for one in scenarios]
         lone_modes = _lone_modes(likelihood, scenarios)
     health, off, rate, lone = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
     share = np.array([one.n_mixture_draws for one in scenarios]) / _N_KEPT
