@@ -209,11 +209,10 @@ def test_modes_that_no_proposal_joins_are_refused_with_their_chains(
         def near(self, _: WeightedDraws, __: np.random.Generator) -> Local:
             return self
 
-        def draw(self, rng: np.random.RandomState, n: int) -> FloatArray:
-            return rng.standard_normal((n, 3))
-
-        def log_density(self, points: FloatArray) -> FloatArray:
-            return np.zeros(points.shape[0])
+        def move(
+            self, points: FloatArray, rng: np.random.RandomState
+        ) -> tuple[FloatArray, FloatArray]:
+            return rng.standard_normal(points.shape), np.zeros(points.shape[0])
 
     monkeypatch.setattr(sampling, "_start", near)
     monkeypatch.setattr(sampling, "Proposal", Local())
