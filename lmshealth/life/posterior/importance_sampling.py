@@ -75,12 +75,16 @@ def importance_sample(
     few = max(200, n // 4)
     for k in range(_MAX_ROUNDS):
         log_weight = log_probability(points) - proposal
-        if k >= _HOPELESS and log_weight.max() < least:
+        draws = _weighted(points, log_weight)
+        is_good = draws.ess >= _GOOD_SHARE * few and points is not start
+        is_hopeless = k >= _HOPELESS and log_weight.max() < least
+        # Enough draws to place kernels by: some are left of a density that most of them miss.
+        wanted = min(_LEAST_PER_DIMENSION * points.shape[1], 0.3 * draws.weight.size)
+        draws = tempered(points, log_weight, wanted)
+        if is_good or is_hopeless or k == _MAX_ROUNDS - 1:
             break
-        if _weighted(points, log_weight).ess >= _GOOD_SHARE * few and points is not start:
-            break
-        points, proposal = _propose(_adapted(points, log_weight), rng, few)
-    return _drawn_near(log_probability, _adapted(points, log_weight), rng, n)
+        points, proposal = _propose(draws, rng, few)
+    return _drawn_near(log_probability, draws, rng, n)
 
 
 def importance_sample_again(
@@ -142,12 +146,6 @@ def tempered(points: FloatArray, log_weight: FloatArray, min_ess: float) -> Weig
         enough = weight.sum() ** 2 >= min_ess * (weight @ weight)
         low, high = (power, high) if enough else (low, power)
     return _weighted(points, power * log_weight)
-
-
-def _adapted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
-    n_inside = np.isfinite(log_weight).sum()
-    wanted = _LEAST_PER_DIMENSION * points.shape[1]
-    return tempered(points, log_weight, min(wanted, 0.3 * n_inside))
 
 
 def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
