@@ -20,8 +20,8 @@ if TYPE_CHECKING:
     from lmshealth.life.health import infer as infer
     from lmshealth.life.health import infer_drifts as infer_drifts
     from lmshealth.life.maintenance_decision import decide as decide
-    from lmshealth.life.posterior import fit_life as fit_life
-    from lmshealth.life.remaining_life import prognose as prognose
+    from lmshealth.life.posterior.fit import fit_life as fit_life
+    from lmshealth.life.prognosis import prognose as prognose
     from lmshealth.life.verdict import judge as judge
     from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
     from lmshealth.modal.frf.identification import read_frf as read_frf
@@ -44,7 +44,7 @@ _HOMES = {
     "assess": "batch.assess",
     "build_history": "tracking.history",
     "decide": "life.maintenance_decision",
-    "fit_life": "life.posterior",
+    "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
     "identify_decays": "modal.free_decay.identification",
     "infer": "life.health",
@@ -52,7 +52,7 @@ _HOMES = {
     "judge": "life.verdict",
     "load_stage": "stage.description",
     "plan": "stage.planning",
-    "prognose": "life.remaining_life",
+    "prognose": "life.prognosis",
     "read_frf": "modal.frf.identification",
     "read_log": "io.reading",
     "run": "batch.run",

@@ -23,8 +23,8 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Metadata
 from lmshealth.life import constants
 from lmshealth.life.health import Health
-from lmshealth.life.likelihood import NO_MODE
-from lmshealth.life.posterior import LoneMode
+from lmshealth.life.posterior.fit import LoneMode
+from lmshealth.life.posterior.likelihood import NO_MODE
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes

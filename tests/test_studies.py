@@ -310,7 +310,7 @@ def test_movable_roller(root: Path, needs: Callable[[str], None]) -> None:
 
 
 def test_sbc_life(root: Path) -> None:
-    """Ranks of health and remaining life are uniform; who takes every part to change is found out."""
+    """Ranks of health and remaining life are uniform; not if every part is taken to change."""
     answer = json.loads(run_study(root, "studies.life.calibration.run"))
     assert all(answer["passed"].values())
     assert answer["not_converged"] == 0

@@ -18,7 +18,6 @@ from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or
 from lmshealth.errors import LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice
 from lmshealth.life import constants
-from lmshealth.life.exploration import LifeStart
 from lmshealth.life.fleet_prior import (
     EndedLife,
     FleetContribution,
@@ -29,8 +28,9 @@ from lmshealth.life.fleet_prior import (
     machine_evidence,
 )
 from lmshealth.life.health import epochs_to_publish, health_of
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import parameters_with_limit, prognosis_of
+from lmshealth.life.posterior.exploration import LifeStart
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import parameters_with_limit, prognosis_of
 from lmshealth.life.verdict import doubt_of_names, judge
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall

@@ -18,8 +18,8 @@ from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_drifts
 from lmshealth.life.maintenance_decision import decide, probability_before
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import prognosis_of
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import prognosis_of
 from lmshealth.life.verdict import doubt_of_names
 from lmshealth.report import tables
 from lmshealth.report.assessment import summarise_life

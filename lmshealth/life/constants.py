@@ -35,7 +35,7 @@ DEVIATION_STDS = (0.0, 0.0125, 0.05)
 grow to a tenth and to a third of the loss at a limit of 0.6 over ten times the travel seen."""
 DEVIATION_PRIOR = (0.6, 0.3, 0.1)
 
-# A mode that moves alone, see README.md.
+# A mode that moves alone, see posterior/README.md.
 LONE_STD = 0.02
 """Standard deviation at the last log of the drift of a mode that moves by a cause of its own."""
 LONE_EXPONENTS = (0.5, 1.0, 2.0)
@@ -46,7 +46,7 @@ LONE_WALKS = ((5e-4, 0.6), (1.5e-3, 0.4))
 LONE_NAMED = 0.5
 """Probability from which such a mode is named beside another verdict."""
 
-# Posterior over scenarios, see README.md.
+# Posterior over scenarios, see posterior/README.md.
 MIN_PROBABILITY = 0.01
 """Scenarios with a lower probability are not published."""
 MAX_GRID_LOSS = 3e-3

@@ -16,14 +16,13 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import LmshealthError
 from lmshealth.life import constants
-from lmshealth.life.likelihood import NO_MODE, scatter_prior
-from lmshealth.life.posterior import LifePosterior
-from lmshealth.life.prognosis import Prognosis
-from lmshealth.life.remaining_life import identifiable_limits, prognose
-from lmshealth.life.scenarios import laws_of
+from lmshealth.life.posterior.fit import LifePosterior
+from lmshealth.life.posterior.likelihood import NO_MODE, scatter_prior
+from lmshealth.life.posterior.scenarios import laws_of
+from lmshealth.life.prognosis import Prognosis, identifiable_limits, prognose
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.degradation_laws import AnyLaw, Law
-from lmshealth.stage.description import ScatterPrior, Stage
+from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.history import History
 
@@ -33,7 +32,6 @@ _LOG_PRIOR = -0.5 * (_MEAN**2 / (1 - _VARIANCE) + np.log(1 - _VARIANCE))
 _SHARE_EDGES = np.sin(np.linspace(0, np.pi / 2, 33)) ** 2
 # By the field that is the prior of a law's pace: the natural parameter, and its unit.
 _PACES = {"life_km": ("life_m", 1e3), "rate_per_km": ("rate_per_m", 1e-3)}
-_N_SCATTER = 500
 _SCATTERS = tuple(field.name for field in fields(ScatterPrior))
 _NO_PACE = np.zeros((1, 1))
 
@@ -161,17 +159,13 @@ def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[
         return {}
     laws: dict[str, list[LawPrior]] = {name: [] for name in needy}
     for parameter in stage.parameters:
-        found: dict[str, list[LawPrior]] = {name: [] for name in needy}
+        predictives = []
         for law in parameter.laws:
             own = {name: evidence[name].laws[parameter.name][law.kind] for name in machines}
-            for name, predictive in _predictives(own, needy, len(parameter.laws)).items():
-                found[name].append(_law_prior(parameter.name, law, own[name].prior, predictive))
-        for name, priors in found.items():
-            # Estimated one by one: their probabilities are normalised.
-            total = sum(one.share[1] for one in priors)
-            for one in priors:
-                share = one.share[0], _rounded(one.share[1] / total)
-                laws[name].append(replace(one, share=share))
+            predictives.append(_predictives(own, needy, len(parameter.laws)))
+        for name in needy:
+            found = [one[name] for one in predictives]
+            laws[name] += _law_priors(parameter, evidence[name].laws[parameter.name], found)
     scatters: dict[str, list[tuple[float, ...]]] = {name: [] for name in needy}
     for field in _SCATTERS:
         columns = zip(*(evidence[name].scatter[field] for name in machines), strict=True)
@@ -242,13 +236,22 @@ def _predictive(share: FloatArray, log_posterior: FloatArray) -> _Predictive:
     return _Predictive(mean_share, float(mean), float(np.sqrt(variance)))
 
 
-def _law_prior(parameter: str, law: AnyLaw, before: float, predictive: _Predictive) -> LawPrior:
-    pace, field = None, _pace_field(law)
-    if field:
-        prior = getattr(law, field)
-        placed = prior.placed(predictive.mean, predictive.std)
-        pace = (prior, type(prior)(*map(_rounded, msgspec.structs.astuple(placed))))
-    return LawPrior(parameter, law.kind, (before, _rounded(predictive.share)), field, pace)
+def _law_priors(
+    parameter: ParameterSpec, own: Mapping[str, LawEvidence], predictives: Sequence[_Predictive]
+) -> list[LawPrior]:
+    """Return the priors of the laws of a parameter from their predictives for a machine."""
+    # Laws are estimated one by one: their probabilities are normalised.
+    shares = [_rounded(one.share) for one in predictives]
+    found = []
+    for law, share, predictive in zip(parameter.laws, shares, predictives, strict=True):
+        pace, field = None, _pace_field(law)
+        if field:
+            prior = getattr(law, field)
+            placed = prior.placed(predictive.mean, predictive.std)
+            pace = (prior, type(prior)(*map(_rounded, msgspec.structs.astuple(placed))))
+        both = own[law.kind].prior, _rounded(share / sum(shares))
+        found.append(LawPrior(parameter.name, law.kind, both, field, pace))
+    return found
 
 
 def _with_prior(law: AnyLaw, fleet: LawPrior) -> AnyLaw:
@@ -291,10 +294,7 @@ def _pace_draws(life: LifePosterior, j: int, law: AnyLaw) -> tuple[FloatArray, F
 
 def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawEvidence, ...]]:
     """Return the evidence on each value of the grid of scatter, averaged over scenarios."""
-    weights = [
-        one.density.weights(one.mixture_draws[:: max(1, len(one.mixture_draws) // _N_SCATTER)])
-        for one in life.scenarios
-    ]
+    weights = [one.density.weights(one.some_draws) for one in life.scenarios]
     found = {}
     for field in _SCATTERS:
         before = np.array(getattr(scatter_prior(stage), field))

@@ -16,13 +16,13 @@ from lmshealth._private.seeds import stream
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.data import clock_and_steps, with_clock
-from lmshealth.life.ensemble_sampling import rank_r_hat
-from lmshealth.life.likelihood import default_scatter
-from lmshealth.life.posterior import LifePosterior, LoneMode, fit_life
+from lmshealth.life.posterior.data import clock_and_steps, with_clock
+from lmshealth.life.posterior.ensemble_sampling import rank_r_hat
+from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
+from lmshealth.life.posterior.likelihood import default_scatter
 from lmshealth.stage.constants import INFORMED
 from lmshealth.stage.description import ANY_CHANGE, Stage
-from lmshealth.stage.identifiability import identifiability_of, identifiable_parameters
+from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.read_tables import Drifts
 
@@ -263,12 +263,9 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
         x = np.log(chains)
     flat = x.reshape(n, -1, p)
     prior = life.prior_at(moments, prior_rng)
-    variance, width = (
-        prior.var(axis=1),
-        np.ptp(np.quantile(np.exp(prior), (0.05, 0.95), axis=1), axis=0),
-    )
-    information = identifiability_of(stage).restricted_to(life.modes)
-    seen = identifiable_parameters([information], [range(p)], information.prior)
+    variance = prior.var(axis=1)
+    width = np.ptp(np.quantile(np.exp(prior), (0.05, 0.95), axis=1), axis=0)
+    seen = identifiability_of(stage).restricted_to(life.modes).identifiable()
     assert stage.modal_map is not None  # a life has one
     low, high = stage.modal_map.low, stage.modal_map.high
     margin = constants.EDGE_SHARE * (high - low)

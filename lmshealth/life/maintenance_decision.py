@@ -8,11 +8,11 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.life import constants
+from lmshealth.life.posterior.data import SECONDS_PER_DAY
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.stage.constants import MAX_RISK
 from lmshealth.stage.description import Decision
 
-_SECONDS_PER_DAY = 86_400.0
 _SHORTER = 0.9  # factor between the intervals of logs that are tried
 
 
@@ -144,7 +144,7 @@ def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
     """
     moment = prognosis.recorded_at
     ahead = datetime.combine(day, time(), moment.tzinfo) - moment
-    days = max(ahead.total_seconds() / _SECONDS_PER_DAY, 0.0)
+    days = max(ahead.total_seconds() / SECONDS_PER_DAY, 0.0)
     within = np.minimum(prognosis.remaining, prognosis.horizon)
     maybe = within <= days * prognosis.usage[:, None]
     surely = maybe & (prognosis.remaining <= prognosis.horizon)

@@ -13,8 +13,8 @@ from scipy.special import expit, logit
 from lmshealth._private.arrays import BoolArray
 from lmshealth.life import constants
 from lmshealth.life.health import Health
-from lmshealth.life.likelihood import NO_MODE
-from lmshealth.life.posterior import LoneMode
+from lmshealth.life.posterior.fit import LoneMode
+from lmshealth.life.posterior.likelihood import NO_MODE
 from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.naming import off_description

@@ -17,8 +17,8 @@ import numpy as np
 from lmshealth.io.log import Refusal
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
-from lmshealth.life.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.maintenance_decision import Service, day_after, probability_before
+from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.report import constants, figures
 from lmshealth.report.assessment import Assessment, Summary, changes, first_limit, limit_of

@@ -1,19 +1,18 @@
 """Laws by which a health parameter degrades with travel (README.md, "Degradation laws")."""
 
-import logging
-from importlib.metadata import entry_points
-from typing import TYPE_CHECKING, Annotated, ClassVar, Union
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Union
 
 import msgspec
 import numpy as np
 from scipy.special import expit, log_expit
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth._private.toml import within
 from lmshealth.stage import constants
 from lmshealth.stage.priors import Lognormal, Prior, Uniform
 
-_log = logging.getLogger(__name__)
 _KM = 1000.0
 # ln of ratios of lengths is cut here: a distant walker may ask for a length outside the range of
 # floats, where its prior is 0 anyway.
@@ -363,25 +362,14 @@ def _settled(z: FloatArray) -> FloatArray:
     return np.asarray(np.where(near, 1 - z / 2, -np.expm1(-z) / np.where(near, 1.0, z)))
 
 
-def _laws_of_other_packages(known: tuple[type[Law], ...]) -> tuple[type[Law], ...]:
-    """Load the laws of entry points; one that cannot be used is logged as an error."""
-    found = list(known)
-    for point in entry_points(group=LAWS):
-        try:
-            law = point.load()
-            if not (isinstance(law, type) and issubclass(law, Law)):
-                raise TypeError(f"it is {law!r}, needed a subclass of Law")
-            kind = law.__struct_config__.tag
-            if not isinstance(kind, str) or kind in [own.__struct_config__.tag for own in found]:
-                raise ValueError(f"its tag is {kind!r}, needed one that no other law has")
-            found.append(law)
-        except Exception as error:
-            # A broken package must not keep descriptions without its law from being read.
-            source = point.dist.name if point.dist else "an unknown distribution"
-            what = f"{type(error).__name__}: {error}"
-            _log.error("law %r of %s is not used: %s; update or uninstall it",
-                       point.name, source, what)  # fmt: skip
-    return tuple(found)
+def _checked(law: Any, others: Sequence[type[Law]]) -> type[Law]:
+    """Return a law of another package; `TypeError` or `ValueError` if it is none."""
+    if not (isinstance(law, type) and issubclass(law, Law)):
+        raise TypeError(f"it is {law!r}, needed a subclass of Law")
+    kind = law.__struct_config__.tag
+    if not isinstance(kind, str) or kind in [own.__struct_config__.tag for own in others]:
+        raise ValueError(f"its tag is {kind!r}, needed one that no other law has")
+    return law
 
 
 LAWS = "lmshealth.laws"
@@ -391,4 +379,4 @@ if TYPE_CHECKING:
     AnyLaw = HertzWear | Loosening | Power | Linear | Unchanging | Accelerating | Free
 else:
     _SHIPPED = (HertzWear, Loosening, Power, Linear, Unchanging, Accelerating, Free)
-    AnyLaw = Union[_laws_of_other_packages(_SHIPPED)]  # noqa: UP007
+    AnyLaw = Union[load_plug_ins(LAWS, "law", _SHIPPED, _checked)]  # noqa: UP007

@@ -69,6 +69,11 @@ class Identifiability:
         """Return the posterior standard deviations of the ln parameters, as `precision` does."""
         return np.sqrt(np.diag(np.linalg.inv(self.precision(noise, exact_map=exact_map))))
 
+    def identifiable(self) -> BoolArray:
+        """Decide which parameters unlimited logs would inform, shape ``(n_parameters,)``."""
+        left = self.std(self.limiting_variance()) ** 2
+        return np.asarray(1 - left / self.prior >= constants.INFORMED)
+
     def change_std(self, noise: FloatArray) -> FloatArray:
         """Return the standard deviations of small changes of the ln parameters.
 
@@ -77,22 +82,6 @@ class Identifiability:
         information = self.std(noise, exact_map=True) ** -2 - 1 / self.prior
         with np.errstate(divide="ignore"):
             return np.asarray(np.maximum(information, 0.0) ** -0.5)
-
-
-def identifiable_parameters(
-    machines: Sequence[Identifiability], columns: Sequence[Sequence[int]], prior: FloatArray
-) -> BoolArray:
-    """Decide which parameters unlimited logs would inform, of one or several machines together.
-
-    For indices of the parameters of each machine among all, and prior variances of all ln
-    parameters, ``(n_parameters,)``.
-    """
-    precision = np.diag(1 / prior)
-    for machine, places in zip(machines, columns, strict=True):
-        gained = machine.precision(machine.limiting_variance()) - np.diag(1 / machine.prior)
-        precision[np.ix_(places, places)] += gained
-    left = np.diag(np.linalg.inv(precision))
-    return np.asarray(1 - left / prior >= constants.INFORMED)
 
 
 def identifiability_of(stage: Stage) -> Identifiability:

@@ -373,12 +373,13 @@ def _merged(found: list[FilterBank]) -> tuple[FilterBank, FloatArray]:
     logs = np.stack([one.log_weight for one in found], axis=1)
     log_weight = np.logaddexp.reduce(logs, axis=1)
     share = np.exp(logs - log_weight[:, None])
-    merged = replace(found[0], log_weight=log_weight, state=np.zeros_like(found[0].state))
-    for own, one in zip(share.T[:, :, None, None], found, strict=True):
-        merged.state[:] += own * one.state
-    for own, one in zip(share.T[:, :, None, None], found, strict=True):
-        off = one.mean - merged.mean
-        merged.cov[:] += own * (off[:, :, None] * off[:, None, :])
+    means = np.stack([one.mean for one in found], axis=1)
+    state = share[:, 0, None, None] * found[0].state
+    for j, one in enumerate(found[1:], start=1):
+        state += share[:, j, None, None] * one.state
+    merged = replace(found[0], log_weight=log_weight, state=state)
+    off = means - merged.mean[:, None]
+    merged.cov[:] += (share[:, :, None] * off).swapaxes(1, 2) @ off
     return merged, share
 
 

@@ -98,8 +98,8 @@ class History(Result):
     def _expect_order(self) -> None:
         """Require moments, and the odometer where there is one, that never decrease."""
         for name, ticks in (
-            ("recorded_at", [moment.timestamp() for moment in self.recorded_at]),
-            ("travel", self.travel if self.has_odometer else []),
+            ("recorded_at", self.seconds),
+            ("travel", self.travel if self.has_odometer else self.travel[:0]),
         ):
             back = np.flatnonzero(np.diff(ticks) < 0)
             if back.size:
@@ -172,12 +172,14 @@ class History(Result):
         """Whether the odometer is the clock; else it is the time."""
         return bool(np.isfinite(self.travel).all())
 
+    @property
+    def seconds(self) -> FloatArray:
+        """Moments of the logs in s since 1970, shape ``(n_logs,)``."""
+        return np.array([moment.timestamp() for moment in self.recorded_at])
+
     def clock(self) -> FloatArray:
         """Return odometer (m), or time (s) without one, since the baseline, shape ``(n_logs,)``."""
-        if self.has_odometer:
-            ticks = self.travel
-        else:
-            ticks = np.array([moment.timestamp() for moment in self.recorded_at])
+        ticks = self.travel if self.has_odometer else self.seconds
         return np.asarray(ticks - ticks[self.baseline])
 
     def first_logs(self, n: int) -> Self:

@@ -13,7 +13,7 @@ from typing import Self
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
-from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import N_CHECKPOINTS
 from lmshealth.tracking.filter_bank import FilterBank, FilterModel, Innovation, begin_step
@@ -34,7 +34,7 @@ _SINGULAR = 1e-10
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Nuisances:
+class Nuisances(Rows):
     """Settings of the filter at one log; stacked, those of all logs with a leading axis."""
 
     level_walk: FloatArray  # variance per life of the random walk of ln f
@@ -52,15 +52,9 @@ class Nuisances:
     @classmethod
     def stacked(cls, logs: Sequence[Self]) -> Self:
         """Return the nuisances of all logs as one object."""
-        names = cls.__dataclass_fields__
-        whole = cls(*(np.array([getattr(one, name) for one in logs]) for name in names))
+        whole = logs[0].with_each(lambda *own: np.array(own), *logs[1:])
         freeze(whole)
         return whole
-
-    def of_log(self, k: int) -> Self:
-        """Return the nuisances of one log of stacked ones."""
-        names = self.__dataclass_fields__
-        return type(self)(*(np.array(getattr(self, name)[k]) for name in names))
 
     def at(self, log: Self) -> Self:
         """Return these nuisances of the machine with those of a log alone."""

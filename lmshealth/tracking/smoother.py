@@ -34,7 +34,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     if followed.nuisances is None:
         raise ValueError(f"the track of {followed.stage} has no nuisances: filter it by `track`")
     space = StateSpace(history, stage, followed.steps)
-    logs = [followed.nuisances.of_log(k) for k in range(len(history.logs))]
+    logs = [followed.nuisances[k] for k in range(len(history.logs))]
     mean, cov = PublishedFilter(FilterModel(space)).smooth(logs)
     contrast = space.drift
     size = contrast.shape[1]

@@ -13,7 +13,7 @@ from lmshealth._private.serialize import pack, unpack
 from lmshealth.batch import assess as assessing
 from lmshealth.batch.assess import Machine, StoredLife
 from lmshealth.life import constants
-from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE

@@ -42,12 +42,12 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.log import Log
 from lmshealth.io.reading import content_digest
-from lmshealth.life import posterior as life_posterior
 from lmshealth.life.fleet_prior import EndedLife, FleetPrior, LawPrior
 from lmshealth.life.health import epochs_to_publish, infer
-from lmshealth.life.likelihood import scatter_prior
-from lmshealth.life.posterior import fit_life
-from lmshealth.life.remaining_life import prognose
+from lmshealth.life.posterior import fit as life_posterior
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.likelihood import scatter_prior
+from lmshealth.life.prognosis import prognose
 from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment, Summary, summarise

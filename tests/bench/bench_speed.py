@@ -20,7 +20,7 @@ from scipy import fft
 
 from lmshealth import identify, infer_drifts, load_stage, prognose, run
 from lmshealth.batch.ingest import Settings
-from lmshealth.life import likelihood
+from lmshealth.life.posterior import likelihood
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track

@@ -11,10 +11,9 @@ from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 
 from lmshealth._private.seeds import stream
-from lmshealth.life.density import LifeDensity
-from lmshealth.life.ensemble_sampling import sample
-from lmshealth.life.importance_sampling import WeightedDraws, importance_sample_to_ess
-from lmshealth.life.likelihood import LifeLikelihood
+from lmshealth.life.posterior.ensemble_sampling import sample
+from lmshealth.life.posterior.importance_sampling import WeightedDraws, importance_sample_to_ess
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.read_tables import Drifts

@@ -9,9 +9,8 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
-from lmshealth.life.density import LifeDensity
-from lmshealth.life.importance_sampling import importance_sample_to_ess
-from lmshealth.life.likelihood import NO_MODE, LifeLikelihood, ln_health
+from lmshealth.life.posterior.importance_sampling import importance_sample_to_ess
+from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, ln_health
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import make_history

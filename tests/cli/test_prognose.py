@@ -13,7 +13,7 @@ from click.testing import CliRunner, Result
 from lmshealth._private.tables import TABLES
 from lmshealth.cli import machine_commands
 from lmshealth.cli.main import main
-from lmshealth.life.posterior import fit_life
+from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.report.text import km, plain
 from lmshealth.stage.description import Stage

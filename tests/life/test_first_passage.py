@@ -8,8 +8,8 @@ from scipy import stats
 from scipy.stats.distributions import rv_frozen
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.life.remaining_life import first_passage
-from lmshealth.life.scenarios import DegradationPath
+from lmshealth.life.posterior.scenarios import DegradationPath
+from lmshealth.life.prognosis import first_passage
 from lmshealth.stage.degradation_laws import AnyLaw, Free, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.priors import Lognormal, Normal, Uniform
 from tests.oracles import binomial_band

@@ -27,10 +27,10 @@ from lmshealth.life.fleet_prior import (
     needs_fleet_prior,
     pace_likelihood,
 )
-from lmshealth.life.likelihood import LifeLikelihood, scatter_prior
-from lmshealth.life.posterior import LifePosterior, fit_life
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.posterior.likelihood import LifeLikelihood, scatter_prior
+from lmshealth.life.posterior.scenarios import list_scenarios
 from lmshealth.life.prognosis import Prognosis
-from lmshealth.life.scenarios import list_scenarios
 from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
 from lmshealth.stage.description import ParameterSpec, ScatterPrior, Stage
 from lmshealth.stage.priors import Lognormal, Normal, Uniform

@@ -16,9 +16,9 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer, infer_drifts
-from lmshealth.life.likelihood import NO_MODE
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import prognosis_of
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.posterior.likelihood import NO_MODE
+from lmshealth.life.prognosis import prognosis_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.read_tables import Drifts

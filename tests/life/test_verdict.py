@@ -11,8 +11,8 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
-from lmshealth.life.likelihood import NO_MODE
-from lmshealth.life.posterior import LoneMode
+from lmshealth.life.posterior.fit import LoneMode
+from lmshealth.life.posterior.likelihood import NO_MODE
 from lmshealth.life.verdict import (
     OUTSIDE_MAP,
     degraded_below,

@@ -19,8 +19,8 @@ from lmshealth.batch.assess import assess
 from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior
-from lmshealth.life.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.maintenance_decision import Service, probability_before
+from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.log_estimates import LogEstimates

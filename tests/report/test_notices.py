@@ -11,7 +11,7 @@ from msgspec import structs
 
 from lmshealth._private.tables import TABLES
 from lmshealth.io.log import Refusal
-from lmshealth.life.posterior import LoneMode
+from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.report.assessment import summarise
 from lmshealth.report.notices import notices
 from lmshealth.report.tables import machine_tables

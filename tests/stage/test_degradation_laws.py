@@ -329,7 +329,7 @@ from lmshealth import load_stage
 stage = load_stage("small.toml")
 (law,) = stage.parameters[0].laws
 print(law.kind, law.label)
-from lmshealth.life.posterior import fit_life
+from lmshealth.life.posterior.fit import fit_life
 from tests.lives import FREQUENCY, make_history, true_drift
 travel = np.linspace(0, 1e6, 8)
 drift = true_drift(("guide_preload",), np.log(1 - 2e-7 * travel)[:, None])[:, :2]

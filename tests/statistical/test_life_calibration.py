@@ -14,11 +14,10 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
-from lmshealth.life.density import LifeDensity
 from lmshealth.life.fleet_prior import machine_evidence, needs_fleet_prior
-from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import fit_life
-from lmshealth.life.remaining_life import _usage, passages
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
+from lmshealth.life.prognosis import _usage, passages
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.data.histories import map_std

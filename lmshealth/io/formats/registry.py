@@ -3,15 +3,16 @@
 A plug-in is a `Format` under the entry-point group ``lmshealth.formats`` of an installed package.
 """
 
-import logging
 import re
+from collections.abc import Sequence
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
 from itertools import takewhile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth.io import constants
 from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
@@ -39,27 +40,16 @@ GROUP = "lmshealth.formats"
 
 _HEAD = 4096
 _NUMBERS = re.compile(rb'(?i)(?=.*\d|.*nan)(?:[\d\s.,;:|/+\-eTZ"]|nan|inf)+')
-_log = logging.getLogger(__name__)
 
 
 @cache
 def plug_ins() -> tuple[Format, ...]:
     """Load the formats of plug-ins; one that cannot be used is logged as an error, once."""
-    formats: list[Format] = []
-    for point in entry_points(group=GROUP):
-        try:
-            formats.append(_loaded(point, [*FORMATS, *formats]))
-        except Exception as error:
-            # A broken plug-in must not keep the files of other formats from being read.
-            source = point.dist.name if point.dist else "an unknown distribution"
-            what = f"{type(error).__name__}: {error}"
-            _log.error("format %r of %s is not used: %s; update or uninstall it",
-                       point.name, source, what)  # fmt: skip
-    return tuple(formats)
+    return load_plug_ins(GROUP, "format", FORMATS, _checked)[len(FORMATS) :]
 
 
-def _loaded(point: EntryPoint, others: list[Format]) -> Format:
-    form = point.load()
+def _checked(form: Any, others: Sequence[Format]) -> Format:
+    """Return the format of a plug-in; `TypeError` or `ValueError` if it is none."""
     if not isinstance(form, Format):
         raise TypeError(f"it is a {type(form).__name__}, needed a Format")
     taken = {suffix for other in others for suffix in other.suffixes} | set(TEXT_SUFFIXES)

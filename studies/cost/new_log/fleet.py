@@ -28,7 +28,7 @@ from lmshealth import load_stage
 from lmshealth._private.seeds import seed_of
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
-from lmshealth.life.remaining_life import prognose
+from lmshealth.life.prognosis import prognose
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.life import constants
-from lmshealth.life.likelihood import NO_MODE, lone_kernel, scatter_prior
-from lmshealth.life.remaining_life import early_life, rate_std
-from lmshealth.life.scenarios import DegradationPath, list_scenarios
+from lmshealth.life.posterior.likelihood import NO_MODE, lone_kernel, scatter_prior
+from lmshealth.life.posterior.scenarios import DegradationPath, list_scenarios
+from lmshealth.life.prognosis import early_life, rate_std
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors

@@ -33,8 +33,8 @@ import msgspec
 import numpy as np
 
 from lmshealth.errors import NotConverged
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import parameters_with_limit, passages
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import parameters_with_limit, passages
 from lmshealth.stage.description import Stage, load_stage
 from studies.harness.claims import Claim, ranked
 from studies.harness.ranks import N_DRAWS, Array, judge, rank, uniform

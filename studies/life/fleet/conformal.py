@@ -30,10 +30,10 @@ from unittest.mock import patch
 
 import numpy as np
 
-from lmshealth.life import constants, remaining_life
+from lmshealth.life import constants, prognosis
 from lmshealth.life.fleet_prior import ended_lives
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import prognose
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import prognose
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.claims import Claim, counted, number
@@ -155,7 +155,7 @@ def by_way(work: Callable[[], Found]) -> Iterator[tuple[str, Found]]:
 
     for way, changed in WAYS.items():
         with ExitStack() as stack:
-            stack.enter_context(patch.object(remaining_life, "fit_life", fitted))
+            stack.enter_context(patch.object(prognosis, "fit_life", fitted))
             for name, value in changed.items():
                 stack.enter_context(patch.object(constants, name, value))
             yield way, work()

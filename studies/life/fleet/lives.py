@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from lmshealth.life import constants
-from lmshealth.life.likelihood import scatter_prior
-from lmshealth.life.scenarios import DegradationPath, laws_of
+from lmshealth.life.posterior.likelihood import scatter_prior
+from lmshealth.life.posterior.scenarios import DegradationPath, laws_of
 from lmshealth.stage.degradation_laws import HertzWear, Unchanging
 from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.stage.priors import Lognormal

@@ -34,8 +34,8 @@ from lmshealth.life.fleet_prior import (
     machine_evidence,
     needs_fleet_prior,
 )
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import passages
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import passages
 from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior

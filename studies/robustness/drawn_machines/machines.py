@@ -15,8 +15,8 @@ from lmshealth.errors import LmshealthError
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.life.health import health_of
-from lmshealth.life.posterior import fit_life
-from lmshealth.life.remaining_life import prognosis_of
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.prognosis import prognosis_of
 from lmshealth.life.verdict import degraded_below, doubt_of_names, judge, verdict_of
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History

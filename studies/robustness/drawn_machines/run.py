@@ -28,7 +28,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth.life.posterior import fit_life
+from lmshealth.life.posterior.fit import fit_life
 from lmshealth.modal.identification import identify
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted, number

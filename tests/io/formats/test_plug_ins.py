@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from lmshealth._private import plug_ins
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import as_samples
 from lmshealth.io.column_map import ColumnMap
@@ -81,7 +82,7 @@ def plugged(monkeypatch):
         point = Point(name, "some.module:FORMAT", registry.GROUP)
         vars(point)["dist"] = SimpleNamespace(name=f"lmshealth-{name}")
         points.append(point)
-    monkeypatch.setattr(registry, "entry_points", lambda group: EntryPoints(points))
+    monkeypatch.setattr(plug_ins, "entry_points", lambda group: EntryPoints(points))
     registry.plug_ins.cache_clear()
     yield
     registry.plug_ins.cache_clear()

@@ -12,10 +12,10 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
-from lmshealth.life import constants, likelihood
-from lmshealth.life.density import LifeDensity
-from lmshealth.life.likelihood import NO_MODE, LifeLikelihood, scatter_prior
-from lmshealth.life.scenarios import Scenario
+from lmshealth.life import constants
+from lmshealth.life.posterior import likelihood
+from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, scatter_prior
+from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +11,7 @@ from numpy.random import MT19937, RandomState
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.importance_sampling import (
+from lmshealth.life.posterior.importance_sampling import (
     LogProbability,
     Proposal,
     WeightedDraws,
@@ -54,7 +53,6 @@ def sample(
     log_probability: LogProbability,
     draws: WeightedDraws,
     seed: np.random.SeedSequence,
-    n_ensembles: int = constants.N_ENSEMBLES,
 ) -> Sample:
     """Sample a posterior by independent ensembles [ForemanMackey2013], [Vehtari2021].
 
@@ -65,7 +63,7 @@ def sample(
     """
     import emcee  # late: it imports scipy.stats
 
-    streams = seed.spawn(2 * n_ensembles)
+    streams = seed.spawn(2 * constants.N_ENSEMBLES)
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
         rng = np.random.default_rng(start_seed)
@@ -74,7 +72,7 @@ def sample(
         # Differences of walkers reach tails beyond it, and with gamma0 = 1 jump between modes of
         # the posterior. DESnookerMove of emcee 3.1.6 does not keep the target: it narrows a
         # Gaussian of six dimensions by 9 %.
-        independent = emcee.moves.MHMove(_independent(Proposal.near(draws, rng)))
+        independent = emcee.moves.MHMove(Proposal.near(draws, rng).move)
         moves = [independent, emcee.moves.DEMove(), emcee.moves.DEMove(gamma0=1.0)]
         weighted = list(zip(moves, (0.8, 0.15, 0.05), strict=True))
         options = {"vectorize": True, "moves": weighted}
@@ -83,18 +81,6 @@ def sample(
         random_state = RandomState(MT19937(chain_seed)).get_state(legacy=False)
         samplers.append((sampler, emcee.State(points, random_state=random_state)))
     return _run(samplers)
-
-
-def _independent(
-    proposal: Proposal,
-) -> Callable[[FloatArray, RandomState], tuple[FloatArray, FloatArray]]:
-    """Return a Metropolis-Hastings move of emcee that proposes whatever the present point is."""
-
-    def propose(points: FloatArray, rng: RandomState) -> tuple[FloatArray, FloatArray]:
-        proposed = proposal.draw(rng, len(points))
-        return proposed, proposal.log_density(points) - proposal.log_density(proposed)
-
-    return propose
 
 
 def _start(draws: WeightedDraws, rng: np.random.Generator) -> FloatArray:

@@ -13,12 +13,12 @@ from scipy import stats
 
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life import ensemble_sampling as sampling
-from lmshealth.life.density import LifeDensity
-from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import fit_life
-from lmshealth.life.prognosis import LawWeight, Prognosis
-from lmshealth.life.remaining_life import (
+from lmshealth.life.posterior import ensemble_sampling as sampling
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
+from lmshealth.life.prognosis import (
+    LawWeight,
+    Prognosis,
     _beyond_laws,
     _usage,
     early_life,

@@ -9,11 +9,12 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.scenarios import Scenario, list_scenarios
+from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 
-_SECONDS_PER_DAY, _KM, _FEW = 86_400.0, 1000.0, 3
+SECONDS_PER_DAY, KM = 86_400.0, 1000.0
+_FEW = 3  # logs at either end of a life, whose mean ln f is compared
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -22,18 +23,16 @@ class LifeData(ReadOnly):
 
     stage: Stage
     history: History  # all logs, condensed
-    # columns, modes, mode_of_series: series of the history that are used, their modes, and
-    # the mode of each, ``(n_series,)``.
+    # Series of the history that are used, their modes, and the mode of each, ``(n_series,)``.
     columns: list[int]
     modes: tuple[str, ...]
     mode_of_series: np.ndarray
-    # clock, steps: travel since the baseline in m of each log, shape ``(n_logs,)``, and step
-    # of the modes.
+    # Travel since the baseline in m of each log, shape ``(n_logs,)``, and step of the modes.
     clock: FloatArray
     steps: tuple[float, ...]
-    # rows, y: index of each datum among all series and logs, and its ln f minus the mean of
-    # its mode, shape ``(n_data,)``.
-    rows: np.ndarray
+    # Series and log of each datum, and its ln f minus the mean of its mode, shape ``(n_data,)``.
+    series_of: np.ndarray
+    log_of: np.ndarray
     y: FloatArray
 
     @classmethod
@@ -63,12 +62,12 @@ class LifeData(ReadOnly):
                 f"{history.stage}: {n_logs} logs with a mode of the map over {now / 1000:.4g} km; "
                 f"a life needs at least {min_logs} logs and some travel"
             )
-        flat = ln_f.T.ravel()
-        rows = np.flatnonzero(np.isfinite(flat))
+        series_of, log_of = np.nonzero(np.isfinite(ln_f.T))
         mode_of_series = np.array([modes.index(name) for name in of_series])
         means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
-        y = flat[rows] - means[mode_of_series[rows // clock.size]]
-        return cls(stage, history, columns, modes, mode_of_series, clock, steps, rows, y)
+        y = ln_f[log_of, series_of] - means[mode_of_series[series_of]]
+        places = (series_of, log_of, y)
+        return cls(stage, history, columns, modes, mode_of_series, clock, steps, *places)
 
     @property
     def now(self) -> float:
@@ -87,14 +86,9 @@ class LifeData(ReadOnly):
         return found
 
     @property
-    def log_of(self) -> np.ndarray:
-        """Index of the log of each datum, shape ``(n_data,)``."""
-        return np.asarray(self.rows % self.clock.size)
-
-    @property
     def mode_of(self) -> np.ndarray:
         """Index of the mode of each datum, shape ``(n_data,)``."""
-        return np.asarray(self.mode_of_series[self.rows // self.clock.size])
+        return np.asarray(self.mode_of_series[self.series_of])
 
     @property
     def scenarios(self) -> tuple[Scenario, ...]:
@@ -123,8 +117,8 @@ def with_clock(history: History, stage: Stage) -> History:
         return history
     per_day = stage.description.usage.km_per_day
     assert per_day is not None  # the description has been checked
-    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    return replace(history, travel=(seconds - seconds[:1]) / _SECONDS_PER_DAY * per_day * _KM)
+    days = (history.seconds - history.seconds[:1]) / SECONDS_PER_DAY
+    return replace(history, travel=days * per_day * KM)
 
 
 def condense(history: History, most: int) -> History:
@@ -142,8 +136,7 @@ def condense(history: History, most: int) -> History:
     group_of = np.repeat(np.arange(begins.size), ends - begins)
     parts = [slice(begin, end) for begin, end in zip(begins, ends, strict=True)]
     found = [_average(history, part) for part in parts]
-    seconds = np.array([moment.timestamp() for moment in history.recorded_at])
-    r = len(history.series)
+    seconds, r = history.seconds, len(history.series)
     return replace(
         history,
         logs=tuple(history.logs[end - 1] for end in ends),

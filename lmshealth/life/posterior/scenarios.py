@@ -3,7 +3,7 @@
 README.md has the model.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -12,7 +12,6 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
-from lmshealth.life.constants import STEP_PROBABILITY
 from lmshealth.stage.degradation_laws import AnyLaw, Free, Law
 from lmshealth.stage.description import ParameterSpec
 
@@ -96,10 +95,20 @@ class Scenario:
         return tuple(len(path.names) for path in self.paths)
 
     @property
+    def n_dim(self) -> int:
+        """Number of coordinates."""
+        return sum(self.sizes)
+
+    @property
+    def steps(self) -> tuple[float, ...]:
+        """Steps of the modes, in m since the baseline."""
+        return self.paths[0].steps
+
+    @property
     def name(self) -> str:
         """Name by the kind and the begin of each law, and the steps, in m."""
         laws = " ".join(f"{path.law.kind}@{path.begin:.0f}" for path in self.paths)
-        return " ".join([laws, *(f"{step:.0f}" for step in self.paths[0].steps)])
+        return " ".join([laws, *(f"{step:.0f}" for step in self.steps)])
 
     @property
     def restarts(self) -> bool:
@@ -110,24 +119,22 @@ class Scenario:
         """Return the name of the scenario whose laws all begin at the baseline."""
         return replace(self, paths=tuple(replace(path, begin=0.0) for path in self.paths)).name
 
-    @property
-    def n_dim(self) -> int:
-        """Number of coordinates."""
-        return sum(self.sizes)
-
     def split(self, y: FloatArray) -> list[FloatArray]:
         """Split coordinates or natural parameters by health parameter."""
         return np.split(y, np.cumsum(self.sizes)[:-1], axis=-1)
 
+    def _parts(self, y: FloatArray) -> Iterator[tuple[DegradationPath, FloatArray]]:
+        """Yield each path with its own coordinates or natural parameters."""
+        return zip(self.paths, self.split(y), strict=True)
+
     def natural(self, y: FloatArray) -> FloatArray:
         """Convert coordinates to natural parameters, both ``(n, n_dim)``."""
-        parts = zip(self.paths, self.split(y), strict=True)
-        return np.hstack([path.natural(part, self.now) for path, part in parts])
+        return np.hstack([path.natural(part, self.now) for path, part in self._parts(y)])
 
     def log_prior(self, y: FloatArray) -> FloatArray:
         """Return the log prior density of coordinates, shape ``(n,)``."""
-        parts = zip(self.paths, self.split(y), strict=True)
-        total = sum((path.log_prior(part, self.now) for path, part in parts), np.zeros(len(y)))
+        each = (path.log_prior(part, self.now) for path, part in self._parts(y))
+        total = sum(each, np.zeros(len(y)))
         return np.where(np.isnan(total), -np.inf, total)
 
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
@@ -139,8 +146,7 @@ class Scenario:
 
         Natural parameters ``(n, n_dim)``; travel ``(n_travel,)`` in m since the baseline.
         """
-        parts = zip(self.paths, self.split(theta), strict=True)
-        return np.stack([path.health(own, travel) for path, own in parts], axis=-1)
+        return np.stack([path.health(own, travel) for path, own in self._parts(theta)], axis=-1)
 
 
 def laws_of(parameter: ParameterSpec, free: float) -> list[tuple[AnyLaw, float]]:
@@ -164,14 +170,14 @@ def list_scenarios(
     Steps, ascending, and the last log by their travel in m since the baseline. The tracker found
     the steps in the same logs: that there are none competes with them. `free` as in `laws_of`.
     """
-    found = []
-    certain = STEP_PROBABILITY if steps else 1.0
+    found: list[Scenario] = []
+    certain = constants.STEP_PROBABILITY if steps else 1.0
     for taken, probability in ((tuple(steps), certain), ((), 1 - certain)):
         if probability:
             choices = [_paths(parameter, taken, now, free) for parameter in parameters]
             for one in product(*choices):
-                weight = probability * float(np.prod([share for _, share in one]))
-                found.append(Scenario(tuple(path for path, _ in one), now, weight))
+                paths, shares = zip(*one, strict=True)
+                found.append(Scenario(paths, now, probability * float(np.prod(shares))))
     return tuple(found)
 
 

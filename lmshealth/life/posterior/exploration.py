@@ -10,15 +10,14 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.density import LifeDensity, kept_weights
-from lmshealth.life.importance_sampling import (
+from lmshealth.life.posterior.importance_sampling import (
     WeightedDraws,
     importance_sample,
     importance_sample_again,
     importance_sample_to_ess,
 )
-from lmshealth.life.likelihood import Grid, LifeLikelihood
-from lmshealth.life.scenarios import DegradationPath, Scenario
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood, kept_weights
+from lmshealth.life.posterior.scenarios import DegradationPath, Scenario
 from lmshealth.stage.degradation_laws import Free
 
 _N_ROUGH, _N_FINE = 300, 2000
@@ -67,7 +66,6 @@ def log_probability(found: Explored) -> float:
     return float(np.log(found[0].scenario.weight) + found[1].log_evidence)
 
 
-@dataclass(eq=False)
 class _Exploration:
     """Rough draws of scenarios, made one after the other from what is known by then.
 
@@ -75,17 +73,16 @@ class _Exploration:
     ones to begin with, whatever the other parameters do.
     """
 
-    likelihood: LifeLikelihood
-    generators: list[np.random.Generator]
-    before: LifeStart | None
-    grid: Grid
-    found: dict[int, Explored]
-    known: list[dict[DegradationPath, tuple[float, FloatArray]]]
-
-    @property
-    def scenarios(self) -> tuple[Scenario, ...]:
-        """All scenarios of the life."""
-        return self.likelihood.data.scenarios
+    def __init__(
+        self, likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None
+    ) -> None:
+        self.likelihood, self.grid, self.before = likelihood, likelihood.grid, before
+        self.scenarios = likelihood.data.scenarios
+        seeds = seed.spawn(len(self.scenarios))
+        self.generators = [np.random.default_rng(own) for own in seeds]
+        self.found: dict[int, Explored] = {}
+        self.known: list[dict[DegradationPath, tuple[float, FloatArray]]]
+        self.known = [{} for _ in likelihood.data.stage.parameters]
 
     def add(self, which: Iterable[int]) -> None:
         """Draw from scenarios that have not been drawn from."""
@@ -101,10 +98,8 @@ class _Exploration:
             value = float(density.log_probability(point)[0])
             self.found[k] = density, WeightedDraws(point, np.ones(1), value)
             return
-        start, best = self._start(scenario, rng), -np.inf
-        if self.found:
-            best = max(log_probability(one) for one in self.found.values())
-        least = best - constants.MAX_LOG_ODDS - _HOPELESS - float(np.log(scenario.weight))
+        start = self._start(scenario, rng)
+        least = self.best() - constants.MAX_LOG_ODDS - _HOPELESS - float(np.log(scenario.weight))
         draws = importance_sample(density.log_probability, start, rng, _N_ROUGH, least)
         self.found[k] = density, draws
         value = log_probability(self.found[k])
@@ -150,11 +145,14 @@ class _Exploration:
         self.found.clear()
         self.add(anchors)
 
+    def best(self) -> float:
+        """Return the log probability of the most probable scenario, -inf without any."""
+        return max(map(log_probability, self.found.values()), default=-np.inf)
+
     def likely(self) -> list[int]:
         """Return the scenarios that are not much less probable than the best, in order."""
-        value = {k: log_probability(one) for k, one in self.found.items()}
-        least = max(value.values()) - constants.MAX_LOG_ODDS
-        return sorted(k for k in value if value[k] > least)
+        least = self.best() - constants.MAX_LOG_ODDS
+        return sorted(k for k, one in self.found.items() if log_probability(one) > least)
 
     def may_be_likely(self, group: Sequence[int], anchors: Sequence[int]) -> bool:
         """Return whether a group of scenarios may have one that is not much less probable.
@@ -165,9 +163,8 @@ class _Exploration:
         if not own:
             return bool(group)
         weight = max(self.scenarios[k].weight for k in group)
-        best = max(log_probability(one) for one in self.found.values())
         possible = max(own) + float(np.log(weight)) + _SIMPLER
-        return possible > best - constants.MAX_LOG_ODDS
+        return possible > self.best() - constants.MAX_LOG_ODDS
 
     def refine(self, k: int, n: int) -> None:
         """Draw n times from a scenario again, with the grid points that it needs."""
@@ -221,20 +218,18 @@ def explore(
     `NotConverged` is raised where the weights of an update are unreliable: they are those of the
     posterior with all logs, so that errors of one update do not reach the next.
     """
-    scenarios = likelihood.data.scenarios
-    generators = [np.random.default_rng(own) for own in seed.spawn(len(scenarios))]
-    known: list[dict[DegradationPath, tuple[float, FloatArray]]] = [{} for _ in scenarios[0].paths]
-    all_ = _Exploration(likelihood, generators, before, likelihood.grid, {}, known)
+    all_ = _Exploration(likelihood, seed, before)
+    scenarios = all_.scenarios
     # Grid points that the least and the most flexible scenarios do without, all do without.
     anchors = _anchors(scenarios)
     all_.narrow(anchors)
-    left = {
-        k
-        for k, one in enumerate(scenarios)
-        if not (update and before is not None and before.excludes(one))
-    }
+    excluded = before.excludes if update and before is not None else lambda _: False
     for with_steps in (False, True):
-        group = [k for k in left if bool(scenarios[k].paths[0].steps) == with_steps]
+        group = [
+            k
+            for k, one in enumerate(scenarios)
+            if bool(one.steps) == with_steps and not excluded(one)
+        ]
         if all_.may_be_likely(group, anchors):
             all_.add(k for k in group if not scenarios[k].restarts)
             # A law may restart at a step where it may have gone on.
@@ -267,7 +262,7 @@ def _anchors(scenarios: Sequence[Scenario]) -> list[int]:
         own = [
             k
             for k, one in enumerate(scenarios)
-            if bool(one.paths[0].steps) == with_steps and not one.restarts
+            if bool(one.steps) == with_steps and not one.restarts
         ]
         if own:
             free = (k for k in own if all(isinstance(p.law, Free) for p in scenarios[k].paths))

@@ -12,9 +12,9 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life import ensemble_sampling as sampling
-from lmshealth.life.ensemble_sampling import Sample, _start, sample
-from lmshealth.life.importance_sampling import WeightedDraws
+from lmshealth.life.posterior import ensemble_sampling as sampling
+from lmshealth.life.posterior.ensemble_sampling import Sample, _start, sample
+from lmshealth.life.posterior.importance_sampling import WeightedDraws
 
 MEAN = np.array([0.3, -1.2])
 WALKERS = 32
@@ -209,11 +209,10 @@ def test_modes_that_no_proposal_joins_are_refused_with_their_chains(
         def near(self, _: WeightedDraws, __: np.random.Generator) -> Local:
             return self
 
-        def draw(self, rng: np.random.RandomState, n: int) -> FloatArray:
-            return rng.standard_normal((n, 3))
-
-        def log_density(self, points: FloatArray) -> FloatArray:
-            return np.zeros(points.shape[0])
+        def move(
+            self, points: FloatArray, rng: np.random.RandomState
+        ) -> tuple[FloatArray, FloatArray]:
+            return rng.standard_normal(points.shape), np.zeros(points.shape[0])
 
     monkeypatch.setattr(sampling, "_start", near)
     monkeypatch.setattr(sampling, "Proposal", Local())

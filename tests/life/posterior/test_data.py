@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from lmshealth.life import constants
-from lmshealth.life.data import condense
-from lmshealth.life.likelihood import LifeLikelihood
-from lmshealth.life.posterior import fit_life
+from lmshealth.life.posterior.data import condense
+from lmshealth.life.posterior.fit import fit_life
+from lmshealth.life.posterior.likelihood import LifeLikelihood
 from lmshealth.tracking.history import Step
 from tests.lives import (
     FREQUENCY,
@@ -124,5 +124,5 @@ def test_ten_thousand_logs_are_no_more_work_than_some_hundreds(lives: tuple) -> 
     )
     times = tuple(sorted(history.recorded_at[0].replace(microsecond=0) for _ in many))
     likelihood = LifeLikelihood.of(replace(longer, recorded_at=times), stage)
-    assert likelihood.data.rows.size <= 2 * (constants.MAX_LOGS + 3)
+    assert likelihood.data.y.size <= 2 * (constants.MAX_LOGS + 3)
     assert likelihood.data.now == longer.travel[-1] - longer.travel[0]

@@ -14,13 +14,13 @@ from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
-from lmshealth.life import constants, exploration, posterior
-from lmshealth.life.density import LifeDensity
-from lmshealth.life.ensemble_sampling import Sample
-from lmshealth.life.importance_sampling import importance_sample_to_ess
-from lmshealth.life.likelihood import NO_MODE, LifeLikelihood
-from lmshealth.life.posterior import LifePosterior, fit_life
-from lmshealth.life.remaining_life import prognose
+from lmshealth.life import constants
+from lmshealth.life.posterior import exploration, fit
+from lmshealth.life.posterior.ensemble_sampling import Sample
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.posterior.importance_sampling import importance_sample_to_ess
+from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood
+from lmshealth.life.prognosis import prognose
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, Step
 from tests.lives import (
@@ -230,7 +230,7 @@ def test_the_update_of_a_life_without_wear_is_accepted(
         starts.append(arguments[2:])
         return explore(*arguments, **options)
 
-    monkeypatch.setattr(posterior, "explore", counting)
+    monkeypatch.setattr(fit, "explore", counting)
     fit_life(history, wavering, 11, chains=False, before=one.start)
     assert starts == [(one.start,)]
 
@@ -240,13 +240,13 @@ def test_linear_algebra_keeps_to_one_thread(
 ) -> None:
     """On small arrays more would only wait for one another, whatever is usual around it."""
     seen: set[int] = set()
-    sampled = posterior._sampled_scenarios
+    sampled = fit._sampled_scenarios
 
-    def counting(*arguments):
+    def counting(*arguments, **options):
         seen.update(threads())
-        return sampled(*arguments)
+        return sampled(*arguments, **options)
 
-    monkeypatch.setattr(posterior, "_sampled_scenarios", counting)
+    monkeypatch.setattr(fit, "_sampled_scenarios", counting)
     with threadpool_limits(2, user_api="blas"):
         fit_life(history, stage, 11, chains=False)
         assert seen == {1}
@@ -358,14 +358,14 @@ def test_the_law_of_the_data_is_the_most_probable(faded: LifePosterior, wavering
     assert faded.laws("guide_preload")["linear", 0.0] > 0.99
     assert next(iter(still.laws("guide_preload"))) == ("none", 0.0)
     assert still.laws("guide_preload")["none", 0.0] > 0.6
-    for fit in (faded, still):
-        probability = [way.probability for way in fit.scenarios]
+    for one in (faded, still):
+        probability = [way.probability for way in one.scenarios]
         assert sum(probability) == pytest.approx(1, abs=1e-12)
         assert probability == sorted(probability, reverse=True)
         assert min(probability) >= 0.01
         for name in NAMES:
-            assert sum(fit.laws(name).values()) == pytest.approx(1, abs=1e-12)
-        share = [way.n_mixture_draws / fit.health.shape[1] for way in fit.scenarios]
+            assert sum(one.laws(name).values()) == pytest.approx(1, abs=1e-12)
+        share = [way.n_mixture_draws / one.health.shape[1] for way in one.scenarios]
         np.testing.assert_allclose(share, probability, atol=1 / 1000)
 
 
@@ -515,7 +515,7 @@ def test_no_life_without_convergence(
     history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A sampler that stops too soon is refused with its chains."""
-    monkeypatch.setattr("lmshealth.life.ensemble_sampling._FIRST_STEPS", 40)
+    monkeypatch.setattr("lmshealth.life.posterior.ensemble_sampling._FIRST_STEPS", 40)
     monkeypatch.setattr("lmshealth.life.constants.MAX_CHAIN_STEPS", 40)
     with pytest.raises(NotConverged, match="after 40 steps") as caught:
         fit_life(history, stage, 1)

@@ -1,22 +1,26 @@
-"""Likelihood of a life: health by the laws of a scenario against the ln frequencies of all logs.
+"""Likelihood of a life, and the posterior density of one scenario averaged over its nuisances.
 
-README.md has the model. Four values follow one from the other: `LifeData` (selection of the data),
+README.md has the model. Five values follow one from the other: `LifeData` (selection of the data),
 `LifeCovariance` (their covariance Σ), `NodeBasis` (nodes from which smooth drifts follow at all
-logs), and `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters).
+logs), `LifeLikelihood` (the data whitened at every point of a grid of nuisance parameters), and
+`LifeDensity`.
 """
 
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
 
 import numpy as np
 from scipy.linalg import qr, solve_triangular
+from scipy.special import softmax
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows, diagonal
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.data import LifeData
-from lmshealth.life.scenarios import Scenario
+from lmshealth.life.posterior.data import LifeData
+from lmshealth.life.posterior.importance_sampling import log_sum_exp
+from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
@@ -32,8 +36,14 @@ _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed a
 _ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 _CACHED = 2_000_000  # whitened drifts that are computed at a time
 
+# Share of the posterior of the grid points that are dropped once a scenario is sampled.
+_NEGLIGIBLE = 0.01
+
 NO_MODE = -1
 """Index in place of that of a mode that moves alone: none does."""
+
+Nuisances = tuple[np.ndarray, np.ndarray]
+"""Indices of the map error and of the grid point of each draw, ``(n,)`` each."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -56,27 +66,35 @@ class LifeCovariance(ReadOnly):
     @classmethod
     def of(cls, data: LifeData) -> Self:
         """Compute the parts from data."""
-        history, clock = data.history, data.clock
-        n_logs, n_series = clock.size, len(data.columns)
-        cov = history.cov[history.baseline :][:, data.columns][:, :, data.columns]
-        noise = np.zeros((n_series, n_logs, n_series, n_logs))
-        for k in range(n_logs):
-            noise[:, k, :, k] = np.nan_to_num(cov[k])
-        same = np.equal.outer(data.mode_of_series, data.mode_of_series)
-        common = np.full((n_logs, n_logs), constants.INTERCEPT_STD**2)
+        history, now, log_of, series_of = data.history, data.now, data.log_of, data.series_of
+        clock = data.clock[log_of]
+        same_mode = np.equal.outer(data.mode_of, data.mode_of)
+        same_log, same_series = (np.equal.outer(one, one) for one in (log_of, series_of))
+        rows, columns = history.baseline + log_of, np.array(data.columns)[series_of]
+        reported = history.cov[rows[:, None], columns[:, None], columns]
+        common = np.full(same_mode.shape, constants.INTERCEPT_STD**2)
         for regressor in regressors(history.covariates, data.stage):
-            values = regressor.values[history.baseline :]
+            values = regressor.values[rows]
             common += regressor.prior_std**2 * np.outer(values, values)
-            common += np.diag(regressor.unknown[history.baseline :])
-        shared = np.maximum(np.minimum.outer(clock, clock), 0.0)
-        sensitivity = data.sensitivity[data.mode_of_series]
-        size, own = n_series * n_logs, np.ix_(data.rows, data.rows)
+            common += same_log * regressor.unknown[rows]
+        fixed = same_mode * common
+        # The intercept is that of a mode's first series; each further one has its own bias.
+        modes = data.mode_of_series
+        further = np.tril(np.equal.outer(modes, modes), -1).any(axis=1)
+        fixed += BIAS_STD[0] ** 2 * (same_series & further[series_of])
+        for step in history.steps:
+            if not step.changes_modes:  # retunings and changed sensors
+                concerned = [step.source in ("", one.source) for one in history.series]
+                moved = step.there[rows] & np.array(concerned)[columns]
+                fixed += JUMP_STD[step.kind][0] ** 2 * (same_mode & np.outer(moved, moved))
+        shared = np.maximum(np.minimum.outer(clock, clock), 0.0) / now
+        gram = data.sensitivity @ data.sensitivity.T
         return cls(
-            fixed=(np.kron(same, common) + _offsets(data, same))[own],
-            noise=noise.reshape(size, size)[own],
-            walk=np.kron(same, shared / data.now)[own],
-            deviation=np.kron(sensitivity @ sensitivity.T, shared / data.now)[own],
-            smooth=np.kron(same, lone_kernel(clock, clock, data.now))[own],
+            fixed=fixed,
+            noise=np.where(same_log, reported, 0.0),
+            walk=same_mode * shared,
+            deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
+            smooth=same_mode * lone_kernel(clock, clock, now),
             mode_of=data.mode_of,
         )
 
@@ -102,21 +120,6 @@ def lone_kernel(moments: FloatArray, clock: FloatArray, now: float) -> FloatArra
     parts = [np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS]
     parts.append(1.5 * least**2 * (most - least / 3))
     return np.asarray(np.mean(parts, axis=0))
-
-
-def _offsets(data: LifeData, same: BoolArray) -> FloatArray:
-    """Return the covariance of offsets without wear: sources, retunings, changed sensors."""
-    # The intercept is that of a mode's first series; each further one has its own bias.
-    further = np.tril(same, -1).any(axis=1).astype(float)
-    total = np.kron(np.diag(further), np.full((data.clock.size,) * 2, BIAS_STD[0] ** 2))
-    for step in data.history.steps:
-        if step.changes_modes:
-            continue
-        there = step.there[data.history.baseline :].astype(float)
-        moved = [step.source in ("", data.history.series[i].source) for i in data.columns]
-        variance = JUMP_STD[step.kind][0] ** 2
-        total += np.kron(same * np.outer(moved, moved), variance * np.outer(there, there))
-    return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -193,16 +196,12 @@ class Grid(Rows):
         n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
         # A mode that moves alone needs others that do not.
         alone *= n_modes > 1
-        total = np.sum(prior.walk)
-        ways = [
-            *((q, p / total * (1 - n_modes * alone), NO_MODE) for q, p in _walks(prior)),
-            *(
-                (walk, alone * p, mode)
-                for mode in range(n_modes)
-                for walk, p in constants.LONE_WALKS
-                if alone
-            ),
-        ]
+        others = (1 - n_modes * alone) / np.sum(prior.walk)
+        walks = zip(constants.WALK_STDS, prior.walk, strict=True)
+        ways = [(walk, p * others, NO_MODE) for walk, p in walks]
+        if alone:
+            lone = product(range(n_modes), constants.LONE_WALKS)
+            ways += [(walk, alone * p, mode) for mode, (walk, p) in lone]
         for (walk, p, lone), (scale, q), (deviation, r) in product(
             ways,
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
@@ -221,10 +220,6 @@ class Grid(Rows):
             values = (design, target, rest, log_weight, data.y.size - fixed)
             points.append((walk, scale, deviation, lone, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
-
-
-def _walks(prior: ScatterPrior) -> list[tuple[float, float]]:
-    return list(zip(constants.WALK_STDS, prior.walk, strict=True))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -292,25 +287,37 @@ class LifeLikelihood:
     def conditional(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Return the mean of Gaussian quantities given a life and all data, and their information.
+        """Return the means of Gaussian quantities given a life and all data, and their information.
 
         That is by how much the data reduce their covariance. At the k-th point of a grid; `cross`
-        are their covariances with the data, ``(n_values, n_data)``. Shapes ``(n, n_values)`` and
-        ``(n, n_values, n_values)`` for x ``(n, ...)``.
+        are the covariances of several groups of quantities with the data, ``(n_groups, n_values,
+        n_data)``. Shapes ``(n, n_groups, n_values)`` and, within each group, ``(n, n_groups,
+        n_values, n_values)`` for x ``(n, ...)``.
         """
         point = grid[np.arange(grid.walk.size) == k]
         settings = (float(grid.walk[k]), float(grid.noise_scale[k]), float(grid.deviation[k]))
         factor = self.covariance.factor(*settings, int(grid.lone[k]))
-        a = solve_triangular(factor, cross.T, lower=True)
+        n_data = cross.shape[2]
+        a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
         u, q, _ = _reduced(self.data, self.basis, factor)
         b = a.T @ q
-        rows = self._residuals(point, x)[0]
-        r, v = rows[:, -1], map_std * rows[:, :-1]
-        solved = np.linalg.solve(np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2), v)  # M⁻¹ V
-        explained = np.einsum("nvr,nr->nv", solved, r)
-        fitted = point.target[0] - r + np.einsum("nv,nvr->nr", explained, v)
-        mean = a.T @ u - fitted @ b.T
-        return mean, a.T @ a - (b @ np.swapaxes(v, 1, 2)) @ (solved @ b.T)
+        of_group = a.T.reshape(cross.shape)
+        known = of_group @ np.swapaxes(of_group, 1, 2)
+        parts = []
+        # A few lives at a time, for the memory.
+        for one in np.array_split(x, x.shape[0] * b.size // _CACHED + 1):
+            rows = self._residuals(point, one)[0]
+            r, v = rows[:, -1], map_std * rows[:, :-1]
+            m = np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2)
+            explained = np.linalg.solve(m, v @ r[:, :, None])
+            fitted = point.target[0] - r + (np.swapaxes(v, 1, 2) @ explained)[:, :, 0]
+            # B Vᵀ M⁻¹ V Bᵀ by a root of M: of the columns of each group alone.
+            root = np.linalg.solve(np.linalg.cholesky(m), v) @ b.T
+            root = root.reshape(*root.shape[:2], *cross.shape[:2]).transpose(0, 2, 3, 1)
+            mean = (a.T @ u - fitted @ b.T).reshape(len(one), *cross.shape[:2])
+            parts.append((mean, known - root @ np.swapaxes(root, 2, 3)))
+        means, information = (np.concatenate(part) for part in zip(*parts, strict=True))
+        return means, information
 
     def deviation(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, moments: FloatArray
@@ -324,12 +331,9 @@ class LifeLikelihood:
         unit = float(grid.deviation[k]) ** 2 / data.now
         shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)
         cross = shared[:, None] * data.sensitivity[data.mode_of].T
-        n, (n_moments, p, _) = x.shape[0], cross.shape
-        means, covs = np.empty((n, n_moments, p)), np.empty((n, n_moments, p, p))
-        for i, own in enumerate(cross):
-            means[:, i], known = self.conditional(grid, k, map_std, x, own)
-            covs[:, i] = unit * max(moments[i], 0.0) * np.diag(data.free) - known
-        return means, covs
+        mean, known = self.conditional(grid, k, map_std, x, cross)
+        variance = unit * np.maximum(moments, 0.0)[:, None, None]
+        return mean, variance * np.diag(data.free) - known
 
     def lone_drift(
         self, grid: Grid, k: int, map_std: float, x: FloatArray
@@ -341,8 +345,8 @@ class LifeLikelihood:
         data, variance = self.data, constants.LONE_STD**2
         kernel = lone_kernel(np.array([data.now]), data.clock[data.log_of], data.now)
         cross = variance * kernel * (data.mode_of == grid.lone[k])
-        mean, known = self.conditional(grid, k, map_std, x, cross)
-        return mean[:, 0], np.maximum(variance - known[:, 0, 0], 0.0)
+        mean, known = self.conditional(grid, k, map_std, x, cross[None])
+        return mean[:, 0, 0], np.maximum(variance - known[:, 0, 0, 0], 0.0)
 
     def _residuals(self, grid: Grid, x: FloatArray) -> FloatArray:
         """Return the rows V of map errors of 1, and last the whitened residuals r.
@@ -351,14 +355,15 @@ class LifeLikelihood:
         """
         drift = np.moveaxis(drifts(self.data, x), 1, 2)
         n_modes, n, n_paths, n_nodes = drift.shape
-        white = drift.reshape(n_modes, -1, n_nodes) @ grid.design
-        white = white.reshape(-1, n_modes, n, n_paths, grid.target.shape[1])
-        p = n_paths - 1
-        rows = np.empty((white.shape[0], n, n_modes * p + 1, white.shape[4]))
+        (n_points, n_rows), p = grid.target.shape, n_paths - 1
+        rows = np.zeros((n_points, n, n_modes * p + 1, n_rows))
         rows[:, :, -1] = grid.target[:, None]
         for k in range(n_modes):
-            rows[:, :, k * p : (k + 1) * p] = white[:, k, :, 1:]
-            rows[:, :, -1] -= white[:, k, :, 0]
+            filled = slice((k + 1) * n_nodes)  # R is upper triangular
+            white = drift[k].reshape(-1, n_nodes) @ grid.design[:, k, :, filled]
+            white = white.reshape(n_points, n, n_paths, -1)
+            rows[:, :, k * p : (k + 1) * p, filled] = white[:, :, 1:]
+            rows[:, :, -1, filled] -= white[:, :, 0]
         return rows
 
 
@@ -393,7 +398,7 @@ def _reduced(
     """Return L⁻¹ y, and Q and R of L⁻¹ W for the nodes of all modes."""
     own = data.mode_of[:, None] == np.arange(len(data.modes))
     shapes = own[:, :, None] * basis.weights[data.log_of][:, None]
-    columns = np.column_stack([shapes.reshape(data.rows.size, -1), data.y])
+    columns = np.column_stack([shapes.reshape(data.y.size, -1), data.y])
     both = solve_triangular(factor, columns, lower=True)
     q, r = np.linalg.qr(both[:, :-1])
     return both[:, -1], q, r
@@ -419,6 +424,113 @@ def expected_scatter(scatter: ScatterPrior) -> tuple[float, float, float]:
     )
 
 
-def expected_squares(weights: tuple[float, ...]) -> float:
-    """Return the prior mean of the variance of the deviation from a law over the history."""
-    return float(np.average(np.square(constants.DEVIATION_STDS), weights=weights))
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeDensity:
+    """Log posterior density of the coordinates of one scenario, averaged over a grid."""
+
+    likelihood: LifeLikelihood
+    scenario: Scenario
+    grid: Grid
+
+    def log_probability(self, y: FloatArray) -> FloatArray:
+        """Return the log posterior density, -inf outside the map, shape ``(n,)``.
+
+        Its integral is the evidence of the scenario up to a factor that all scenarios share.
+        """
+        total = self.scenario.log_prior(y)
+        possible = np.isfinite(total)
+        x, within = self.likelihood.path(self.scenario, y[possible])
+        total[possible] = np.where(within, total[possible], -np.inf)
+        if within.any():
+            terms = self.likelihood.terms(self.grid, x)
+            total[np.isfinite(total)] += log_sum_exp(terms.reshape(-1, terms.shape[2]))
+        return total
+
+    def point_weights(self, y: FloatArray) -> FloatArray:
+        """Return the probability of map errors and grid points, ``(n_map_errors, n_points, n)``.
+
+        At coordinates, of which those outside the map are left out.
+        """
+        x, inside = self.likelihood.path(self.scenario, y[np.isfinite(self.scenario.log_prior(y))])
+        if not inside.any():
+            name = self.likelihood.data.stage.name
+            raise NotEnoughData(f"{name}: no life of the prior stays inside the map")
+        return np.asarray(softmax(self.likelihood.terms(self.grid, x), axis=(0, 1)))
+
+    def weights(self, y: FloatArray) -> FloatArray:
+        """Return the probability of each grid point, averaged over coordinates, ``(n_points,)``."""
+        return np.asarray(self.point_weights(y).sum(axis=0).mean(axis=1))
+
+    def narrowed(self, y: FloatArray) -> Self:
+        """Drop grid points with together a negligible share of the posterior at coordinates."""
+        return replace(self, grid=self.grid[kept_weights(self.weights(y), _NEGLIGIBLE)])
+
+    def settings(self, y: FloatArray) -> FloatArray:
+        """Return means at coordinates of walk, noise scale, deviation, χ², and its freedom.
+
+        χ² is that at the mean of the coordinates. Its degrees of freedom are the data less all that
+        they determine: intercepts, coefficients, and coordinates.
+        """
+        weight, grid = self.point_weights(y).mean(axis=2), self.grid
+        centre = y.mean(axis=0, keepdims=True)
+        possible = np.isfinite(self.scenario.log_prior(centre))
+        x, inside = self.likelihood.path(self.scenario, centre[possible])
+        if not inside.any():
+            x, _ = self.likelihood.path(self.scenario, y[:1])
+        chi_square = float(np.sum(weight * self.likelihood.quadratic(grid, x)[0][:, :, 0]))
+        means = np.stack([grid.walk, grid.noise_scale, grid.deviation, grid.freedom])
+        walk, noise, deviation, freedom = means @ weight.sum(axis=0)
+        freedom = max(freedom - self.scenario.n_dim, 1.0)
+        return np.array([walk, noise, deviation, chi_square, freedom])
+
+    def draw_nuisances(
+        self, y: FloatArray, rng: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Draw a map error and a grid point for coordinates inside the support, ``(n,)`` each."""
+        # Without coordinates all draws are of one life.
+        one = y[:1] if not self.scenario.n_dim else y
+        weight = self.point_weights(one)
+        upto = np.cumsum(weight.reshape(-1, one.shape[0]), axis=0)
+        chosen = (upto < rng.uniform(size=y.shape[0])).sum(axis=0).clip(max=upto.shape[0] - 1)
+        return np.divmod(chosen, weight.shape[1])
+
+    def deviations(
+        self, y: FloatArray, nuisances: Nuisances, moments: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Draw the deviation of ln health from its laws at moments in m since the baseline.
+
+        For coordinates ``(n, n_dim)`` inside the support and their nuisances: ``(n, n_moments,
+        n_parameters)``, independent from moment to moment.
+        """
+        free = self.likelihood.data.free
+        off = np.zeros((y.shape[0], moments.size, free.size))
+        for own, map_std, k, x in self.by_nuisances(y, nuisances):
+            if self.grid.deviation[k] > 0:
+                mean, cov = self.likelihood.deviation(self.grid, k, map_std, x, moments)
+                # A variance of 0 may be rounded to below 0.
+                least = 1e-15 * np.eye(cov.shape[-1])
+                unit = rng.standard_normal((own.size, *mean.shape[1:], 1))
+                off[own] = mean + (np.linalg.cholesky(cov + least) @ unit)[..., 0]
+        return off * free
+
+    def by_nuisances(
+        self, y: FloatArray, nuisances: Nuisances
+    ) -> Iterator[tuple[np.ndarray, float, int, FloatArray]]:
+        """Yield the draws of each map error and grid point, for coordinates as `deviations`.
+
+        Their indices, the standard deviation of the map error, the index of the grid point, and ln
+        parameters at the nodes, of a single life where there are no coordinates.
+        """
+        x, _ = self.likelihood.path(self.scenario, y if self.scenario.n_dim else y[:1])
+        for error, k in np.unique(np.column_stack(nuisances), axis=0).tolist():
+            own = np.flatnonzero((nuisances[0] == error) & (nuisances[1] == k))
+            map_std = self.likelihood.data.stage.map_errors[error][0]
+            yield own, map_std, k, x[own] if self.scenario.n_dim else x
+
+
+def kept_weights(weight: FloatArray, loss: float) -> BoolArray:
+    """Mark the largest weights ``(n,)``, all but those that sum to less than the loss."""
+    order = np.argsort(weight)
+    kept = np.ones(weight.size, dtype=bool)
+    kept[order[np.cumsum(weight[order]) < loss]] = False
+    return kept

@@ -10,7 +10,7 @@ from scipy.optimize import brentq
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
 from lmshealth.life.constants import STEP_PROBABILITY
-from lmshealth.life.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
+from lmshealth.life.posterior.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
 from lmshealth.stage.degradation_laws import AnyLaw, Free, HertzWear, Linear, Loosening, Unchanging
 from lmshealth.stage.description import ParameterSpec
 from lmshealth.stage.priors import Lognormal, Normal, Uniform

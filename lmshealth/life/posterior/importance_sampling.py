@@ -75,12 +75,16 @@ def importance_sample(
     few = max(200, n // 4)
     for k in range(_MAX_ROUNDS):
         log_weight = log_probability(points) - proposal
-        if k >= _HOPELESS and log_weight.max() < least:
+        draws = _weighted(points, log_weight)
+        is_good = draws.ess >= _GOOD_SHARE * few and points is not start
+        is_hopeless = k >= _HOPELESS and log_weight.max() < least
+        # Enough draws to place kernels by: some are left of a density that most of them miss.
+        wanted = min(_LEAST_PER_DIMENSION * points.shape[1], 0.3 * draws.weight.size)
+        draws = tempered(points, log_weight, wanted)
+        if is_good or is_hopeless or k == _MAX_ROUNDS - 1:
             break
-        if _weighted(points, log_weight).ess >= _GOOD_SHARE * few and points is not start:
-            break
-        points, proposal = _propose(_adapted(points, log_weight), rng, few)
-    return _drawn_near(log_probability, _adapted(points, log_weight), rng, n)
+        points, proposal = _propose(draws, rng, few)
+    return _drawn_near(log_probability, draws, rng, n)
 
 
 def importance_sample_again(
@@ -132,18 +136,16 @@ def tempered(points: FloatArray, log_weight: FloatArray, min_ess: float) -> Weig
     The power is at most 1; a log weight of -inf drops its point.
     """
     draws = _weighted(points, log_weight)
+    if draws.ess >= min_ess:
+        return draws
     low, high = 0.0, 1.0
-    for _ in range(25 if draws.ess < min_ess else 0):
-        middle = (low + high) / 2
-        draws = _weighted(points, middle * log_weight)
-        low, high = (middle, high) if draws.ess >= min_ess else (low, middle)
-    return draws
-
-
-def _adapted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
-    n_inside = np.isfinite(log_weight).sum()
-    wanted = _LEAST_PER_DIMENSION * points.shape[1]
-    return tempered(points, log_weight, min(wanted, 0.3 * n_inside))
+    relative = log_weight[np.isfinite(log_weight)] - log_weight.max()
+    for _ in range(25):
+        power = (low + high) / 2
+        weight = np.exp(power * relative)
+        enough = weight.sum() ** 2 >= min_ess * (weight @ weight)
+        low, high = (power, high) if enough else (low, power)
+    return _weighted(points, power * log_weight)
 
 
 def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
@@ -153,8 +155,18 @@ def _weighted(points: FloatArray, log_weight: FloatArray) -> WeightedDraws:
             "no draw of the prior lies inside the modal map: widen the map or the prior", points
         )
     kept = log_weight[inside]
-    total = float(np.logaddexp.reduce(kept))
+    total = float(log_sum_exp(kept))
     return WeightedDraws(points[inside], np.exp(kept - total), total - np.log(log_weight.size))
+
+
+def log_sum_exp(values: FloatArray, axis: int = 0) -> FloatArray:
+    """Return ln of the sum of exponentials of finite values along an axis.
+
+    As scipy's logsumexp, at a fraction of its time for so few values.
+    """
+    largest = values.max(axis=axis, keepdims=True)
+    total = np.log(np.exp(values - largest).sum(axis=axis))
+    return np.asarray(total + largest.squeeze(axis))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -203,10 +215,15 @@ class Proposal(ReadOnly):
         )
         square = (unit**2).sum(1)[:, None] + (whitened**2).sum(1) - 2 * unit @ whitened.T
         of_kernel = _log_t(np.maximum(square, 0), self.width, d)
-        kernels = np.logaddexp.reduce(of_kernel, axis=1) - np.log(_N_KERNELS)
+        kernels = log_sum_exp(of_kernel, axis=1) - np.log(_N_KERNELS)
         about_all = _log_t((unit**2).sum(1), _WHOLE_WIDTH, d)
         total = np.logaddexp(kernels + np.log1p(-_WHOLE_SHARE), about_all + np.log(_WHOLE_SHARE))
         return np.asarray(total - np.sum(np.log(np.diag(self.factor))))
+
+    def move(self, points: FloatArray, rng: Any) -> tuple[FloatArray, FloatArray]:
+        """Propose points whatever the present ones are, with the log ratio that emcee asks for."""
+        proposed = self.draw(rng, len(points))
+        return proposed, self.log_density(points) - self.log_density(proposed)
 
 
 def _propose(

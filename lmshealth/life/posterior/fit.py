@@ -14,18 +14,18 @@ from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth._private.seeds import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.data import LifeData
-from lmshealth.life.density import LifeDensity, Nuisances
-from lmshealth.life.ensemble_sampling import Sample, sample, thin
-from lmshealth.life.exploration import Explored, LifeStart, explore, log_probability
-from lmshealth.life.likelihood import (
+from lmshealth.life.posterior.data import LifeData
+from lmshealth.life.posterior.ensemble_sampling import Sample, sample, thin
+from lmshealth.life.posterior.exploration import Explored, LifeStart, explore, log_probability
+from lmshealth.life.posterior.likelihood import (
     NO_MODE,
+    LifeDensity,
     LifeLikelihood,
-    expected_squares,
+    Nuisances,
     ln_health,
     scatter_prior,
 )
-from lmshealth.life.scenarios import Scenario
+from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
 
 _STEP = 1 << 20  # of the random stream
 _N_SETTINGS, _N_LONE, _N_PRIOR = 500, 50, 2000
+_N_KEPT = constants.N_DRAWS // constants.N_ENSEMBLES  # draws of each ensemble
 _NONE = np.zeros(0, dtype=int)
 _CHECKS = ("ess_bulk", "ess_tail", "r_hat")
 
@@ -67,6 +68,18 @@ class ScenarioPosterior:
     def mixture_draws(self) -> FloatArray:
         """Coordinates in the mixture of all scenarios, ``(n_ensembles n_mixture_draws, n_dim)``."""
         return np.concatenate(thin(self.sample.draws, self.n_mixture_draws))
+
+    @property
+    def some_draws(self) -> FloatArray:
+        """About 500 of `mixture_draws`, for averages over their nuisances."""
+        return self.mixture_draws[:: max(1, len(self.mixture_draws) // _N_SETTINGS)]
+
+    def health_by_laws(self, moments: FloatArray) -> FloatArray:
+        """Return health in the mixture at moments in m since the baseline, without deviations.
+
+        Fractions of the baseline, ``(n_ensembles n_mixture_draws, n_moments, n_parameters)``.
+        """
+        return self.scenario.health(self.scenario.natural(self.mixture_draws), moments)
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,9 +162,8 @@ class LifePosterior:
         """
         parts = []
         for one in self.scenarios:
-            y = one.mixture_draws
-            off = one.density.deviations(y, one.nuisances, moments, rng)
-            health = one.scenario.health(one.scenario.natural(y), moments) * np.exp(off)
+            off = one.density.deviations(one.mixture_draws, one.nuisances, moments, rng)
+            health = one.health_by_laws(moments) * np.exp(off)
             shape = (self.health.shape[0], one.n_mixture_draws, *health.shape[1:])
             parts.append(health.reshape(shape))
         return np.moveaxis(np.concatenate(parts, axis=1), 2, 0)
@@ -162,7 +174,8 @@ class LifePosterior:
         Of lives that stay inside the map, with deviations from their laws.
         """
         data = self.data
-        spread = expected_squares(scatter_prior(data.stage).deviation)
+        chances = scatter_prior(data.stage).deviation
+        spread = np.average(np.square(constants.DEVIATION_STDS), weights=chances)
         scenarios = data.scenarios
         weights = np.array([one.weight for one in scenarios])
         sizes = np.ceil(_N_PRIOR * weights / weights.sum()).astype(int).tolist()
@@ -283,7 +296,6 @@ def fit_life(
     mount_stiffness: 87%
     """
     likelihood = LifeLikelihood.of(history, stage, min_logs)
-    n_kept = constants.N_DRAWS // constants.N_ENSEMBLES
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
         # Updates one after the other must not repeat their random numbers.
@@ -296,20 +308,18 @@ def fit_life(
             if before is None:
                 raise
             return fit_life(history, stage, seed, chains=chains, min_logs=min_logs)
-        drawn = _sampled_scenarios(weighted, seeds[1], n_kept, np.inf)
-        scenarios, judge = drawn, np.full((2, len(stage.parameters)), np.nan)
+        # Where chains follow, importance sampling is only compared with them.
+        scenarios = _sampled_scenarios(weighted, seeds[1], by_chains=False, compared=chains)
+        judge, now = np.full((2, len(stage.parameters)), np.nan), np.array([likelihood.data.now])
         if chains:
-            least = constants.MIN_CHAIN_PROBABILITY
-            scenarios = _sampled_scenarios(weighted, seeds[1], n_kept, least)
-            judge = _change(likelihood, drawn, scenarios)
-        rng, now = np.random.default_rng(off_seed), np.array([likelihood.data.now])
+            drawn, scenarios = scenarios, _sampled_scenarios(weighted, seeds[1], by_chains=True)
+            judge = _change(drawn, scenarios, now)
+        rng = np.random.default_rng(off_seed)
         draws = [_drawn_now(one, now, rng) for one in scenarios]
-        some = [one.mixture_draws for one in scenarios]
-        some = [y[:: max(1, y.shape[0] // _N_SETTINGS)] for y in some]
-        settings = [one.density.settings(y) for one, y in zip(scenarios, some, strict=True)]
+        settings = [one.density.settings(one.some_draws) for one in scenarios]
         lone_modes = _lone_modes(likelihood, scenarios)
     health, off, rate, lone = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
-    share = np.array([one.n_mixture_draws for one in scenarios]) / n_kept
+    share = np.array([one.n_mixture_draws for one in scenarios]) / _N_KEPT
     means = (float(value) for value in share @ np.array(settings))
     walk, noise_scale, deviation, chi_square, freedom = means
     return LifePosterior(
@@ -338,29 +348,23 @@ def _drawn_now(
     one: ScenarioPosterior, now: FloatArray, rng: np.random.Generator
 ) -> list[np.ndarray]:
     """Return health, off, rate and lone mode of the draws of a scenario, as `LifePosterior`."""
-    y, density, (_, point) = one.mixture_draws, one.density, one.nuisances
-    off = density.deviations(y, one.nuisances, now, rng)[:, 0]
-    by_law = one.scenario.health(one.scenario.natural(y), now)[:, 0]
+    density, (_, point) = one.density, one.nuisances
+    off = density.deviations(one.mixture_draws, one.nuisances, now, rng)[:, 0]
     rate = density.grid.deviation[point, None] ** 2 / now * density.likelihood.data.free
-    columns = (by_law * np.exp(off), off, rate, density.grid.lone[point, None])
+    health = one.health_by_laws(now)[:, 0] * np.exp(off)
+    columns = (health, off, rate, density.grid.lone[point, None])
     shape = (constants.N_ENSEMBLES, one.n_mixture_draws, -1)
     return [part.reshape(shape) for part in columns]
 
 
 def _change(
-    likelihood: LifeLikelihood,
-    before: Sequence[ScenarioPosterior],
-    after: Sequence[ScenarioPosterior],
+    before: Sequence[ScenarioPosterior], after: Sequence[ScenarioPosterior], now: FloatArray
 ) -> FloatArray:
     """Return shift and ratio of ln health now, by the laws, as in `LifePosterior`, ``(2, p)``."""
-    now, quantiles = np.array([likelihood.data.now]), []
+    quantiles = []
     for scenarios in (before, after):
-        health = [
-            one.scenario.health(one.scenario.natural(one.mixture_draws), now)[:, 0]
-            for one in scenarios
-        ]
         with np.errstate(divide="ignore"):
-            x = np.log(np.concatenate(health))
+            x = np.log(np.concatenate([one.health_by_laws(now)[:, 0] for one in scenarios]))
         quantiles.append(np.quantile(x, (0.05, 0.5, 0.95), axis=0))
     (low, middle, high), other = quantiles
     width = np.where(high > low, high - low, np.nan)
@@ -375,16 +379,13 @@ def _lone_modes(
     data, sums = likelihood.data, np.zeros((len(likelihood.data.modes), 3))
     total = sum(one.nuisances[1].size for one in scenarios)
     for one in scenarios:
-        y, grid = one.mixture_draws, one.density.grid
-        for error, k in np.unique(np.column_stack(one.nuisances), axis=0).tolist():
-            own = np.flatnonzero((one.nuisances[0] == error) & (one.nuisances[1] == k))
-            if grid.lone[k] == NO_MODE:
-                continue
-            some = y[own[:: own.size // _N_LONE + 1]] if one.scenario.n_dim else y[:1]
-            x, _ = likelihood.path(one.scenario, some)
-            mean, variance = likelihood.lone_drift(grid, k, data.stage.map_errors[error][0], x)
-            moments = 1.0, mean.mean(), np.mean(variance + mean**2)
-            sums[grid.lone[k]] += own.size / total * np.array(moments)
+        grid = one.density.grid
+        for own, map_std, k, x in one.density.by_nuisances(one.mixture_draws, one.nuisances):
+            if grid.lone[k] != NO_MODE:
+                some = x[:: own.size // _N_LONE + 1]
+                mean, variance = likelihood.lone_drift(grid, k, map_std, some)
+                moments = 1.0, mean.mean(), np.mean(variance + mean**2)
+                sums[grid.lone[k]] += own.size / total * np.array(moments)
     found = []
     for mode, (share, first, second) in zip(data.modes, sums, strict=True):
         if share:
@@ -397,16 +398,20 @@ def _lone_modes(
 def _sampled_scenarios(
     found: Sequence[Explored],
     seed: np.random.SeedSequence,
-    n_kept: int,
-    min_chain_probability: float,
+    *,
+    by_chains: bool,
+    compared: bool = False,
 ) -> tuple[ScenarioPosterior, ...]:
-    """Sample the probable scenarios, and divide the draws of the mixture among them."""
+    """Sample the probable scenarios, and divide the draws of the mixture among them.
+
+    Draws that are only to be `compared` get no nuisances.
+    """
     probability = softmax([log_probability(one) for one in found])
     least = constants.MIN_PROBABILITY
     order = [k for k in np.argsort(-probability) if probability[k] >= least]
     kept = probability[order] / probability[order].sum()
     # Rounded so that they add up.
-    shares = np.diff(np.round(np.cumsum(kept) * n_kept), prepend=0).astype(int)
+    shares = np.diff(np.round(np.cumsum(kept) * _N_KEPT), prepend=0).astype(int)
     seeds = seed.spawn(len(found))
     sampled = []
     for k, share, own in zip(order, shares, kept, strict=True):
@@ -414,21 +419,22 @@ def _sampled_scenarios(
         n_dim = density.scenario.n_dim
         chain_seed, draw_seed = seeds[k].spawn(2)
         rng = np.random.default_rng(draw_seed)
-        if n_dim and own >= min_chain_probability:
+        if by_chains and n_dim and own >= constants.MIN_CHAIN_PROBABILITY:
             draws = sample(density.log_probability, weighted, chain_seed)
         else:
-            y = weighted.resampled(rng, constants.N_ENSEMBLES * n_kept)
+            y = weighted.resampled(rng, constants.N_DRAWS)
             ess, unknown = np.full(n_dim, weighted.ess), np.full(n_dim, np.nan)
-            draws = Sample(y.reshape(constants.N_ENSEMBLES, n_kept, n_dim), ess, ess, unknown)
-        kept_draws = thin(draws.draws, n_kept)
+            draws = Sample(y.reshape(constants.N_ENSEMBLES, _N_KEPT, n_dim), ess, ess, unknown)
+        kept_draws = thin(draws.draws, _N_KEPT)
         mixed = np.concatenate(thin(kept_draws, int(share)))
+        is_mixed = share and not compared
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
             evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
             sample=replace(draws, draws=kept_draws),
             n_mixture_draws=int(share),
-            nuisances=density.draw_nuisances(mixed, rng) if share else (_NONE, _NONE),
+            nuisances=density.draw_nuisances(mixed, rng) if is_mixed else (_NONE, _NONE),
         )
         sampled.append(one)
     return tuple(sampled)

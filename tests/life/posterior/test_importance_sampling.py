@@ -11,7 +11,7 @@ from scipy import stats
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.importance_sampling import (
+from lmshealth.life.posterior.importance_sampling import (
     Proposal,
     WeightedDraws,
     importance_sample,

@@ -1,0 +1,1 @@
+"""Posterior of the life of a machine: scenarios, data, likelihood, sampling, and their mixture."""
