@@ -245,19 +245,18 @@ class Named:
     def _refuse(self, target: Target, rejected: dict[str, Refusal], modes: Modes) -> Refusal:
         """Return why a described mode is not published."""
         given = {name: own for own, name in self.names.items()}
-        near = [
-            row
-            for row in rejected.values()
-            if row.frequency is not None and is_near(target, row.frequency)
-        ]
         if (own := rejected.get(given.get(target.name, ""))) is not None:
             return replace(own, mode=target.name)
         if target.name in self.ambiguous:
             reason, detail, _ = self.ambiguous[target.name]
             return Refusal(self.log, reason, detail, mode=target.name)
+        near = [
+            (abs(np.log(row.frequency / target.frequency)), row)
+            for row in rejected.values()
+            if row.frequency is not None and is_near(target, row.frequency)
+        ]
         if near:
-            closest = min(near, key=lambda row: abs(np.log(row.frequency / target.frequency)))
-            return replace(closest, mode=target.name)
+            return replace(min(near, key=lambda one: one[0])[1], mode=target.name)
         f = target.frequency
         there = [x for x in modes.frequency.tolist() if is_near(target, x)]
         detail = f"no resonance near {f:.4g} Hz in any channel; excite it more or record longer"

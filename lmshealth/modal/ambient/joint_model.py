@@ -141,7 +141,7 @@ class JointModel:
         squares = self.data.count[:, None] * (ratio - 1) ** 2
         scatter = np.median(squares, axis=0) / _MEDIAN_SQUARE
         level = self.data.count @ ratio / self.data.count.sum()
-        return np.where(level < _LITTLE, np.minimum(scatter, 1.0), scatter)
+        return np.asarray(np.where(level < _LITTLE, np.minimum(scatter, 1.0), scatter))
 
     @cached_property
     def misfit(self) -> float:

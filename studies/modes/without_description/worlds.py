@@ -53,7 +53,7 @@ class World:
 
 
 @dataclass(frozen=True, slots=True)
-class _Machine:
+class Machine:
     """What is drawn of a machine before it is recorded."""
 
     frequency: Array
@@ -73,11 +73,11 @@ def four_modes(rng: np.random.Generator) -> World:
     """Draw a stage: four modes about 117 to 148 Hz, two accelerometers and a following error."""
     f = np.array([117.0, 126.0, 137.0, 148.0]) * (1 + 0.015 * rng.uniform(-1, 1, 4))
     zeta = rng.uniform(0.006, 0.02, 4)
-    machine = _Machine(
-        f, zeta, np.full(4, 1e4) * 10 ** rng.uniform(-0.5, 0.5, 4), _shapes(rng, 3, 4),
+    machine = Machine(
+        f, zeta, np.full(4, 1e4) * 10 ** rng.uniform(-0.5, 0.5, 4), shapes_of(rng, 3, 4),
         displacements=1, band=(100.0, 170.0),
     )  # fmt: skip
-    return _record(rng, "four modes", machine, 1000.0, 20.0)
+    return record(rng, "four modes", machine, 1000.0, 20.0)
 
 
 def varied(rng: np.random.Generator) -> World:
@@ -91,17 +91,17 @@ def varied(rng: np.random.Generator) -> World:
         mean_width = (zeta[k - 1] + zeta[k]) * f[-1]
         apart = rng.uniform(1.0, 2.0) if close == k - 1 else rng.uniform(4.0, 10.0)
         f.append(f[-1] + apart * mean_width)
-    shapes = _shapes(rng, n_channels, n_modes)
+    shapes = shapes_of(rng, n_channels, n_modes)
     if close is not None:
-        shapes[:, close + 1] = _apart(rng, shapes[:, close])
-    machine = _Machine(
+        shapes[:, close + 1] = shapes_apart(rng, shapes[:, close])
+    machine = Machine(
         np.array(f), zeta, 10 ** rng.uniform(2.5, 4.5, n_modes), shapes,
         floor_slope=float(rng.uniform(0, 2)), shared=float(rng.uniform(0, 0.7)),
         steady=(50.0, 100.0) if rng.random() < 0.5 else (),
         displacements=int(n_channels > 1 and rng.random() < 0.3),
         band=(f[0] / 1.25, 1.2 * f[-1]),
     )  # fmt: skip
-    return _record(rng, "varied", machine, 1000.0, float(np.exp(rng.uniform(*np.log([20, 120])))))
+    return record(rng, "varied", machine, 1000.0, float(np.exp(rng.uniform(*np.log([20, 120])))))
 
 
 def eight_modes(rng: np.random.Generator) -> World:
@@ -115,29 +115,29 @@ def eight_modes(rng: np.random.Generator) -> World:
     strength = 10 ** rng.uniform(2.5, 4.0, 8)
     weak = int(rng.choice([k for k in range(1, 7) if k not in (pair, pair + 1)]))
     strength[weak] = 0.01 * np.sqrt(strength[weak - 1] * strength[weak + 1])
-    shapes = _shapes(rng, 6, 8)
-    shapes[:, pair + 1] = _apart(rng, shapes[:, pair])
-    base = _free_place(rng, f, zeta, 10.0, 40.0)
-    machine = _Machine(
+    shapes = shapes_of(rng, 6, 8)
+    shapes[:, pair + 1] = shapes_apart(rng, shapes[:, pair])
+    base = free_place(rng, f, zeta, 10.0, 40.0)
+    machine = Machine(
         f, zeta, strength.clip(30.0), shapes, floor_slope=float(rng.uniform(0, 2)),
-        steady=(_free_place(rng, f, zeta, 8.0, 20.0), _free_place(rng, f, zeta, 20.0, 44.0)),
+        steady=(free_place(rng, f, zeta, 8.0, 20.0), free_place(rng, f, zeta, 20.0, 44.0)),
         wandering=(base,), band=(4.0, 48.0), harmonic_level=float(10 ** rng.uniform(-1, 0.5)),
     )  # fmt: skip
-    return _record(
+    return record(
         rng, "eight modes", machine, 128.0, float(np.exp(rng.uniform(*np.log([150, 600]))))
     )
 
 
 def turbine(rng: np.random.Generator) -> World:
     """Draw the first mode of a tower at low frequency, and a rotor harmonic that wanders."""
-    shapes = _shapes(rng, 8, 1)
+    shapes = shapes_of(rng, 8, 1)
     shapes[6:] *= 0.03
-    machine = _Machine(
+    machine = Machine(
         np.array([rng.uniform(0.35, 0.4)]), rng.uniform(0.008, 0.02, 1),
         10 ** rng.uniform(2.3, 2.6, 1), shapes, floor_slope=1.0, band=(0.2, 1.5),
         wandering=(float(rng.uniform(0.75, 0.85)),), harmonic_level=float(rng.uniform(0.3, 3.0)),
     )  # fmt: skip
-    return _record(rng, "turbine", machine, 30.0, 600.0)
+    return record(rng, "turbine", machine, 30.0, 600.0)
 
 
 FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
@@ -148,21 +148,21 @@ FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
 }
 
 
-def _shapes(rng: np.random.Generator, n_channels: int, n_modes: int) -> Array:
+def shapes_of(rng: np.random.Generator, n_channels: int, n_modes: int) -> Array:
     shapes = rng.choice([-1.0, 1.0], (n_channels, n_modes))
     shapes *= 10 ** rng.uniform(-1, 0, (n_channels, n_modes))
     return np.asarray(shapes / np.abs(shapes).max(axis=0))
 
 
-def _apart(rng: np.random.Generator, shape: Array) -> Array:
+def shapes_apart(rng: np.random.Generator, shape: Array) -> Array:
     """Draw a shape whose modal assurance criterion with another one is below 0.3."""
     while True:
-        other = _shapes(rng, shape.size, 1)[:, 0]
+        other = shapes_of(rng, shape.size, 1)[:, 0]
         if (shape @ other) ** 2 < 0.3 * (shape @ shape) * (other @ other):
             return other
 
 
-def _free_place(rng: np.random.Generator, f: Array, zeta: Array, low: float, high: float) -> float:
+def free_place(rng: np.random.Generator, f: Array, zeta: Array, low: float, high: float) -> float:
     """Draw a frequency at least four half-power bandwidths and 4 % from all modes."""
     while True:
         place = float(rng.uniform(low, high))
@@ -170,8 +170,8 @@ def _free_place(rng: np.random.Generator, f: Array, zeta: Array, low: float, hig
             return place
 
 
-def _record(
-    rng: np.random.Generator, family: str, machine: _Machine, rate: float, seconds: float
+def record(
+    rng: np.random.Generator, family: str, machine: Machine, rate: float, seconds: float
 ) -> World:
     """Record a machine with floors of unit PSD in the middle of its band (accelerations)."""
     n = round(seconds * rate)
@@ -189,7 +189,7 @@ def _record(
     displacement, acceleration = np.stack(response, axis=1)
     samples = machine.shapes @ acceleration
     for c in range(n_channels):
-        samples[c] += _coloured(rng, n, rate, centre, machine.floor_slope)
+        samples[c] += coloured(rng, n, rate, centre, machine.floor_slope)
     for c in range(machine.displacements):
         noise = rng.standard_normal(n) * np.sqrt(rate / 2)
         samples[c] = machine.shapes[c] @ displacement + noise / (2 * np.pi * centre) ** 2
@@ -224,7 +224,7 @@ def _oscillate(omega: float, zeta: float, force: Array, rate: float) -> Array:
     return np.stack([lfilter(numerator, denominator, force) for numerator in numerators])
 
 
-def _coloured(rng: np.random.Generator, n: int, rate: float, centre: float, slope: float) -> Array:
+def coloured(rng: np.random.Generator, n: int, rate: float, centre: float, slope: float) -> Array:
     """Draw a floor of unit one-sided PSD at a frequency, f ** -slope above a twentieth of it."""
     spectrum = np.fft.rfft(rng.standard_normal(2 * n) * np.sqrt(rate / 2))
     frequency = np.fft.rfftfreq(2 * n, 1 / rate).clip(centre / 20)
