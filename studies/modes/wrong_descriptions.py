@@ -7,8 +7,8 @@ Method
     with errors of 20 %, and lacks one or two modes, has one mode or all modes shifted by 3 to 8 %,
     or both; a fifth kind is complete and right. A name is wrong if the mode is not within 1.5 % of
     the true frequency of that name; a warning is the flag ``off-description`` or
-    ``doubtful-name``. Control: each described mode takes the nearest resonance in its search, without
-    these flags, which must publish wrong names.
+    ``doubtful-name``. Control: each described mode takes the nearest resonance in its search,
+    without these flags, which must publish wrong names.
 Run time
     Ten minutes on two processors.
 """

@@ -30,11 +30,14 @@ Run time
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 from studies.harness.claims import Claim, counted, number
+from studies.harness.program import Program
 from studies.harness.study import Row, Study
 from studies.life.kinds.answers import HEALTH_ALONE, IMPORTANCE, WITHOUT_CHAINS, answer
-from studies.life.kinds.earlier import Earlier
 from studies.life.kinds.plant import PARAMETERS, map_table
 from studies.life.kinds.scores import scored, summarised
 from studies.life.kinds.worlds import (
@@ -48,6 +51,8 @@ from studies.life.kinds.worlds import (
     life_of,
 )
 
+# The last revision with a posterior of its own at each epoch.
+REVISION = "1811c297"
 # Lives of each kind: rows that the requirements name have a hundred or more.
 LIVES = {
     **dict.fromkeys(WEARING, 36),
@@ -104,6 +109,12 @@ def one(kind: str, number_: int, how: str = IMPORTANCE) -> Row:
     return answer(life_of(kind, number_).logs(), map_table(), number_, how)
 
 
+def one_before(program: Program, kind: str, number_: int, how: str) -> Any:
+    """Answer one life by the code of the control."""
+    logs = life_of(kind, number_).logs()
+    return program.ask({"logs": logs, "map_table": map_table(), "seed": number_, "how": how})
+
+
 def now(study: Study, plan: Mapping[str, int]) -> dict[str, list[Row]]:
     """Answer and score lives of some kinds."""
     tasks = _tasks(plan)
@@ -119,9 +130,9 @@ def earlier(study: Study, plan: Mapping[str, int]) -> dict[str, list[Row]]:
         WITHOUT_CHAINS if kind in WEARING and k % len(SHARES) == old else HEALTH_ALONE
         for kind, k in tasks
     ]
-    with Earlier() as program:
+    with Program(Path(__file__).with_name("answers.py"), REVISION) as program:
         own = [(*task, way) for task, way in zip(tasks, how, strict=True)]
-        found = study.trials.collect(program.answer, own)
+        found = study.trials.collect(partial(one_before, program), own)
     return _scored(tasks, found)
 
 

@@ -135,9 +135,7 @@ def case(kind: str, number: int) -> Case:
     )
 
 
-def _with_more_noise(
-    rng: np.random.Generator, samples: Array, rate: float
-) -> tuple[Array, Array]:
+def _with_more_noise(rng: np.random.Generator, samples: Array, rate: float) -> tuple[Array, Array]:
     """Add floors of other levels and slopes, and one that all channels share; return levels, too.
 
     The level is that at 130 Hz, the bound that of white independent noise of this level.

@@ -149,6 +149,7 @@ FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
 
 
 def shapes_of(rng: np.random.Generator, n_channels: int, n_modes: int) -> Array:
+    """Draw shapes, ``(n_channels, n_modes)``, with a largest component of one."""
     shapes = rng.choice([-1.0, 1.0], (n_channels, n_modes))
     shapes *= 10 ** rng.uniform(-1, 0, (n_channels, n_modes))
     return np.asarray(shapes / np.abs(shapes).max(axis=0))
