@@ -51,6 +51,7 @@ def flat_point(modes: Sequence[Mode], n_channels: int, noise: float = NOISE) -> 
         [
             np.log([mode.frequency for mode in modes]),
             np.log([mode.damping for mode in modes]),
+            np.zeros(len(modes)),
             np.tile([np.log(noise), 0.0, 0.0], n_channels),
             [float(i == j) for i, j in layout.force],
             [modes[i].shape[c] / modes[i].shape[i % n_channels] for c, i in layout.shape],
@@ -86,9 +87,9 @@ def other_point(target: Likelihood, seed: int = 0) -> np.ndarray:
 def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.ndarray:
     """Read the unknowns as documented, and let the oracle turn them into a covariance."""
     m, n = target.layout.n_modes, target.layout.n_channels
-    e, d, b = p[2 * m : 2 * m + 3 * n].reshape(n, 3).T
+    e, d, b = p[3 * m : 3 * (m + n)].reshape(n, 3).T
     u = np.log(frequency / target.centre) / target.spread
-    root, at = np.eye(m + n), 2 * m + 3 * n
+    root, at = np.eye(m + n), 3 * (m + n)
     for i in range(m + n):
         for j in range(i + 1 if i < m else i):
             if n == 1 and i < m and i - j > 1:  # one channel: neighbours alone share forces
@@ -103,7 +104,7 @@ def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.n
     assert at == p.size
     return channel_covariance(
         frequency,
-        resonances=np.exp(p[: 2 * m].reshape(2, m).T),
+        resonances=np.vstack([np.exp(p[: 2 * m].reshape(2, m)), p[2 * m : 3 * m]]).T,
         floors=[np.exp((e[c] + d[c] * u + b[c] * u**2) / 2) for c in range(n)],
         root=root,
         shapes=shapes,

@@ -254,8 +254,7 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
                 "remove_sinusoids",
                 lambda raw, *_: (raw, np.ones(len(raw), dtype=bool), ()),
             )
-            # A search for undescribed resonances would find the mode beside the line.
-            patch.setattr(identification, "shows_more", lambda *_: False)
+            patch.setattr(identification, "find_lines", lambda *_: np.empty((0, 2)))
             left_in = find(values + line)
         assert not left_in.names or moved(left_in, clean) > 1
 
@@ -287,7 +286,10 @@ def test_an_order_sweeping_through_a_mode_moves_it_less_than_its_uncertainty(see
     std = np.sqrt(np.diag(clean.cov))
     assert abs(dirty.ln_frequency[0] - clean.ln_frequency[0]) < std[0]
     assert abs(dirty.ln_damping[0] - clean.ln_damping[0]) < 2 * std[1]
-    assert {line.kind for line in dirty.lines} == {"ball pass"}
+    kinds = [line.kind for line in dirty.lines]
+    assert "ball pass" in kinds
+    # Thomson's test may find one by chance.
+    assert kinds.count("ball pass") >= len(kinds) - 1
 
 
 def test_mains_inside_the_band_of_a_mode_are_named() -> None:

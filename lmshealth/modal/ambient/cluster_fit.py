@@ -1,8 +1,7 @@
 """Joint fit of a cluster of neighbouring modes to all channels of a log.
 
-`bin_cluster` bins the spectra around a cluster, `locate` shifts described modes to their start
-values, and `fit_cluster` screens the modes, masks spectral lines, maximises the posterior, prunes
-modes without evidence, marginalises, and rejects estimates that are not credible.
+`bin_cluster` bins the spectra around a cluster, and `fit_modes` masks spectral lines, maximises the
+posterior, prunes modes without evidence, marginalises, and rejects estimates that are not credible.
 """
 
 from __future__ import annotations
@@ -437,7 +436,7 @@ def _solve(
         sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
         reference[i] = int(amplitude[:, i].argmax())
     scale = amplitude.max(axis=0)
-    layout = lay_out(reference, n_channels, has_static=True)
+    layout = lay_out(reference, n_channels)
     start = np.concatenate(
         [
             np.log([target.frequency for target in targets]),

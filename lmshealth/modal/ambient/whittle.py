@@ -8,7 +8,7 @@ over modes and noise floors. Means W of n ordinates suffice where E is constant 
 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
-Unknowns, in this order: ln f (m), ln ζ (m), e_c, d_c and b_c of each floor, L row by row up to its
+Unknowns, in this order: ln f (m), ln ζ (m), static responses (m), e_c, d_c and b_c of each floor, L row by row up to its
 diagonal (which is one for the floors), the shapes but for the reference channel of each mode, and
 the heights of bumps of the log spectrum of the modal forces, of which there are none at first.
 README.md of this folder derives the model; `marginalise` integrates the nuisance parameters.
@@ -42,13 +42,7 @@ class Layout:
     n_channels: int
     force: tuple[tuple[int, int], ...]  # row and column of each unknown of L
     shape: tuple[tuple[int, int], ...]  # channel and mode of each unknown of the shapes
-    has_static: bool = False  # third unknown of each mode: its static response
     n_bumps: int = 0  # of the log spectrum of the modal forces; their heights are the last unknowns
-
-    @cached_property
-    def _of_modes(self) -> tuple[int, ...]:
-        """Derivatives of h by the unknowns of a mode."""
-        return (1, 2, 3) if self.has_static else (1, 2)
 
     @cached_property
     def n_components(self) -> int:
@@ -57,13 +51,13 @@ class Layout:
 
     @cached_property
     def n_poles(self) -> int:
-        """Number of the unknowns of h, which come first: two per mode, three per floor."""
-        return len(self._of_modes) * self.n_modes + 3 * self.n_channels
+        """Number of the unknowns of h, which come first: three per mode and per floor."""
+        return 3 * self.n_components
 
     @cached_property
     def pole(self) -> list[tuple[int, int]]:
         """Component of each unknown of h, and the index of its derivative of h."""
-        modes = [(i, q) for q in self._of_modes for i in range(self.n_modes)]
+        modes = [(i, q) for q in (1, 2, 3) for i in range(self.n_modes)]
         floors = [(i, q) for i in range(self.n_modes, self.n_components) for q in (1, 2, 3)]
         return modes + floors
 
@@ -92,7 +86,7 @@ class Layout:
     @cached_property
     def statics(self) -> list[int]:
         """Static responses of the modes."""
-        return list(range(2 * self.n_modes, 3 * self.n_modes)) if self.has_static else []
+        return list(range(2 * self.n_modes, 3 * self.n_modes))
 
     @cached_property
     def shapes(self) -> slice:
@@ -122,14 +116,14 @@ class Layout:
         return self.n_poles + len(self.force) + len(self.shape) + self.n_bumps
 
 
-def lay_out(reference: Sequence[int], n_channels: int, *, has_static: bool = False) -> Layout:
+def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
     """Return the places of the unknowns; ``reference`` is the channel in which a shape is one."""
     m = len(reference)
     # A single channel only shows which forces neighbours share.
     modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
     floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
     shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
-    return Layout(m, n_channels, (*modes, *floors), tuple(shape), has_static)
+    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
 
 
 # Index of the second derivatives of h by the indices of the first ones.
@@ -158,7 +152,7 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     """Return the acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
 
     The array has shape ``(10, …, n)``: h, its first derivatives by three unknowns and its second
-    ones (11, 12, 13, 22, 23, 33); modes have no third unknown. With d = 1/h, h_a = -d_a h² and
+    ones (11, 12, 13, 22, 23, 33); the third unknown, the static response, is added by the caller. With d = 1/h, h_a = -d_a h² and
     h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
@@ -207,7 +201,7 @@ class Likelihood:
         return np.concatenate(
             [
                 np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
-                np.full(lay.has_static * lay.n_modes, constants.WIDTHS_STATIC[-1]),
+                np.full(lay.n_modes, constants.WIDTHS_STATIC[-1]),
                 np.tile(constants.PRIOR_FLOOR, lay.n_channels),
                 forces,
                 np.full(len(lay.shape), constants.PRIOR_SHAPE),
@@ -367,9 +361,8 @@ class _Point:
         self._s = np.asarray(self._root @ self._root.T)
         f, zeta = np.exp(p[: 2 * m].reshape(2, m, 1))
         modes = receptance(f, zeta, block.grid)
-        if lay.has_static:
-            modes[0] += p[2 * m : 3 * m, None]
-            modes[3] = 1.0
+        modes[0] += p[2 * m : 3 * m, None]
+        modes[3] = 1.0
         tilts = p[lay.n_poles - 3 * lay.n_channels : lay.n_poles].reshape(-1, 3)
         u = np.log(block.grid / likelihood.centre) / likelihood.spread
         # Responses h of all components and their derivatives, (10, components, grid).

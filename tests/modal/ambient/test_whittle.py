@@ -236,7 +236,7 @@ def test_the_unit_of_a_channel_and_the_phase_of_all_do_not_matter() -> None:
     )
     start = other.start.copy()
     m = 2
-    start[2 * m + 6] += 2 * np.log(1e3)
+    start[3 * m + 6] += 2 * np.log(1e3)
     shapes = start[other.layout.shapes]
     for at, (c, _) in enumerate(other.layout.shape):
         shapes[at] *= unit[c]
@@ -306,7 +306,7 @@ def test_the_maximum_on_scatter_free_data_is_the_truth(m: int, n: int, duration:
     start = exact.start.copy()
     start[:m] += 0.01
     start[m : 2 * m] += 0.3
-    start[2 * m : exact.layout.n_poles : 3] += 0.5
+    start[3 * m : exact.layout.n_poles : 3] += 0.5
     target = replace(exact, start=start, scale=1.2 * exact.scale)
     p = target.minimise(start)
     hessian = target.derivatives(p)[1]
@@ -328,7 +328,7 @@ def test_nonsense_is_infinitely_unlikely_not_an_error() -> None:
     """Unknowns that overflow have the value inf, so that a search turns back."""
     target = noisy(1, 2, 8.0)
     p = target.start.copy()
-    p[2] = 2000.0
+    p[3] = 2000.0
     assert target.value(p) == np.inf
 
 
@@ -420,7 +420,7 @@ def test_every_unknown_has_one_place(m: int, n: int) -> None:
     layout = lay_out([i % n for i in range(m)], n)
     assert len(layout.pole) == layout.n_poles == layout.forces.start
     assert layout.forces.stop == layout.shapes.start
-    assert layout.shapes.stop == layout.size == 2 * m + 3 * n + len(layout.force) + m * (n - 1)
+    assert layout.shapes.stop == layout.size == 3 * (m + n) + len(layout.force) + m * (n - 1)
     assert len(set(layout.pole)) == layout.n_poles
     assert len(set(layout.force)) == len(layout.force)
     assert all(j < i or (j == i < m) for i, j in layout.force)
