@@ -92,9 +92,10 @@ MOST_DAMPING = 0.1
 # estimated separately, and their likelihood is not normal.
 SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
-# not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors.
+# not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors;
+# the level of few of many directions is known from the others: 0.03 would be too sure.
 PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
-PRIOR_FLOOR = (5.0, 2.0, 1.0)
+PRIOR_FLOORS = (5.0, 2.0, 1.0), (0.3, 2.0, 1.0)
 # Standard deviations of priors that are marginalised over these widths, of which the fit uses the
 # last: the share of a floor that is coherent with the modes and with other floors (in units of the
 # floor), its bend, and the static response of a mode over its receptance: 0 where the force acts on

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from scipy.ndimage import binary_dilation, find_objects, label, median_filter
@@ -35,6 +36,9 @@ _COMMON_STEPS, _OWN_STEPS = 41, 15
 # Multiplicative updates to convergence, and enough to rank candidates; their exponent over that
 # for which monotonicity is proved.
 _UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
+# What is foreign is fitted where it is above this share of the noise; least singular value of shapes
+# that are independent.
+_FOREIGN, _INDEPENDENT = 0.3, 1e-3
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
 _COLLAPSED = 0.5
 # Ordinates over which the level near a line is taken, and that it covers to either side.
@@ -65,11 +69,16 @@ class BinnedSpectra:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ClusterData:
-    """Data that a cluster is fitted to: the band of the channels that show any of the modes."""
+    """Data that a cluster is fitted to: the band of the channels that show any of the modes.
 
-    spectra: LogSpectra  # in units of the noise of each channel
+    Of many channels a fit sees the directions in which the modes move, or anything foreign does.
+    """
+
+    whole: LogSpectra  # of the channels, in units of the noise of each
     unit: FloatArray  # root of the noise in (m/s²)/Hz^½, (n_channels,)
-    binned: BinnedSpectra  # in the same units
+    basis: FloatArray  # orthonormal directions that are fitted, (n_channels, n_directions)
+    spectra: LogSpectra  # of the directions
+    binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
 
@@ -299,21 +308,56 @@ def prepare(
     level = binned.level[index]
     noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
     unit = np.sqrt(noise)
-    whiten = np.outer(unit, unit)
-    cut = tuple(s for spectrum in spectra.spectra if (s := spectrum.band(*band)).frequency.size)
-    chosen = replace(spectra, spectra=cut).select(index)
-    scaled = tuple(
-        replace(
-            s,
-            matrix=s.matrix / whiten,
-            foreign=None if s.foreign is None else s.foreign / whiten,
-            transforms=None if s.transforms is None else s.transforms / unit,
+    whole = spectra.select(index).each(partial(_turned, basis=np.diag(1 / unit)))
+    cut = whole.each(lambda spectrum: spectrum.band(*band))
+    cut = replace(cut, spectra=tuple(s for s in cut.spectra if s.frequency.size))
+    moved = [t.amplitude[index] / unit for t in present if t.amplitude is not None]
+    basis = _directions(moved, cut) if len(moved) == len(present) else np.eye(unit.size)
+    if basis.shape[1] < unit.size:
+        names = tuple(f"direction {k}" for k in range(basis.shape[1]))
+        turn = partial(_turned, basis=basis)
+        ours = [replace(one.each(turn), channels=names, sources=(whole.source,) * len(names))
+                for one in (cut, whole)]  # fmt: skip
+        low, high = float(binned.frequency[0]), float(binned.frequency[-1])
+        width = (high - low) / binned.frequency.size
+        chosen, levels = ours[0], bin_spectra(ours[1], low, high, width, binned.neighbours)
+    else:
+        basis, chosen, levels = (
+            np.eye(unit.size),
+            cut,
+            replace(binned, level=level / noise[:, None]),
         )
-        for s in chosen.spectra
+    masks = tuple(s.free for s in chosen.spectra)
+    return ClusterData(cut, unit, basis, chosen, levels, masks, tuple(index))
+
+
+def _turned(spectrum: CrossSpectrum, basis: FloatArray) -> CrossSpectrum:
+    """Return the spectrum of other signals, basisᵀ x of the channels x."""
+    foreign, transforms = spectrum.foreign, spectrum.transforms
+    return replace(
+        spectrum,
+        matrix=basis.T @ spectrum.matrix @ basis,
+        foreign=None if foreign is None else basis.T @ foreign @ basis,
+        transforms=None if transforms is None else transforms @ basis,
     )
-    masks = tuple(s.free for s in scaled)
-    whitened = replace(binned, level=level / noise[:, None])
-    return ClusterData(replace(chosen, spectra=scaled), unit, whitened, masks, tuple(index))
+
+
+def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArray:
+    """Return an orthonormal basis of the shapes of modes and of what is foreign to them.
+
+    Both in units of the noise, in which nothing else distinguishes directions; of what is foreign
+    that which is above a share of the noise.
+    """
+    columns = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
+    foreign = [s.foreign for s in spectra.spectra if s.foreign is not None]
+    if foreign:
+        parts = np.concatenate(foreign).real
+        for vector in np.linalg.eigh(parts.sum(axis=0))[1].T:
+            if np.max(np.einsum("kab,a,b->k", parts, vector, vector)) > _FOREIGN:
+                columns.append(vector)
+    columns = [column / np.linalg.norm(column) for column in columns]
+    u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
+    return np.asarray(u[:, s > _INDEPENDENT])
 
 
 def mask_prominent_lines(data: ClusterData) -> ClusterData:
@@ -355,7 +399,7 @@ def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
 def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
     """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``."""
     n_free = sum(int(mask.sum()) for mask in data.masks)
-    false_alarm = constants.LINE_FALSE_ALARM / (data.unit.size * n_free)
+    false_alarm = constants.LINE_FALSE_ALARM / (data.basis.shape[1] * n_free)
     masks = []
     for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
         highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
@@ -420,7 +464,7 @@ def _solve(
     targets: tuple[Target, ...],
 ) -> _Optimum:
     """Find the posterior mode of a set of modes."""
-    n_channels = data.unit.size
+    n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
     least = np.outer(0.01 * data.binned.level.min(axis=1), 4 * zeta**2)
@@ -430,7 +474,7 @@ def _solve(
     sign = np.ones_like(amplitude)
     for i, target in enumerate(targets):
         assert target.amplitude is not None  # a search states it
-        own = target.amplitude[list(data.index)] / data.unit
+        own = data.basis.T @ (target.amplitude[list(data.index)] / data.unit)
         own = own * np.exp(-1j * np.angle(own[np.abs(own).argmax()]))
         amplitude[:, i] = np.maximum(np.abs(own), np.sqrt(least[:, i]))
         sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
@@ -455,6 +499,7 @@ def _solve(
         scale=np.concatenate([scale, np.ones(n_channels)]),
         centre=float(np.sqrt(low * high)),
         spread=float(np.log(high / low) / 2),
+        known_floors=n_channels < data.unit.size,
         narrowest=_COLLAPSED / data.spectra.spectra[data.longest].duration,
     )
     p = likelihood.minimise(start)
@@ -465,7 +510,7 @@ def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
     """Return the expectation of each spectrum over the band; infinite where it is masked."""
     bandwidth = float(np.min(2 * np.prod(optimum.poles, axis=0)))
     likelihood = replace(optimum.likelihood, blocks=make_blocks(data, bandwidth))
-    masked = np.diag(np.full(data.unit.size, np.inf)).astype(complex)
+    masked = np.diag(np.full(data.basis.shape[1], np.inf)).astype(complex)
     full = [np.tile(masked, (mask.size, 1, 1)) for mask in data.masks]
     for group, values in zip(_groups(data), likelihood.expected(optimum.p), strict=True):
         kept = np.any([data.masks[i] for i in group], axis=0)
@@ -490,12 +535,15 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     spectrum = data.spectra.spectra[data.longest]
     duration = spectrum.duration
     dispersion = _dispersion(*_residual(data, expected), f, zeta)
-    channels, shapes = data.spectra.channels, likelihood.shapes(p).T
+    channels, shapes = data.whole.channels, likelihood.shapes(p).T
+    seen = shapes @ data.basis.T  # in units of the noise, (n_modes, n_channels)
+    clear = ratio if data.basis.shape[1] == data.unit.size else seen.T**2
     observed = data.spectra.spectra, data.masks, expected
     unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
     # Squares of the ordinates near a mode are correlated where its excitation is not steady.
     wider = np.sqrt([max(one.ratio, 1.0) for one in unsteady] * 2)
-    strength = data.unit**2 @ likelihood.strength(p)
+    strength = likelihood.strength(p).sum(axis=0) / np.sum(shapes**2, axis=1)
+    strength = strength * (seen**2 @ data.unit**2)
     each = zip(f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
     flags = tuple(
         _flags(*one, duration, unsteady=force.is_clear)
@@ -503,8 +551,8 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     )
     modes = Modes(
         names=names,
-        sources=(data.spectra.source,) * n,
-        channels=tuple(channels[c] for c in ratio.argmax(axis=0)),
+        sources=(data.whole.source,) * n,
+        channels=tuple(channels[c] for c in clear.argmax(axis=0)),
         ln_frequency=estimate[:n],
         ln_damping=estimate[n:],
         cov=cov,
@@ -513,7 +561,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         excitation=np.sqrt(strength * np.pi * f / (4 * zeta)),
         flags=flags,
         shape_channels=channels,
-        shapes=_unit_shapes(data.unit * shapes),
+        shapes=_unit_shapes(data.unit * seen),
         lines=(),
         refused=(),
     ).widened("unsteady", cov * np.outer(wider, wider))
@@ -525,11 +573,30 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     lines = _excluded_lines(data, f[narrow])
-    fitted = FittedSpectrum(channels, data.unit, spectrum, expected[data.longest])
+    whole = data.whole.spectra[data.longest]
+    fitted = FittedSpectrum(channels, data.unit, whole, _of_channels(data, expected[data.longest]))
     fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
     return ClusterFit(ClusterModes(modes, np.array(_losses(optimum)), lines, fitted), rejected)
+
+
+def _of_channels(data: ClusterData, expected: ComplexArray) -> ComplexArray:
+    """Return an expectation for all channels: in other directions there is noise, and the foreign.
+
+    Infinite on the diagonal where that of the directions is.
+    """
+    basis, whole = data.basis, data.whole.spectra[data.longest]
+    if basis.shape[1] == len(basis):
+        return expected
+    known = np.isfinite(expected[:, 0, 0])
+    rest = np.eye(len(basis)) - basis @ basis.T
+    full = np.tile(np.diag(np.full(len(basis), np.inf)).astype(complex), (known.size, 1, 1))
+    full[known] = basis @ expected[known] @ basis.T + rest
+    if whole.foreign is not None:
+        inside = basis @ basis.T
+        full[known] += whole.foreign[known] - inside @ whole.foreign[known] @ inside
+    return full
 
 
 def _excluded_lines(data: ClusterData, found: FloatArray) -> tuple[LineEstimate, ...]:
@@ -577,8 +644,9 @@ def _residual(
     """
     spectrum, mask = data.spectra.spectra[data.longest], data.masks[data.longest]
     white = np.linalg.solve(expected[data.longest][mask], spectrum.matrix[mask])
-    ratio = np.trace(white, axis1=1, axis2=2).real / data.unit.size
-    return spectrum.frequency[mask], ratio, spectrum.count * data.unit.size
+    n = data.basis.shape[1]
+    ratio = np.trace(white, axis1=1, axis2=2).real / n
+    return spectrum.frequency[mask], ratio, spectrum.count * n
 
 
 def _dispersion(
@@ -609,13 +677,13 @@ def masked_ordinates(data: ClusterData) -> list[tuple[int, int]]:
 
 def read_line(data: ClusterData, first: int, last: int) -> LineEstimate:
     """Read a line within some ordinates of the longest observation, in its strongest channel."""
-    spectrum = data.spectra.spectra[data.longest]
+    spectrum = data.whole.spectra[data.longest]
     powers = spectrum.powers()[first:last]
     c = int(np.argmax(powers.sum(axis=0)))
     frequency = float(spectrum.frequency[first + int(np.argmax(powers[:, c]))])
     # Σ I = A² T / 2 over the ordinates of a sine.
     amplitude = float(np.sqrt(2 * powers[:, c].sum() / spectrum.duration) * data.unit[c])
-    return LineEstimate(data.spectra.channels[c], frequency, amplitude)
+    return LineEstimate(data.whole.channels[c], frequency, amplitude)
 
 
 def _incredible(modes: Modes, i: int, target: Target, duration: float) -> Rejection | None:

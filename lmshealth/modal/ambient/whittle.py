@@ -187,6 +187,7 @@ class Likelihood:
     spread: float  # half width of the band in ln f
     bumps: FloatArray = field(default_factory=lambda: np.empty((2, 0)))  # centres, widths in Hz
     bump_std: float = 1.0  # standard deviation of the prior of their heights
+    known_floors: bool = False  # whether further directions determine their level
     narrowest: float = 0.0  # half-power bandwidth in Hz below which a pole is a line
     # Models at the latest unknowns, by the bytes of these.
     _latest: dict[bytes, list[_Point]] = field(default_factory=dict, init=False, repr=False)
@@ -202,7 +203,7 @@ class Likelihood:
             [
                 np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
                 np.full(lay.n_modes, constants.WIDTHS_STATIC[-1]),
-                np.tile(constants.PRIOR_FLOOR, lay.n_channels),
+                np.tile(constants.PRIOR_FLOORS[self.known_floors], lay.n_channels),
                 forces,
                 np.full(len(lay.shape), constants.PRIOR_SHAPE),
                 np.full(lay.n_bumps, self.bump_std),
