@@ -641,7 +641,7 @@ def cdf_at(axis: FloatArray, density: FloatArray, truth: float) -> float:
 def channel_covariance(
     frequency: FloatArray,
     *,
-    resonances: Sequence[tuple[float, float, float]],
+    resonances: FloatArray,
     floors: Sequence[FloatArray],
     root: FloatArray,
     shapes: FloatArray,
@@ -649,15 +649,16 @@ def channel_covariance(
     """Covariance of the transforms of all channels under white forces, force by force.
 
     Each ``resonance`` is a natural frequency in Hz, a damping ratio and a static response, which
-    adds to that to the force, each ``floor`` a real response ``(n_frequencies,)``; row i of ``root`` says how strongly each force drives resonance
-    or floor i, row c of ``shapes`` how strongly each resonance moves channel c.
+    adds to that to the force, each ``floor`` a real response ``(n_frequencies,)``; row i of
+    ``root`` says how strongly each force drives resonance or floor i, row c of ``shapes`` how
+    strongly each resonance moves channel c.
     """
     n_channels, m = shapes.shape
     cov = np.zeros((frequency.size, n_channels, n_channels), dtype=complex)
     for k, f in enumerate(frequency):
         w = 2 * np.pi * f
         moves = np.zeros((n_channels, root.shape[1]), dtype=complex)
-        for i, (natural, zeta, static) in enumerate(resonances):
+        for i, (natural, zeta, static) in enumerate(resonances.tolist()):
             w_n = 2 * np.pi * natural
             # Of x¨ + 2ζω_n x˙ + ω_n² x = force under exp(iωt), as an acceleration.
             response = static - w**2 / (w_n**2 - w**2 + 2j * zeta * w_n * w)

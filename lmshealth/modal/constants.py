@@ -43,7 +43,7 @@ OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8
 # moved as much as all have in common.
 NAME_GAIN = 4.6
 # Largest factor between the damping ratio found and the one described.
-DAMPING_SPAN = 6.0
+DAMPING_SPAN = 10.0
 # Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
 # (wear of a guide moves them together), and of each mode alone.
 COMMON_SHIFT, OWN_SHIFT = 1 / 2, 1 / 6

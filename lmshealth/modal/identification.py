@@ -51,7 +51,7 @@ _CEILING = 4.0
 # A fit reaches as far from its outer modes as they stand above the noise, in damping ratios within
 # these limits: less costs information about floors, bends and static responses, up to half of the
 # whole, and further away the floors of real machines are not as simple as the likelihood assumes.
-_LEAST_REACH, _MOST_REACH = 6.0, 24.0
+_LEAST_REACH, _MOST_REACH = 6.0, 16.0
 # A band whose ends have a larger ratio than the first is searched in parts up to the second, as no
 # simple floors hold over it; each is searched up to the third ratio beyond its ends, and the edges
 # are shifted up to the fourth where no mode is.

@@ -31,7 +31,7 @@ def assign(
     damping: Sequence[float] | None = None,
     shapes: FloatArray | None = None,
     complete: bool = False,
-    undescribed: bool = False,
+    standing: bool = False,
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances to targets by `pairing_probability`, whose arguments these are.
 
@@ -44,7 +44,7 @@ def assign(
         damping=damping,
         shapes=shapes,
         complete=complete,
-        undescribed=undescribed,
+        standing=standing,
     )
     names = clear_names(probability, targets, constants.CLEAR_NAME)
     return names, _ambiguous(frequency, targets, probability, names, complete=complete)
@@ -88,7 +88,7 @@ def pairing_probability(
     damping: Sequence[float] | None = None,
     shapes: FloatArray | None = None,
     complete: bool = False,
-    undescribed: bool = False,
+    standing: bool = False,
 ) -> FloatArray:
     """Return the probability that each resonance is each target, ``(n_resonances, n_targets)``.
 
@@ -96,8 +96,8 @@ def pairing_probability(
     are normal about a common one, and every pair gains. Pairs outside the search, or with another
     damping where it is given, are excluded. Resonances, in Hz, and targets ascend; ``shapes`` holds
     the modal assurance criterion of each pair, NaN where it is unknown. ``complete`` states that
-    every resonance is a target, ``undescribed`` that some are none: then dampings count, and the
-    machine is as likely at its description as worn.
+    every resonance is a target, ``standing`` that the machine is as likely at its description as
+    worn: then dampings count, too.
     """
     n, m = len(frequency), len(targets)
     if not n or not m:
@@ -110,14 +110,14 @@ def pairing_probability(
     if damping is not None:
         ratio = np.array(damping)[:, None] / [target.damping_ratio for target in targets]
         admissible &= np.abs(np.log(ratio)) < np.log(constants.DAMPING_SPAN)
-        if undescribed:
+        if standing:
             gain -= np.log1p(0.5 * (np.log(ratio) / constants.DAMPING_PRIOR) ** 2)
     if shapes is not None:
         gain -= np.log1p(0.5 * np.nan_to_num((1 - shapes) / constants.SHAPE_PRIOR) ** 2)
     reach = float(np.log1p(search.max()))
     common = np.linspace(-reach, reach, _COMMON_SHIFTS)
     scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
-    prior = norm.pdf(common[:, None], scale=scales) @ [1.0, float(undescribed)]
+    prior = norm.pdf(common[:, None], scale=scales) @ [1.0, float(standing)]
     apart = (shift - common[:, None, None]) / (search * constants.OWN_SHIFT)
     weight = np.where(admissible, np.exp(gain - 0.5 * apart**2), 0.0)
     before = _sums_before(weight, complete=complete)
@@ -258,9 +258,23 @@ class Named:
         if near:
             return replace(min(near, key=lambda one: one[0])[1], mode=target.name)
         f = target.frequency
-        there = [x for x in modes.frequency.tolist() if is_near(target, x)]
+        unnamed = [
+            (x, zeta)
+            for name, x, zeta in zip(
+                modes.names, modes.frequency.tolist(), modes.damping_ratio.tolist(), strict=True
+            )
+            if name not in self.names and is_near(target, x)
+        ]
         detail = f"no resonance near {f:.4g} Hz in any channel; excite it more or record longer"
-        if there:
+        if unnamed:
+            x, zeta = min(unnamed, key=lambda one: abs(np.log(one[0] / f)))
+            factor = constants.DAMPING_SPAN
+            if abs(np.log(zeta / target.damping_ratio)) > np.log(factor):
+                detail = (
+                    f"the resonance at {x:.5g} Hz has a damping of {100 * zeta:.2g} %, more than a "
+                    f"factor of {factor:g} from the {100 * target.damping_ratio:.2g} % described"
+                )
+                return Refusal(self.log, "outside-search", detail, mode=target.name, frequency=x)
             detail = (
                 f"every resonance near {f:.4g} Hz is more likely another mode; correct the "
                 "description, or excite this mode"
@@ -271,8 +285,8 @@ class Named:
 def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named:
     """Name all resonances of a log, of which some may be no described mode.
 
-    Fewer than there are described modes are all taken for such modes: then the machine may as well
-    have moved as stand at its description, and a lonely resonance is not named by guessing.
+    Fewer than there are described modes are all taken for such modes. A lonely one of these is not
+    named by guessing: that the machine stands at its description takes two resonances to say.
     """
     near = [i for i, f in enumerate(both.frequency.tolist()) if any(is_near(t, f) for t in targets)]
     both = both.select(near)
@@ -284,7 +298,7 @@ def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named
         damping=both.damping_ratio.tolist(),
         shapes=likeness(both, targets),
         complete=fewer,
-        undescribed=not fewer,
+        standing=not fewer or len(near) > 1,
     )
     names = clear_names(probability, targets, constants.CLEAR_NAME)
     sure = clear_names(probability, targets, constants.SURE_NAME)

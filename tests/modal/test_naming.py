@@ -83,13 +83,13 @@ def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() 
     """With 126.5, 136.4 and 155.1 Hz the described 126.5 and 136.5 Hz keep their places."""
     described = (Target("roll", 126.5, 0.015, 0.15), Target("pitch", 136.5, 0.015, 0.15))
     found, damping = [126.5, 136.4, 155.1], [0.015, 0.015, 0.017]
-    assert assign(found, described, damping=damping, undescribed=True)[0] == ("roll", "pitch", "")
+    assert assign(found, described, damping=damping, standing=True)[0] == ("roll", "pitch", "")
     # A regular row of modes shifted by its spacing is never certain.
     regular = tuple(
         Target(name, f, 0.015, 0.15) for name, f in zip("abc", (126, 137, 148), strict=True)
     )
     row = [117.0, 126.0, 137.0, 148.0]
-    probability = pairing_probability(row, regular, damping=[0.015] * 4, undescribed=True)
+    probability = pairing_probability(row, regular, damping=[0.015] * 4, standing=True)
     assert probability.max() < SURE_NAME
 
 

@@ -36,11 +36,13 @@ _COMMON_STEPS, _OWN_STEPS = 41, 15
 # Multiplicative updates to convergence, and enough to rank candidates; their exponent over that
 # for which monotonicity is proved.
 _UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
-# What is foreign is fitted where it is above this share of the noise; least singular value of shapes
-# that are independent.
-_FOREIGN, _INDEPENDENT = 0.3, 1e-3
+# So many channels are fitted as they are. Of more, what is foreign is fitted where it is above this
+# share of the noise; least singular value of shapes that are independent.
+_FEW, _FOREIGN, _INDEPENDENT = 4, 0.3, 1e-3
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
-_COLLAPSED = 0.5
+_COLLAPSED = 0.1
+# That with which a pole begins anew beside a line.
+_BEGINS = 5.0
 # Ordinates over which the level near a line is taken, and that it covers to either side.
 _LINE_NEIGHBOURS, _LINE_BINS = 41, 2
 _MOST_LINE_ROUNDS = 4
@@ -81,6 +83,11 @@ class ClusterData:
     binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
+
+    @property
+    def duration(self) -> float:
+        """Duration of the longest segment in s."""
+        return self.spectra.spectra[self.longest].duration
 
     @property
     def longest(self) -> int:
@@ -214,27 +221,54 @@ def fit_modes(
         short = {t.name: Rejection("too-short", detail, t.frequency) for t in targets}
         return ClusterFit(None, short)
     data = mask_prominent_lines(data)
+    collapsed: dict[str, Rejection] = {}
     for _ in range(_MOST_LINE_ROUNDS):
-        optimum = _fit_and_prune(data, targets)
+        data, optimum, lines = _fit_beside_lines(data, targets)
+        collapsed |= lines
+        if optimum is None:
+            return ClusterFit(None, collapsed)
         targets = optimum.targets
-        if lines := optimum.likelihood.collapsed(optimum.p):
-            data = _mask_at(data, optimum.poles[0][lines])
-            targets = tuple(t for i, t in enumerate(targets) if i not in lines)
-            if targets:
-                continue
-            return ClusterFit(None, {})
         expected = _expected(data, optimum)
         before, data = data, mask_residual_lines(data, expected)
         if data is before:
             break
-    return _conclude(data, optimum, expected)
+    fit = _conclude(data, optimum, expected)
+    return replace(fit, rejected=fit.rejected | collapsed)
+
+
+def _fit_beside_lines(
+    data: ClusterData, targets: tuple[Target, ...]
+) -> tuple[ClusterData, _Optimum | None, dict[str, Rejection]]:
+    """Fit modes, and mask lines that poles become; None where no mode is left.
+
+    A pole begins anew beside the first line that it became, as a mode may be there, too.
+    """
+    begun: set[str] = set()
+    rejected: dict[str, Rejection] = {}
+    while targets:
+        optimum = _fit_and_prune(data, targets)
+        lines = optimum.likelihood.collapsed(optimum.p)
+        if not lines:
+            return data, optimum, rejected
+        data = _mask_at(data, optimum.poles[0][lines])
+        left = list(optimum.targets)
+        for i, f in zip(lines, optimum.poles[0][lines].tolist(), strict=True):
+            name, duration = left[i].name, data.duration
+            if name in begun:
+                detail = f"{f:.5g} Hz is narrower than a record of {duration:.3g} s resolves"
+                rejected[name] = Rejection("line-not-mode", detail, f)
+            least = _BEGINS / (2 * f * duration)
+            left[i] = replace(left[i], damping_ratio=max(left[i].damping_ratio, least))
+            begun.add(name)
+        targets = tuple(t for t in left if t.name not in rejected)
+    return data, None, rejected
 
 
 def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
     """Fit all modes, and drop those without evidence, the least likely first.
 
-    Modes are tried without whose loss, all others fixed, is small, or that overlap another one; one
-    that left its start is dropped, and one mode stays.
+    Modes are tried without whose loss, all others fixed, is small; one that left its start is
+    dropped, and one mode stays.
     """
 
     def solved(some: tuple[Target, ...]) -> _Optimum:
@@ -248,8 +282,7 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
     optimum = solved(targets)
     while len(targets := optimum.targets) > 1 and not optimum.likelihood.collapsed(optimum.p):
         lost = _escaped(optimum)
-        near = _overlapping(*optimum.poles)
-        doubtful = lost or [i for i, x in enumerate(_losses(optimum)) if x < _DOUBTFUL or near[i]]
+        doubtful = lost or [i for i, x in enumerate(_losses(optimum)) if x < _DOUBTFUL]
         worst, least = None, constants.EVIDENCE_MARGIN
         for i in doubtful:
             less = solved(targets[:i] + targets[i + 1 :])
@@ -262,14 +295,6 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
             break
         optimum = worst
     return _refined(data, optimum)
-
-
-def _overlapping(f: FloatArray, zeta: FloatArray) -> BoolArray:
-    """Return which modes are within a half-power bandwidth of another one."""
-    width = f * zeta
-    apart = np.abs(f[:, None] - f) / (width[:, None] + width)
-    np.fill_diagonal(apart, np.inf)
-    return np.asarray(apart.min(axis=1) < 1)
 
 
 def _escaped(optimum: _Optimum) -> list[int]:
@@ -312,7 +337,8 @@ def prepare(
     cut = whole.each(lambda spectrum: spectrum.band(*band))
     cut = replace(cut, spectra=tuple(s for s in cut.spectra if s.frequency.size))
     moved = [t.amplitude[index] / unit for t in present if t.amplitude is not None]
-    basis = _directions(moved, cut) if len(moved) == len(present) else np.eye(unit.size)
+    many = unit.size > _FEW and len(moved) == len(present)
+    basis = _directions(moved, cut) if many else np.eye(unit.size)
     if basis.shape[1] < unit.size:
         names = tuple(f"direction {k}" for k in range(basis.shape[1]))
         turn = partial(_turned, basis=basis)
@@ -352,9 +378,9 @@ def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArra
     foreign = [s.foreign for s in spectra.spectra if s.foreign is not None]
     if foreign:
         parts = np.concatenate(foreign).real
-        for vector in np.linalg.eigh(parts.sum(axis=0))[1].T:
-            if np.max(np.einsum("kab,a,b->k", parts, vector, vector)) > _FOREIGN:
-                columns.append(vector)
+        vectors = np.linalg.eigh(parts.sum(axis=0))[1].T
+        most = np.einsum("kab,va,vb->vk", parts, vectors, vectors, optimize=True).max(axis=1)
+        columns += list(vectors[most > _FOREIGN])
     columns = [column / np.linalg.norm(column) for column in columns]
     u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
     return np.asarray(u[:, s > _INDEPENDENT])
@@ -500,7 +526,7 @@ def _solve(
         centre=float(np.sqrt(low * high)),
         spread=float(np.log(high / low) / 2),
         known_floors=n_channels < data.unit.size,
-        narrowest=_COLLAPSED / data.spectra.spectra[data.longest].duration,
+        narrowest=_COLLAPSED / data.duration,
     )
     p = likelihood.minimise(start)
     return _Optimum(targets, likelihood, p, likelihood.data_value(p))

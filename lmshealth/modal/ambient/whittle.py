@@ -8,9 +8,10 @@ over modes and noise floors. Means W of n ordinates suffice where E is constant 
 
     -ln p = Σ n (ln det E + tr E⁻¹ W).
 
-Unknowns, in this order: ln f (m), ln ζ (m), static responses (m), e_c, d_c and b_c of each floor, L row by row up to its
-diagonal (which is one for the floors), the shapes but for the reference channel of each mode, and
-the heights of bumps of the log spectrum of the modal forces, of which there are none at first.
+Unknowns, in this order: ln f (m), ln ζ (m), static responses (m), e_c, d_c and b_c of each floor,
+L row by row up to its diagonal (which is one for the floors), the shapes but for the reference
+channel of each mode, and the heights of bumps of the log spectrum of the modal forces, of which
+there are none at first.
 README.md of this folder derives the model; `marginalise` integrates the nuisance parameters.
 """
 
@@ -152,8 +153,8 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
     """Return the acceleration response h of modes and its derivatives by x = ln f and z = ln ζ.
 
     The array has shape ``(10, …, n)``: h, its first derivatives by three unknowns and its second
-    ones (11, 12, 13, 22, 23, 33); the third unknown, the static response, is added by the caller. With d = 1/h, h_a = -d_a h² and
-    h_ab = (2 d_a d_b h - d_ab) h².
+    ones (11, 12, 13, 22, 23, 33); the third unknown, the static response, is added by the caller.
+    With d = 1/h, h_a = -d_a h² and h_ab = (2 d_a d_b h - d_ab) h².
     """
     beta = f / frequency
     damping = -2j * zeta * beta
@@ -167,7 +168,7 @@ def receptance(f: FloatArray, zeta: FloatArray, frequency: FloatArray) -> Comple
 
 
 # Newton decrement, a square in standard deviations, below which the search ends, and most steps.
-_ARRIVED, _MOST_STEPS = 1e-5, 60
+_ARRIVED, _MOST_STEPS = 1e-5, 100
 # First and least radius of the trust region, and shares of the expected gain: steps count above
 # the first share, the radius shrinks below the second and grows above the third.
 _FIRST_RADIUS, _LEAST_RADIUS, _ACCEPTED, _POOR, _GOOD = 0.3, 1e-9, 0.15, 0.25, 0.75

@@ -10,7 +10,7 @@ Method
     accelerometers; coverage is judged over all modes.
     The beam is the movable-roller testbed DROPBEAR (data set 8). Dwells follow from the measured
     roller position; the mode is searched within 30 % of 33 Hz with a damping of 0.2 % within a
-    factor of six. Reference frequencies come from Welch spectra and least squares, good to 0.15
+    factor of ten. Reference frequencies come from Welch spectra and least squares, good to 0.15
     Hz.
 Answer
     Yes: 24 of 24 coverages in nine cases. Narrow intervals are detected 24 times, wide ones 22

@@ -9,6 +9,8 @@ from scipy.stats import ncx2
 
 from lmshealth import identify
 from lmshealth.modal import constants as modal_constants
+from lmshealth.modal import identification
+from lmshealth.modal.ambient import cluster_fit
 from lmshealth.signal import constants as signal_constants
 from lmshealth.signal.segments import find_segments
 from lmshealth.signal.spectral_lines import find_lines, find_lines_by_velocity
@@ -185,6 +187,8 @@ def moves(values: Array, at: float, std: float, velocity: Array | None = None) -
     with (
         patch.object(signal_constants, "SINUSOID_CONTRAST", np.inf),
         patch.object(modal_constants, "LINE_FALSE_ALARM", 0.0),
+        patch.object(identification, "_thomson_lines", lambda *_: []),
+        patch.object(cluster_fit, "_COLLAPSED", 0.0),
     ):
         bare = (estimate(values, velocity)[0] - at) / std
     both = {"moved": moved, "moved_with_lines_left_in": bare}
