@@ -400,17 +400,27 @@ def mask_prominent_lines(data: ClusterData) -> ClusterData:
 
 
 def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> ClusterData:
-    """Mask ordinates that noise about the expectation does not reach; return ``data`` if none."""
-    levels = []
+    """Mask ordinates that noise about the expectation does not reach; return ``data`` if none.
+
+    A line on a resonance is seen in the directions in which the mode does not move.
+    """
+    levels, whitened = [], []
     for spectrum, matrix in zip(data.spectra.spectra, expected, strict=True):
         level = np.diagonal(matrix, axis1=1, axis2=2).real
+        known = np.flatnonzero(np.isfinite(level[:, 0]))
+        total = np.zeros(len(level))
+        white = np.linalg.solve(matrix[known], spectrum.matrix[known])
+        total[known] = np.trace(white, axis1=1, axis2=2).real
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
         if spectrum.count > 1:
             ratio = spectrum.powers() / level / median_ordinate(spectrum.count)
             level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
+            near = median_filter(total, _LINE_NEIGHBOURS) / level.shape[1]
+            total = total / near.clip(1.0)
         levels.append(level)
-    return _mask_above(data, levels)
+        whitened.append(total)
+    return _mask_above(data, levels, whitened)
 
 
 def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
@@ -422,14 +432,23 @@ def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
     return replace(data, masks=tuple(masks))
 
 
-def _mask_above(data: ClusterData, levels: list[FloatArray]) -> ClusterData:
-    """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``."""
+def _mask_above(
+    data: ClusterData, levels: list[FloatArray], whitened: list[FloatArray] | None = None
+) -> ClusterData:
+    """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``.
+
+    Or all of them together: ``whitened`` is the trace of ordinates over their expectation.
+    """
     n_free = sum(int(mask.sum()) for mask in data.masks)
-    false_alarm = constants.LINE_FALSE_ALARM / (data.basis.shape[1] * n_free)
+    n = data.basis.shape[1]
+    false_alarm = constants.LINE_FALSE_ALARM / ((n + (whitened is not None)) * n_free)
     masks = []
-    for spectrum, mask, level in zip(data.spectra.spectra, data.masks, levels, strict=True):
+    for k, (spectrum, mask) in enumerate(zip(data.spectra.spectra, data.masks, strict=True)):
         highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
-        lines = mask & (spectrum.powers() > highest * level).any(axis=1)
+        above = (spectrum.powers() > highest * levels[k]).any(axis=1)
+        if whitened is not None:
+            above |= whitened[k] > gamma.isf(false_alarm, spectrum.count * n) / spectrum.count
+        lines = mask & above
         reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
         masks.append(mask & ~reached)
     # A band that would lose more than half of its ordinates holds no lines.
