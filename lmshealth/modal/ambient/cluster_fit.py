@@ -232,6 +232,7 @@ def fit_modes(
         before, data = data, mask_residual_lines(data, expected)
         if data is before:
             break
+    assert optimum is not None  # there is at least one round
     fit = _conclude(data, optimum, expected)
     return replace(fit, rejected=fit.rejected | collapsed)
 

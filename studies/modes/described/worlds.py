@@ -142,7 +142,7 @@ def _with_more_noise(rng: np.random.Generator, samples: Array, rate: float) -> t
     """
     n, n_channels = samples.shape
     shared = coloured(rng, n, rate, 130.0, 2.0)
-    levels: Array = 10 ** rng.uniform(-0.5, 0.5, n_channels)
+    levels = np.power(10.0, rng.uniform(-0.5, 0.5, n_channels))
     own = [x * coloured(rng, n, rate, 130.0, rng.uniform(0, 3)) for x in levels.tolist()]
     gains = 0.7 * rng.choice([-1.0, 1.0], n_channels)
     return samples + np.stack(own, axis=1) + np.outer(shared, gains), 1 + levels**2 + gains**2

