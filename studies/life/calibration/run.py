@@ -19,8 +19,8 @@ Method
     their 99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as exact that is
     wrong by 5 or 10 %; every parameter taken to change, while half of them do not.
 Run time
-    Of one processor three to four seconds a life, an hour and a half in all. The recorded time is
-    that after an interruption.
+    Of one processor one to four seconds a life, half an hour in all. The recorded time is that after
+    an interruption.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from studies.life.calibration.lives import Life, draw
 SEED = 20261123
 ONE, CHAINS = "posterior", "by chains"
 EXACT, LOSING = "map taken as exact", "every part taken to change"
-LIVES = {ONE: 1000, CHAINS: 40, EXACT: 100, LOSING: 100}
+LIVES = {ONE: 500, CHAINS: 40, EXACT: 100, LOSING: 100}
 # The quick form begins where none jumps, which takes long, and some parts keep their health.
 QUICK, QUICK_FIRST = {ONE: 3, LOSING: 3}, 3
 CHANGES = ("preload changes", "mount changes")
