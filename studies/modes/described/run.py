@@ -12,7 +12,7 @@ Method
     had a likelihood of its own for described modes, on the same records. Controls: intervals two
     thirds as wide, which must not cover; the code before, which must miss the bound.
 Run time
-    Ten minutes on one processor.
+    A quarter of an hour on one processor.
 """
 
 from __future__ import annotations
@@ -41,6 +41,11 @@ OVER_BOUND = {
     "8 channels, 6 modes, two harmonics": 1.25,
 }
 MOST_OVER_BOUND, SCORES, NARROWER = 1.15, (0.85, 1.15), 1.5
+NOT_MET = {
+    "none missing or wrong: pair 1 % apart": "the description is off by 0.4 % for each mode, with "
+    "which the order of two that are 1 % apart is not always that of the description; where the "
+    "data do not separate them both are refused",
+}
 
 
 def main() -> None:
@@ -57,7 +62,7 @@ def main() -> None:
         was = {kind: summarised(kind, tasks, before) for kind in plan}
     result: Row = {"seed": SEED, "kinds": rows, "before": was}
     result["passed"] = verdicts(result)
-    study.conclude(result, quick_may_fail=True)
+    study.conclude(result, not_met=NOT_MET, quick_may_fail=True)
 
 
 def now(kind: str, number_: int) -> Row:
