@@ -19,8 +19,8 @@ Method
     their 99.9 % Clopper-Pearson interval. Controls that must fail: a map taken as exact that is
     wrong by 5 or 10 %; every parameter taken to change, while half of them do not.
 Run time
-    Of one processor one to four seconds a life, half an hour in all. The recorded time is that after
-    an interruption.
+    Of one processor one to four seconds a life, half an hour in all. The recorded time is that
+    after an interruption.
 """
 
 from __future__ import annotations
