@@ -7,6 +7,7 @@ posterior, prunes modes without evidence, marginalises, and rejects estimates th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -410,8 +411,9 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
         level = np.diagonal(matrix, axis1=1, axis2=2).real
         known = np.flatnonzero(np.isfinite(level[:, 0]))
         total = np.zeros(len(level))
-        white = np.linalg.solve(matrix[known], spectrum.matrix[known])
-        total[known] = np.trace(white, axis1=1, axis2=2).real
+        with suppress(np.linalg.LinAlgError):  # channels that copy each other
+            white = np.linalg.solve(matrix[known], spectrum.matrix[known])
+            total[known] = np.trace(white, axis1=1, axis2=2).real
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
         if spectrum.count > 1:

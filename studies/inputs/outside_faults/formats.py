@@ -241,7 +241,7 @@ CASES: tuple[Case, ...] = (
             name,
             "aligned: damping 1.65 ± 0.17 % of the mode at 126 Hz",
             partial(
-                read, _outside(name), 126.0, damping=(1.48, 1.82), allowed="starts 1000 samples"
+                read, _outside(name), 126.0, damping=(1.31, 1.99), allowed="starts 1000 samples"
             ),
             partial(read, tdms, 126.0),
         )

@@ -215,22 +215,14 @@ def test_each_flag_has_its_own_reason() -> None:
 
 
 @pytest.mark.slow
-def test_a_mode_under_a_line_that_is_too_unsteady_to_be_told_is_refused() -> None:
-    """A line that wanders by 0.3 Hz about roll is no noise: roll is refused, pitch is not."""
+def test_a_line_that_is_unsteady_about_a_mode_leaves_its_truth_or_a_flag() -> None:
+    """A line that wanders by 0.3 Hz about roll is masked where it is clear, and flagged if not."""
     t = np.arange(60_000) / RATE
     phase = 2 * np.pi * np.cumsum(105 + 0.3 * np.sin(2 * np.pi * t / 17)) / RATE
-    result, rejected = fit(both() + 10.0 * np.sin(phase), [ROLL, PITCH])
-    assert result is not None
-    assert list(result.names) == ["pitch"]
-    assert (
-        np.abs((result.modes.estimate - TRUTH[[1, 3]]) / np.sqrt(np.diag(result.modes.cov))).max()
-        < 4
-    )
-    reason, detail, *_ = rejected["roll"]
-    assert reason == "poor-fit"
-    assert "times as much as noise" in detail
-    # At a third of that amplitude the mode is published with a flag.
-    faint, rejected = fit(both() + 5.0 * np.sin(phase), [ROLL, PITCH])
-    assert faint is not None
-    assert rejected == {}
-    assert ["loose-fit" in flags.split() for flags in faint.modes.flags] == [True, False]
+    for amplitude, loose in ((30.0, False), (10.0, False), (5.0, True)):
+        result, rejected = fit(both() + amplitude * np.sin(phase), [ROLL, PITCH])
+        assert result is not None
+        assert rejected == {}
+        off = (result.modes.estimate - TRUTH) / np.sqrt(np.diag(result.modes.cov))
+        assert np.abs(off).max() < 4
+        assert ["loose-fit" in flags.split() for flags in result.modes.flags] == [loose, False]
