@@ -150,6 +150,13 @@ def test_mislabelled_modes(root: Path) -> None:
     assert all(answer["passed"].values())
 
 
+def test_modes_described(root: Path) -> None:
+    """Of two records of two kinds all described modes are named, with errors as published."""
+    answer = json.loads(run_study(root, "studies.modes.described.run"))
+    assert all(answer["passed"].values())
+    assert sum(row["named"] for row in answer["kinds"].values()) == 12
+
+
 def test_line_test(root: Path) -> None:
     """Alarms stay as declared, lines are found and leave modes in peace; controls do not."""
     answer = json.loads(run_study(root, "studies.modes.lines.run"))
