@@ -29,13 +29,6 @@ SURE_NAME = 0.95
 # Then, of a machine that stands at its description, standard deviation of the common shift as a
 # share of the search; and scales of ln ζ and of 1 - MAC about the described values.
 NO_SHIFT, DAMPING_PRIOR, SHAPE_PRIOR = 1 / 10, 0.5, 0.1
-# What shows that described modes do not explain the spectra: ratio by which a peak exceeds both
-# sides, its gain in log likelihood, and factor between the damping found and described from which a
-# mode may stand for two.
-PEAK_RATIO, PEAK_GAIN, WIDE = 1.1, 40.0, 2.0
-# Ordinates in the narrowest half-power bandwidth described from which on resonances that have no
-# description are searched for: in shorter segments what masking left of a line resembles a mode.
-SEARCHABLE = 20.0
 # Differences from the description that search and map do not explain: of frequency, factor of
 # damping (beyond two standard deviations), and modal assurance criterion.
 OFF_FREQUENCY, OFF_DAMPING, OFF_SHAPE = 0.03, 2.5, 0.8
@@ -60,9 +53,9 @@ LEAST_FREQUENCIES = 50
 SIMILAR_BANDWIDTH = 8.0
 # Probability that noise alone makes a line somewhere in the band of a cluster.
 LINE_FALSE_ALARM = 1e-3
-# Gain in log likelihood of the binned spectra: below the first a mode is absent; above the second
-# it is present; between them the Bayesian information criterion decides, with this margin.
-ABSENT, PRESENT, EVIDENCE_MARGIN = 3.0, 60.0, 10.0
+# Gain in log likelihood of the binned spectra below which a mode is absent, and margin by which the
+# Bayesian information criterion must gain with a mode.
+ABSENT, EVIDENCE_MARGIN = 3.0, 10.0
 # Search without a description: share of the orders of a subspace model in which a candidate occurs;
 # gain in log likelihood by which it enters the joint model, and by which the residual of that model
 # shows a further mode (evidence decides afterwards); most modes that are published from one fit.

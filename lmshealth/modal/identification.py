@@ -2,7 +2,7 @@
 
 Lines are masked, a search of all channels finds what resonates, groups of resonances are fitted by
 one Whittle likelihood of all channels, as channels of one log share the excitation, and what is
-credible is published. A description says where to look, and names what was found.
+credible is published. A description gives hints to the search, and names to what was found.
 """
 
 from collections.abc import Callable, Sequence
@@ -153,7 +153,9 @@ def read_ambient(
             short.append(refusal)
     spans = _spans(log, whole.duration, hints, band)
     tested = _thomson_lines(log, stretches, spans)
-    explore = partial(_explore, whole, spans, hints, [f for _, f, _ in tested], log, progress)
+    masked_at = [f for _, f, _ in tested]
+    cut = whole.each(lambda spectrum: spectrum.without(masked_at))
+    explore = partial(_explore, cut, spans, hints, masked_at, _TOP * log.sample_rate, progress)
     sought, fits = explore(())
     if suspected := _lines_at_modes(fits):
         sought, fits = explore(suspected)
@@ -165,14 +167,9 @@ def read_ambient(
     named = name_resonances(merge(resonances, (), (), whole.channels), near, log.name)
     fits = [separate(fit, named.names) for fit in fits]
     fitted = [fit.modes for fit in fits if fit.modes is not None]
-    masked = [line for one in fitted for line in one.lines]
-    seen = [*tested, *whole.removed_lines, *masked]
+    seen = [*tested, *whole.removed_lines, *(line for one in fitted for line in one.lines)]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / whole.duration)
-    lines += tuple(
-        Line(h.frequency, h.amplitude, "m/s²", "wandering", part.spectra.channels[h.channel])
-        for part in sought
-        for h in part.harmonics
-    )
+    lines += _wandering(sought)
     credible = [one.modes for fit in fits if (one := fit.credible) is not None]
     unlike = set.intersection(*({*part.left_out} for part in sought))
     shown = tuple(name for name in whole.channels if name not in unlike)
@@ -196,6 +193,15 @@ def read_ambient(
         modes = replace(modes, refused=(*modes.refused, nothing))
     return AmbientReading(
         modes, whole, tuple(one.fitted for one in fitted), tuple(rejected), sought
+    )
+
+
+def _wandering(sought: Sequence[Found]) -> tuple[Line, ...]:
+    """Return the harmonics that wander as lines."""
+    return tuple(
+        Line(h.frequency, h.amplitude, "m/s²", "wandering", part.spectra.channels[h.channel])
+        for part in sought
+        for h in part.harmonics
     )
 
 
@@ -332,17 +338,16 @@ def _thomson_lines(
 
 
 def _explore(
-    whole: LogSpectra,
+    spectra: LogSpectra,
     spans: Sequence[tuple[float, float]],
     hints: tuple[Target, ...],
     lines: list[float],
-    log: Log,
+    top: float,
     progress: Callable[[str, int, int], None],
     suspected: Sequence[float],
 ) -> tuple[tuple[Found, ...], list[ClusterFit]]:
-    """Search bands for modes, with lines in Hz masked, and fit these."""
-    cut = whole.each(lambda spectrum: spectrum.without(lines))
-    sought = _search(cut, spans, hints, lines, progress, suspected)
+    """Search bands for modes, and fit these below ``top``; lines are masked; all are in Hz."""
+    sought = _search(spectra, spans, hints, lines, progress, suspected)
     groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
     for part in sought:
         for group in split_groups(part.modes):
@@ -351,7 +356,7 @@ def _explore(
     fits: list[ClusterFit] = []
     for k, (near, (part, group)) in enumerate(groups.items()):
         progress("fitting", k, len(groups))
-        fits += _fit_group(part, group, near, _TOP * log.sample_rate)
+        fits += _fit_group(part, group, near, top)
     progress("fitting", len(groups), len(groups))
     return sought, fits
 

@@ -27,27 +27,26 @@ _COMMON_SHIFTS = 121
 def assign(
     frequency: Sequence[float],
     targets: Sequence[Target],
+    probability: FloatArray,
     *,
-    damping: Sequence[float] | None = None,
-    shapes: FloatArray | None = None,
     complete: bool = False,
-    standing: bool = False,
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
-    """Assign resonances to targets by `pairing_probability`, whose arguments these are.
+    """Assign resonances to targets by their `pairing_probability`.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
     and the targets that are not assigned but may be one of the resonances.
     """
-    probability = pairing_probability(
-        frequency,
-        targets,
-        damping=damping,
-        shapes=shapes,
-        complete=complete,
-        standing=standing,
-    )
     names = clear_names(probability, targets, constants.CLEAR_NAME)
-    return names, _ambiguous(frequency, targets, probability, names, complete=complete)
+    # With complete assignments a named resonance cannot be another target as well.
+    open_ = [i for i, name in enumerate(names) if not (complete and name)]
+    ambiguous = {}
+    for j, target in enumerate(targets):
+        rivals = [i for i in open_ if probability[i, j] > constants.UNLIKELY_NAME]
+        if target.name not in names and rivals:
+            odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
+            remedy = "the assignment is not clear; excite the other modes, or narrow searches"
+            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
+    return names, ambiguous
 
 
 def clear_names(
@@ -58,27 +57,6 @@ def clear_names(
         targets[int(np.argmax(row))].name if row.size and row.max() >= least else ""
         for row in probability
     )
-
-
-def _ambiguous(
-    frequency: Sequence[float],
-    targets: Sequence[Target],
-    probability: FloatArray,
-    names: tuple[str, ...],
-    *,
-    complete: bool,
-) -> dict[str, Rejection]:
-    """Return the targets without a name that may be one of the resonances."""
-    # With complete assignments a named resonance cannot be another target as well.
-    open_ = [i for i, name in enumerate(names) if not (complete and name)]
-    ambiguous = {}
-    for j, target in enumerate(targets):
-        rivals = [i for i in open_ if probability[i, j] > constants.UNLIKELY_NAME]
-        if target.name not in names and rivals:
-            odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
-            remedy = "the assignment is not clear; excite the other modes, or narrow searches"
-            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
-    return ambiguous
 
 
 def pairing_probability(
@@ -286,7 +264,7 @@ def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named
     """Name all resonances of a log, of which some may be no described mode.
 
     Fewer than there are described modes are all taken for such modes. A lonely one of these is not
-    named by guessing: that the machine stands at its description takes two resonances to say.
+    named by guessing: only two resonances show that the machine stands at its description.
     """
     near = [i for i, f in enumerate(both.frequency.tolist()) if any(is_near(t, f) for t in targets)]
     both = both.select(near)
@@ -300,13 +278,13 @@ def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named
         complete=fewer,
         standing=not fewer or len(near) > 1,
     )
-    names = clear_names(probability, targets, constants.CLEAR_NAME)
+    names, ambiguous = assign(frequency, targets, probability, complete=fewer)
     sure = clear_names(probability, targets, constants.SURE_NAME)
     likely = probability.sum(axis=1) > 0.5
     return Named(
         names={own: name for own, name in zip(both.names, names, strict=True) if name},
         doubtful=frozenset(names) - frozenset(sure) if more else frozenset(),
-        ambiguous=_ambiguous(frequency, targets, probability, names, complete=fewer),
+        ambiguous=ambiguous,
         undescribed=frozenset(
             own for own, there in zip(both.names, likely, strict=True) if not there
         ),

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,14 +34,22 @@ def named(
     *found: float, targets: tuple[Target, ...] = TARGETS
 ) -> tuple[tuple[str, ...], dict[str, Rejection]]:
     """Assign resonances of the described damping."""
-    return assign(found, targets, damping=[0.02] * len(found))
+    return assigned(found, targets, damping=[0.02] * len(found))
+
+
+def assigned(
+    found: Sequence[float], targets: tuple[Target, ...], **given: Any
+) -> tuple[tuple[str, ...], dict[str, Rejection]]:
+    """Assign resonances by the probability of pairs; options are those of `pairing_probability`."""
+    probability = pairing_probability(found, targets, **given)
+    return assign(found, targets, probability, complete=given.get("complete", False))
 
 
 def test_modes_where_they_are_expected_get_their_names() -> None:
     """Three modes shifted together by wear are named in order."""
     shifted = [0.9 * f for f in (105.0, 120.0, 150.0)]
     assert named(*shifted) == (("roll", "pitch", "yaw"), {})
-    assert assign(shifted, TARGETS, complete=True) == named(*shifted)
+    assert assigned(shifted, TARGETS, complete=True) == named(*shifted)
 
 
 def test_a_resonance_outside_every_search_gets_no_name() -> None:
@@ -60,7 +70,7 @@ def test_one_of_two_equal_candidates_is_not_guessed() -> None:
 
 def test_a_single_resonance_known_to_be_a_target_is_ambiguous_between_neighbours() -> None:
     """At the frequency of roll it may be roll or pitch; the message quotes both probabilities."""
-    names, ambiguous = assign([112.0], TARGETS, complete=True)
+    names, ambiguous = assigned([112.0], TARGETS, complete=True)
     assert names == ("",)
     assert set(ambiguous) == {"roll", "pitch"}
     assert "112 Hz may be roll" in ambiguous["roll"].detail
@@ -75,7 +85,7 @@ def test_nothing_found_names_nothing() -> None:
 
 def test_a_damping_far_off_belongs_to_something_else() -> None:
     """Of two resonances near one target, one ten times as damped, the other has the name."""
-    result = assign([98.0, 112.5], TARGETS[:1], damping=[0.2, 0.02])
+    result = assigned([98.0, 112.5], TARGETS[:1], damping=[0.2, 0.02])
     assert result == (("", "roll"), {})
 
 
@@ -83,7 +93,7 @@ def test_unshifted_beside_an_undescribed_mode_beats_a_shift_to_the_neighbours() 
     """With 126.5, 136.4 and 155.1 Hz the described 126.5 and 136.5 Hz keep their places."""
     described = (Target("roll", 126.5, 0.015, 0.15), Target("pitch", 136.5, 0.015, 0.15))
     found, damping = [126.5, 136.4, 155.1], [0.015, 0.015, 0.017]
-    assert assign(found, described, damping=damping, standing=True)[0] == ("roll", "pitch", "")
+    assert assigned(found, described, damping=damping, standing=True)[0] == ("roll", "pitch", "")
     # A regular row of modes shifted by its spacing is never certain.
     regular = tuple(
         Target(name, f, 0.015, 0.15) for name, f in zip("abc", (126, 137, 148), strict=True)
@@ -106,8 +116,8 @@ def test_described_shapes_name_what_frequencies_leave_open() -> None:
     described = tuple(replace(t, shape=s) for t, s in zip(TARGETS, shapes, strict=True))
     alike = likeness(shaped("", 112.0, [0.6, -0.8]), described)
     np.testing.assert_allclose(alike, [[0.02, 0.98, np.nan]])
-    assert assign([112.0], described, shapes=alike, complete=True)[0] == ("pitch",)
-    assert assign([112.0], described, complete=True)[0] == ("",)
+    assert assigned([112.0], described, shapes=alike, complete=True)[0] == ("pitch",)
+    assert assigned([112.0], described, complete=True)[0] == ("",)
 
 
 def test_a_mode_off_its_description_is_compared_with_it() -> None:

@@ -32,11 +32,8 @@ from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
 from lmshealth.stage.constants import BAND_HALF_WIDTH
 
-# Steps of the common shift and of the shift of each mode.
-_COMMON_STEPS, _OWN_STEPS = 41, 15
-# Multiplicative updates to convergence, and enough to rank candidates; their exponent over that
-# for which monotonicity is proved.
-_UPDATES, _FEW_UPDATES, _STRIDE = 25, 10, 1.8
+# Multiplicative updates to convergence; their exponent over that for which monotonicity is proved.
+_UPDATES, _STRIDE = 25, 1.8
 # So many channels are fitted as they are. Of more, what is foreign is fitted where it is above this
 # share of the noise; least singular value of shapes that are independent.
 _FEW, _FOREIGN, _INDEPENDENT = 4, 0.3, 1e-3
@@ -51,13 +48,8 @@ _MOST_LINE_ROUNDS = 4
 _MOST_SLOPES = 400_000
 # Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
 _DOUBTFUL = 200.0
-# The sign of a shape starts as that of the cross spectrum within so many damping ratios.
-_SIGN_BAND = 1.5
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
 _NARROWER = 0.7
-# Bins over which the gain of a peak is added up, about a half-power bandwidth, and from its centre
-# to its sides.
-_PEAK_BINS, _SIDE_BINS = 5, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -350,11 +342,8 @@ def prepare(
         width = (high - low) / binned.frequency.size
         chosen, levels = ours[0], bin_spectra(ours[1], low, high, width, binned.neighbours)
     else:
-        basis, chosen, levels = (
-            np.eye(unit.size),
-            cut,
-            replace(binned, level=level / noise[:, None]),
-        )
+        basis, chosen = np.eye(unit.size), cut
+        levels = replace(binned, level=level / noise[:, None])
     masks = tuple(s.free for s in chosen.spectra)
     return ClusterData(cut, unit, basis, chosen, levels, masks, tuple(index))
 

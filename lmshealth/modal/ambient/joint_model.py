@@ -133,7 +133,7 @@ class JointModel:
     def dispersions(self) -> FloatArray:
         """Return the dispersion of the residual of each channel given the others; 1 for noise.
 
-        A channel with less noise than the least floor scatters less than its floor says.
+        A channel with less noise than the least floor scatters less than its floor implies.
         """
         g = self._inverse
         precision = np.einsum("kaa->ka", g).real

@@ -24,7 +24,7 @@ from lmshealth.modal.free_decay.decay_fit import (
 )
 from lmshealth.modal.free_decay.transient_likelihood import transform_decays
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
-from lmshealth.modal.naming import assign, is_near
+from lmshealth.modal.naming import assign, is_near, pairing_probability
 from lmshealth.modal.targets import (
     Target,
     check_band,
@@ -425,9 +425,8 @@ def _name(
         missing = [target for target in targets if target.name not in taken]
         poles = [pole for band in bands if band.source == source for pole in band.accepted]
         poles.sort(key=lambda pole: pole.frequency)
-        assigned, unclear = assign(
-            [pole.frequency for pole in poles], missing, damping=[pole.damping for pole in poles]
-        )
+        f, zeta = [pole.frequency for pole in poles], [pole.damping for pole in poles]
+        assigned, unclear = assign(f, missing, pairing_probability(f, missing, damping=zeta))
         ambiguous |= unclear
         names = dict(zip(poles, assigned, strict=True))
         for band in bands:

@@ -81,7 +81,7 @@ LEFT_HELD, LEFT_WIDTH, LATE = 0.86, 1.2, 0.05
 # What is short, and why.
 _WIDER = "the posterior does not know the course, of which the ideal knows the shape"
 _ONSET = "where a loss began a while ago it may have begun at any of few logs, and may stop"
-_STEPS = "losses in steps are told from repairs and foreign changes one by one only"
+_STEPS = "each step of a loss is distinguished from repairs and foreign changes by itself"
 _SLOWER = "a mount that loosens ever more slowly may stop before the limit"
 NOT_MET = {
     "preload, all courses: guide_preload is held": "302 of 321 hold 90 %, more than are asked for: "

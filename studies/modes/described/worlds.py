@@ -37,7 +37,7 @@ class Case:
     bound: Array  # least standard deviations of ln f, (n_modes,)
 
     def request(self) -> dict[str, Any]:
-        """Return what an identification is told, as JSON can express it."""
+        """Return what an identification is given, as JSON can express it."""
         return {
             "rate": self.sample_rate,
             "modes": {f"m{k}": f for k, f in zip(self.described, self.declared, strict=True)},
