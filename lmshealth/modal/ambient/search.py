@@ -219,16 +219,19 @@ def _evidence(more: JointModel, less: JointModel) -> float:
 
 
 def _prune(model: JointModel) -> JointModel:
-    """Drop modes without evidence, the least likely first."""
+    """Drop modes without evidence, the least likely first.
+
+    Only the neighbours of a mode are refined without it; all modes are where that may decide.
+    """
     while model.f.size:
-        worst, least = None, constants.EVIDENCE_MARGIN
-        for i in _doubtful(model):
-            less = model.without(i)
-            less = less.refined(2, less.nearest(model.f[i])).refined(2)
-            evidence = _evidence(model, less)
-            if evidence < least:
-                worst, least = less, evidence
-        if worst is None:
+        less = [(model.without(i), float(model.f[i])) for i in _doubtful(model)]
+        tried = [one.refined(2, one.nearest(f)) for one, f in less]
+        if not tried:
+            break
+        worst = min(tried, key=partial(_evidence, model))
+        if _evidence(model, worst) >= constants.EVIDENCE_MARGIN:
+            worst = worst.refined(2)
+        if _evidence(model, worst) >= constants.EVIDENCE_MARGIN:
             break
         model = worst.refined(2)
     return model
@@ -374,6 +377,8 @@ def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
         if gains[best] < constants.LEAST_START:
             break
         chosen.append(rest.pop(best))
+        first = candidates[chosen[-1]]
+        rest = [k for k in rest if not _inseparable(candidates[k], first, data.scale)]
         s, floor = _update(data, b[:, :, chosen], block_diag(s, strength[best]), floor, 8)
     turn = np.exp(-0.5j * np.angle(np.sum(phi[chosen] ** 2, axis=1)))
     root = np.sqrt(np.diagonal(s).real)
@@ -381,6 +386,15 @@ def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
     real = np.real(phi[chosen] * turn[:, None]).T * (root / peak[chosen])
     return JointModel(data, floor, f[chosen], zeta[chosen], real, np.zeros_like(real), r)
+
+
+def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:
+    """Return whether no fit separates two poles: their motions are alike, their bands overlap."""
+    a, b = (c.shape / scale / np.linalg.norm(c.shape / scale) for c in (one, other))
+    apart = abs(one.frequency - other.frequency)
+    widths = one.frequency * one.damping_ratio + other.frequency * other.damping_ratio
+    alike = abs(a.conj() @ b) ** 2 > constants.ALIKE_MAC
+    return bool(alike and apart < constants.SEPARATION_ALIKE * widths)
 
 
 def _update(
