@@ -34,7 +34,7 @@ from lmshealth.modal.ambient.search import (
 from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import name_resonances
-from lmshealth.modal.targets import Target, check_band, choose_targets, limit_channels
+from lmshealth.modal.targets import Target, check_band, choose_channels, choose_targets
 from lmshealth.signal.segments import Segment, find_phases, stationary, with_few_lengths
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
@@ -142,7 +142,7 @@ def read_ambient(
 ) -> AmbientReading:
     """Identify modes as `identify` does; return them with the spectra and their fit."""
     check_band(log, band)
-    log = limit_channels(log, channels)
+    log = replace(log, channels=choose_channels(log, channels))
     hints, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
     while True:
         try:

@@ -95,13 +95,14 @@ def _distance_from_ends(fit: FittedSpectrum, f: float) -> float:
 def _direction(fit: FittedSpectrum, modes: Modes, i: int, shapes: ComplexArray) -> ComplexArray:
     """Return the shape of mode i, given shapes of all modes, ``(n_modes, n_channels)``."""
     frequency, f, zeta = fit.spectrum.frequency, modes.frequency, modes.damping_ratio
-    known = np.flatnonzero(np.isfinite(fit.expected[:, 0, 0]))  # no line
+    known = np.flatnonzero(np.isfinite(fit.density[:, 0]))  # no line
     off = np.abs(frequency[known] - f[i])
     reach = max(zeta[i] * f[i], np.sort(off)[:_LEAST_ORDINATES][-1])
     near = known[off <= reach]
     rest = near.size * np.eye(len(fit.channels), dtype=complex)
     if fit.spectrum.foreign is not None:
-        rest += fit.spectrum.foreign[near].sum(axis=0)
+        foreign = np.moveaxis(fit.spectrum.foreign[near], 1, 0).reshape(len(rest), -1)
+        rest += foreign @ foreign.conj().T
     for j in np.flatnonzero(np.isfinite(shapes).all(axis=1)):
         if j != i:
             psi = shapes[j] / fit.unit
@@ -109,5 +110,5 @@ def _direction(fit: FittedSpectrum, modes: Modes, i: int, shapes: ComplexArray) 
             gain = np.abs(response(f[j], zeta[j], frequency[near])) ** 2
             power = 4 * zeta[j] ** 2 * modes.snr[j] * float(gain.sum())
             rest += power * np.outer(psi, psi.conj())
-    _, vectors = eigh(fit.spectrum.matrix[near].sum(axis=0), rest)
+    _, vectors = eigh(fit.spectrum.sums([near])[0] / fit.spectrum.count, rest)
     return np.asarray(rest @ vectors[:, -1] * fit.unit, dtype=np.complex128)

@@ -94,7 +94,8 @@ def summarise(
     )  # fmt: skip
     edges = empty.edges
     weight = np.array([s.observed for s in spectra.spectra])
-    matrix = np.average([_binned(s, edges) for s in spectra.spectra], axis=0, weights=weight)
+    parts = [_binned(s, edges, whole=n_singular > 0) for s in spectra.spectra]
+    matrix = np.average(parts, axis=0, weights=weight)
     count = weight.sum() * np.diff(edges)
     level = _decibel(np.diagonal(matrix, axis1=1, axis2=2).real.T)
     expected = np.full_like(level, np.nan)
@@ -111,17 +112,22 @@ def summarise(
     )  # fmt: skip
 
 
-def _binned(spectrum: CrossSpectrum, edges: FloatArray) -> ComplexArray:
-    """Average the matrices within bins, shape ``(n_bins, n_channels, n_channels)``."""
-    n = spectrum.matrix.shape[1]
+def _binned(spectrum: CrossSpectrum, edges: FloatArray, *, whole: bool) -> ComplexArray:
+    """Average the matrices, or their diagonals, within bins: ``(n_bins, n_channels, n_channels)``.
+
+    Row by row: the matrices of many channels at all ordinates would not fit into memory.
+    """
+    n = spectrum.transforms.shape[2]
     cut = spectrum.band(edges[0] - 1 / spectrum.duration, edges[-1] + 2 / spectrum.duration)
     binned = np.zeros((edges.size - 1, n, n), dtype=complex)
     if not cut.frequency.size:
         return binned
-    parts = cut.matrix.reshape(cut.frequency.size, -1)
-    for k in range(n * n):
-        for part, unit in ((parts[:, k].real, 1.0), (parts[:, k].imag, 1j)):
-            binned[:, k // n, k % n] += unit * bin_density(cut, part, edges)
+    for i in range(n):
+        columns = range(n) if whole else [i]
+        row = cut.transforms[:, :, i, None] * cut.transforms[:, :, columns].conj()
+        for j, part in zip(columns, row.mean(axis=0).T, strict=True):
+            for own, unit in ((part.real, 1.0), (part.imag, 1j)):
+                binned[:, i, j] += unit * bin_density(cut, own, edges)
     for channel, frequency, amplitude in cut.lines:
         k = int(np.searchsorted(edges, frequency)) - 1
         if 0 <= k < len(binned):
@@ -133,7 +139,7 @@ def _binned(spectrum: CrossSpectrum, edges: FloatArray) -> ComplexArray:
 def _expected(fit: FittedSpectrum, edges: FloatArray) -> FloatArray:
     """Average the expected density of each channel in the bins that the fit covers; else NaN."""
     frequency = fit.spectrum.frequency
-    density = np.diagonal(fit.expected, axis1=1, axis2=2).real.T * fit.unit[:, None] ** 2
+    density = fit.density.T * fit.unit[:, None] ** 2
     known = np.isfinite(density[0])
     covered = (edges[:-1] >= frequency[0]) & (edges[1:] <= frequency[-1])
     rows = []

@@ -96,16 +96,16 @@ def modes_figure(
 
 def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSpectrum:
     """Subtract what stands for harmonics that wander: the expectation of modes and floors."""
-    expected = fit.expected
+    density = fit.density
     for part in reading.sought:
         names = part.spectra.channels
         if len(names) == 1 or not set(fit.channels) <= set(names):
             continue  # in a single channel their bands are left out
         rows = [names.index(name) for name in fit.channels]
         for one in part.harmonics:
-            there = one.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
-            expected = expected - there / np.outer(fit.unit, fit.unit)
-    return replace(fit, expected=expected)
+            there = one.expected(fit.spectrum.frequency)[:, rows, 0]
+            density = density - (np.abs(there) / fit.unit) ** 2
+    return replace(fit, density=density)
 
 
 def shapes_size(shapes: ModeShapes, stage: Stage | None) -> tuple[float, float]:

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Any, NamedTuple, Self
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import fft
 from scipy.stats import gamma
 
@@ -25,26 +26,44 @@ _LONG = 1 << 14
 _LEAST_PART = MINUTE // 2
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class CrossSpectrum:
-    """All channels as acceleration over one segment, or the mean over several of one length."""
+    """Transforms of all channels as acceleration over one segment, or several of one length.
+
+    Matrices of many channels are formed where they are needed, for a band or some directions.
+    """
 
     frequency: FloatArray  # Fourier frequencies in Hz, shape ``(n_ordinates,)``
-    # F F*, F the transforms of all channels; its diagonal holds their one-sided periodograms
-    # in (m/s²)²/Hz: the power spectral density times the mean of ``count`` exponential variables,
-    # shape ``(n_ordinates, n_channels, n_channels)``.
-    matrix: ComplexArray
+    # F of each segment in (m/s²)/Hz^½, ``(count, n_ordinates, n_channels)``
+    transforms: ComplexArray
     duration: float  # of a segment in s
     velocity: float  # set velocity in m/s, NaN where unknown
     free: BoolArray  # ordinates without a removed or masked line, shape ``(n_ordinates,)``
     # Index of the channel, frequency in Hz and amplitude in m/s² of each removed sinusoid.
     lines: tuple[tuple[int, float, float], ...] = ()
-    count: int = 1  # number of averaged segments
-    foreign: ComplexArray | None = None  # expectation of what no mode causes, as the matrix
-    transforms: ComplexArray | None = None  # F of each segment, (count, n_ordinates, n_channels)
+    # Columns G of the expectation G G* of what no mode causes, (n_ordinates, n_channels, n)
+    foreign: ComplexArray | None = None
 
     def __post_init__(self) -> None:
-        freeze(self, ("matrix", self.frequency.size, *self.matrix.shape[1:]))
+        n = self.transforms.shape
+        freeze(self, ("transforms", n[0], self.frequency.size, n[2]))
+
+    @cached_property
+    def matrix(self) -> ComplexArray:
+        """F F*, its mean over the segments, ``(n_ordinates, n_channels, n_channels)``.
+
+        Its diagonal holds the one-sided periodograms in (m/s²)²/Hz: the power spectral density
+        times the mean of ``count`` exponential variables.
+        """
+        rows = np.moveaxis(self.transforms, 0, -1)
+        matrix = np.asarray(rows @ np.swapaxes(rows.conj(), 1, 2) / self.count)
+        matrix.flags.writeable = False
+        return matrix
+
+    @property
+    def count(self) -> int:
+        """Number of averaged segments."""
+        return len(self.transforms)
 
     @property
     def observed(self) -> float:
@@ -58,12 +77,22 @@ class CrossSpectrum:
         return replace(
             self,
             frequency=self.frequency[cut],
-            matrix=self.matrix[cut],
+            transforms=self.transforms[:, cut],
             free=self.free[cut],
             lines=tuple(line for line in self.lines if low <= line[1] < high),
             foreign=None if self.foreign is None else self.foreign[cut],
-            transforms=None if self.transforms is None else self.transforms[:, cut],
         )
+
+    def project(self, basis: FloatArray) -> Self:
+        """Return the spectrum of other signals, basisᵀ x of the channels x."""
+        foreign = None if self.foreign is None else basis.T @ self.foreign
+        return replace(self, transforms=self.transforms @ basis, lines=(), foreign=foreign)
+
+    def sums(self, parts: Sequence[NDArray[np.intp]]) -> ComplexArray:
+        """Sum F F* over parts of the ordinates and the segments, ``(n_parts, n, n)``."""
+        n = self.transforms.shape[2]
+        rows = (self.transforms[:, part].reshape(-1, n) for part in parts)
+        return np.array([row.T @ row.conj() for row in rows]).reshape(-1, n, n)
 
     def without(self, lines: Sequence[float]) -> Self:
         """Mask lines at these frequencies in Hz: their width, at least two ordinates to a side."""
@@ -79,13 +108,13 @@ class CrossSpectrum:
         return replace(self, free=self.free & ((self.frequency < low) | (self.frequency > high)))
 
     def with_foreign(self, expected: Callable[[FloatArray], ComplexArray]) -> Self:
-        """Add an expectation, of the shape of ``matrix``, that is a function of frequency in Hz."""
-        added = expected(self.frequency)
-        return replace(self, foreign=added if self.foreign is None else self.foreign + added)
+        """Add columns of an expectation, a function of frequency in Hz, to those of ``foreign``."""
+        there = [] if self.foreign is None else [self.foreign]
+        return replace(self, foreign=np.concatenate([*there, expected(self.frequency)], axis=2))
 
     def powers(self) -> FloatArray:
         """Return the periodograms of all channels, shape ``(n_ordinates, n_channels)``."""
-        return np.asarray(np.diagonal(self.matrix, axis1=1, axis2=2).real)
+        return np.mean(self.transforms.real**2 + self.transforms.imag**2, axis=0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -125,14 +154,12 @@ class LogSpectra:
 
     def select(self, kept: Sequence[int]) -> Self:
         """Return some of the channels."""
-        rows, columns = np.ix_(kept, kept)
         spectra = tuple(
             replace(
                 s,
-                matrix=s.matrix[:, rows, columns],
+                transforms=s.transforms[:, :, kept],
                 lines=tuple((kept.index(c), f, a) for c, f, a in s.lines if c in kept),
-                foreign=None if s.foreign is None else s.foreign[:, rows, columns],
-                transforms=None if s.transforms is None else s.transforms[:, :, kept],
+                foreign=None if s.foreign is None else s.foreign[:, kept],
             )
             for s in self.spectra
         )
@@ -225,9 +252,7 @@ def transform_segment(
         (one.channel, (one.ordinate + 1) / duration, float(np.sqrt(2 * one.power / duration)))
         for one in sinusoids
     )
-    matrix = rest[:, :, None] * rest[:, None].conj()
-    velocity = segment.velocity
-    return CrossSpectrum(frequency, matrix, duration, velocity, free, lines, transforms=rest[None])
+    return CrossSpectrum(frequency, rest[None], duration, segment.velocity, free, lines)
 
 
 def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
@@ -255,18 +280,12 @@ def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
 
 
 def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
-    first = next(spectra)
-    total, free, lines, count = first.matrix, first.free, first.lines, 1
-    every = [] if first.transforms is None else [first.transforms]
-    for spectrum in spectra:
-        total, count = total + spectrum.matrix, count + 1
-        every += [] if spectrum.transforms is None else [spectrum.transforms]
-        free, lines = free & spectrum.free, (*lines, *spectrum.lines)
-    if count == 1:
-        return first
-    transforms = np.concatenate(every) if every else None
+    every = list(spectra)
     return replace(
-        first, matrix=total / count, free=free, lines=lines, count=count, transforms=transforms
+        every[0],
+        transforms=np.concatenate([one.transforms for one in every]),
+        free=np.all([one.free for one in every], axis=0),
+        lines=tuple(line for one in every for line in one.lines),
     )
 
 

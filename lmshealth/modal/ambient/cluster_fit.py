@@ -327,7 +327,7 @@ def prepare(
     level = binned.level[index]
     noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
     unit = np.sqrt(noise)
-    whole = spectra.select(index).each(partial(_turned, basis=np.diag(1 / unit)))
+    whole = spectra.select(index).each(partial(_over, unit=unit))
     cut = whole.each(lambda spectrum: spectrum.band(*band))
     cut = replace(cut, spectra=tuple(s for s in cut.spectra if s.frequency.size))
     moved = [t.amplitude[index] / unit for t in present if t.amplitude is not None]
@@ -335,8 +335,7 @@ def prepare(
     basis = _directions(moved, cut) if many else np.eye(unit.size)
     if basis.shape[1] < unit.size:
         names = tuple(f"direction {k}" for k in range(basis.shape[1]))
-        turn = partial(_turned, basis=basis)
-        ours = [replace(one.each(turn), channels=names, sources=(whole.source,) * len(names))
+        ours = [replace(one.each(partial(CrossSpectrum.project, basis=basis)), channels=names, sources=(whole.source,) * len(names))
                 for one in (cut, whole)]  # fmt: skip
         low, high = float(binned.frequency[0]), float(binned.frequency[-1])
         width = (high - low) / binned.frequency.size
@@ -348,15 +347,10 @@ def prepare(
     return ClusterData(cut, unit, basis, chosen, levels, masks, tuple(index))
 
 
-def _turned(spectrum: CrossSpectrum, basis: FloatArray) -> CrossSpectrum:
-    """Return the spectrum of other signals, basisᵀ x of the channels x."""
-    foreign, transforms = spectrum.foreign, spectrum.transforms
-    return replace(
-        spectrum,
-        matrix=basis.T @ spectrum.matrix @ basis,
-        foreign=None if foreign is None else basis.T @ foreign @ basis,
-        transforms=None if transforms is None else transforms @ basis,
-    )
+def _over(spectrum: CrossSpectrum, unit: FloatArray) -> CrossSpectrum:
+    """Return the spectrum in units of each channel."""
+    foreign = None if spectrum.foreign is None else spectrum.foreign / unit[:, None]
+    return replace(spectrum, transforms=spectrum.transforms / unit, foreign=foreign)
 
 
 def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArray:
@@ -368,9 +362,10 @@ def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArra
     columns = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
     foreign = [s.foreign for s in spectra.spectra if s.foreign is not None]
     if foreign:
-        parts = np.concatenate(foreign).real
-        vectors = np.linalg.eigh(parts.sum(axis=0))[1].T
-        most = np.einsum("kab,va,vb->vk", parts, vectors, vectors, optimize=True).max(axis=1)
+        parts = np.concatenate(foreign)  # (n_ordinates, n_channels, n)
+        rows = np.moveaxis(parts, 1, 0).reshape(parts.shape[1], -1)
+        vectors = np.linalg.eigh((rows @ rows.conj().T).real)[1].T
+        most = np.sum(np.abs(vectors @ parts) ** 2, axis=2).max(axis=0)
         columns += list(vectors[most > _FOREIGN])
     columns = [column / np.linalg.norm(column) for column in columns]
     u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
@@ -611,29 +606,27 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     lines = _excluded_lines(data, f[narrow])
     whole = data.whole.spectra[data.longest]
-    fitted = FittedSpectrum(channels, data.unit, whole, _of_channels(data, expected[data.longest]))
+    fitted = FittedSpectrum(channels, data.unit, whole, _density(data, expected[data.longest]))
     fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
     return ClusterFit(ClusterModes(modes, np.array(_losses(optimum)), lines, fitted), rejected)
 
 
-def _of_channels(data: ClusterData, expected: ComplexArray) -> ComplexArray:
-    """Return an expectation for all channels: in other directions there is noise, and the foreign.
+def _density(data: ClusterData, expected: ComplexArray) -> FloatArray:
+    """Return the density of each channel: in other directions there is noise, and the foreign.
 
-    Infinite on the diagonal where that of the directions is.
+    Infinite where the expectation of the directions, ``(n_ordinates, n, n)``, is.
     """
-    basis, whole = data.basis, data.whole.spectra[data.longest]
-    if basis.shape[1] == len(basis):
-        return expected
+    basis, foreign = data.basis, data.whole.spectra[data.longest].foreign
     known = np.isfinite(expected[:, 0, 0])
-    rest = np.eye(len(basis)) - basis @ basis.T
-    full = np.tile(np.diag(np.full(len(basis), np.inf)).astype(complex), (known.size, 1, 1))
-    full[known] = basis @ expected[known] @ basis.T + rest
-    if whole.foreign is not None:
-        inside = basis @ basis.T
-        full[known] += whole.foreign[known] - inside @ whole.foreign[known] @ inside
-    return full
+    density = np.full((known.size, len(basis)), np.inf)
+    inside = np.sum((basis @ expected[known].real) * basis, axis=2)
+    density[known] = inside + 1 - np.sum(basis**2, axis=1)
+    if foreign is not None and basis.shape[1] < len(basis):
+        own = basis @ (basis.T @ foreign[known])
+        density[known] += np.sum(np.abs(foreign[known]) ** 2 - np.abs(own) ** 2, axis=2)
+    return density
 
 
 def _excluded_lines(data: ClusterData, found: FloatArray) -> tuple[LineEstimate, ...]:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.modes import Modes, Rejection
 from lmshealth.signal.spectra import CrossSpectrum
@@ -33,7 +33,7 @@ class FittedSpectrum:
     channels: tuple[str, ...]
     unit: FloatArray  # root of the noise of the channels in (m/s²)/Hz^½, (n_channels,)
     spectrum: CrossSpectrum  # in these units
-    expected: ComplexArray  # of its matrix, by the fit; infinite at lines
+    density: FloatArray  # of the channels by the fit, infinite at lines, (n_ordinates, n_channels)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

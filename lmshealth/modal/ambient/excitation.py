@@ -49,13 +49,13 @@ def unsteadiness(
     """Compute the unsteadiness of the force of a mode from its kurtosis; 1 for a steady force.
 
     ``masks`` hold the ordinates without lines, ``expected`` the expectation of each spectrum, and
-    ``shape`` the mode, ``(n_channels,)``. Without transforms the ratio is 1.
+    ``shape`` the mode, ``(n_channels,)``.
     """
     fourth = square = total = 0.0
     n = 0
     for spectrum, mask, e in zip(spectra, masks, expected, strict=True):
         near = mask & (np.abs(spectrum.frequency - f) < _BAND * zeta * f)
-        if spectrum.transforms is None or not near.any():
+        if not near.any():
             continue
         place = np.flatnonzero(near)
         # The force as the channels show it best, h* φᵀ E⁻¹ F, at twice the rate of its band.

@@ -122,7 +122,10 @@ def average_ordinates(
         total += (spectrum.count * mask)[:, None, None] * spectrum.matrix
     kept: BoolArray = count > 0
     frequency, count, total = first.frequency[kept], count[kept], total[kept]
-    foreign = None if first.foreign is None else first.foreign[kept]
+    foreign = None
+    if first.foreign is not None:
+        columns = first.foreign[kept]
+        foreign = np.asarray(columns @ np.swapaxes(columns.conj(), 1, 2))
     resolution = bandwidth * first.duration
     n_segments = sum(spectrum.count for spectrum in spectra)
     if resolution < _RESOLVED * n_segments:

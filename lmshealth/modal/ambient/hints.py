@@ -65,8 +65,8 @@ def _real_part(spectra: LogSpectra, frequency: float, width: float) -> FloatArra
     for s in spectra.spectra:
         near = s.free & (np.abs(s.frequency - frequency) < max(width, 1.5 / s.duration))
         if s.foreign is not None:
-            near &= np.trace(s.foreign, axis1=1, axis2=2).real == 0
-        total += s.count * s.matrix[near].sum(axis=0).real
+            near &= ~s.foreign.any(axis=(1, 2))
+        total += s.sums([np.flatnonzero(near)])[0].real
     return total
 
 

@@ -34,6 +34,13 @@ class BandData:
     scale: FloatArray  # unit of each channel in (m/s²)/Hz^½, (n_channels,)
     basis: FloatArray  # of the floors, positive, (n_basis, n)
 
+    def of_channels(self, kept: Sequence[int]) -> BandData:
+        """Return the data of some of the channels."""
+        block = np.ix_(range(len(self.count)), kept, kept)
+        foreign = None if self.foreign is None else self.foreign[block]
+        scale = self.scale[list(kept)]
+        return replace(self, matrix=self.matrix[block], foreign=foreign, scale=scale)
+
 
 def expectation(
     data: BandData, b: ComplexArray, s: ComplexArray | FloatArray, floor: FloatArray
@@ -96,13 +103,58 @@ class JointModel:
             r=block_diag(self.r, np.eye(1)),
         )
 
-    def of_channels(self, kept: list[int]) -> JointModel:
+    def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
-        d, block = self.data, np.ix_(range(len(self.data.count)), kept, kept)
-        foreign = None if d.foreign is None else d.foreign[block]
-        data = replace(d, matrix=d.matrix[block], foreign=foreign, scale=d.scale[kept])
-        rows = {"floor": self.floor[kept], "phi": self.phi[kept], "rho": self.rho[kept]}
-        return replace(self, data=data, **rows)
+        rows = {"floor": self.floor, "phi": self.phi, "rho": self.rho}
+        own = {name: values[list(kept)] for name, values in rows.items()}
+        return replace(self, data=self.data.of_channels(kept), **own)
+
+    def on(self, data: BandData) -> JointModel:
+        """Return the model of other bins of the same channels, which have units of their own."""
+        ratio = (self.data.scale / data.scale)[:, None]
+        floor = np.maximum(self.floor * ratio**2, LEAST_FLOOR)
+        return replace(self, data=data, floor=floor, phi=self.phi * ratio, rho=self.rho * ratio)
+
+    def with_channels(self, data: BandData) -> JointModel:
+        """Add the last channels of the data, by regression on what the model's channels show."""
+        n, more = len(self.phi), data.scale.size - len(self.phi)
+        h = response(self.f[:, None], self.zeta[:, None], self.data.frequency)
+        # Expected cross spectra of a channel with the others, per unit of its part in each mode.
+        unit = h.T[:, :, None] * (self.r @ np.swapaxes(self._b.conj(), 1, 2))
+        weighted = data.count[:, None, None] * (unit @ self._inverse)
+        seen = data.matrix[:, n:, :n]
+        if data.foreign is not None:
+            seen = seen - data.foreign[:, n:, :n]
+        normal = np.einsum("kia,kja->ij", weighted, unit.conj()).real
+        right = np.einsum("kia,kca->ic", weighted, seen.conj()).real
+        phi = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), right).T
+        floor = np.full((more, self.floor.shape[1]), 0.5)
+        return replace(
+            self,
+            data=data,
+            floor=np.concatenate([self.floor, floor]),
+            phi=np.concatenate([self.phi, phi]),
+            rho=np.concatenate([self.rho, np.zeros_like(phi)]),
+        )
+
+    def joined(self, other: JointModel, n_common: int, data: BandData) -> JointModel:
+        """Add the channels of another model after the first ones, which both have in common.
+
+        Its modes are the same, better known, and possibly further ones that only it shows.
+        """
+        further = ((0, 0), (0, other.f.size - self.f.size))
+        phi, rho = (np.pad(rows[n_common:], further) for rows in (self.phi, self.rho))
+
+        def rows(own: FloatArray, between: FloatArray) -> FloatArray:
+            return np.concatenate([own[:n_common], between, own[n_common:]])
+
+        return replace(
+            other,
+            data=data,
+            floor=rows(other.floor, self.floor[n_common:]),
+            phi=rows(other.phi, phi),
+            rho=rows(other.rho, rho),
+        )
 
     @property
     def size(self) -> int:
@@ -125,10 +177,10 @@ class JointModel:
         return expectation(self.data, self._b, self.r, self.floor)
 
     def modal(self, kept: BoolArray, frequency: FloatArray) -> ComplexArray:
-        """Return the part of some modes in the expectation, in physical units."""
+        """Return columns of the part of some modes in the expectation, in physical units."""
         part = self.subset(kept)
         b = part._columns(frequency) * self.data.scale[:, None]
-        return np.asarray(b @ part.r @ np.swapaxes(b.conj(), 1, 2))
+        return np.asarray(b @ np.linalg.cholesky(part.r))
 
     def dispersions(self) -> FloatArray:
         """Return the dispersion of the residual of each channel given the others; 1 for noise.

@@ -3,7 +3,9 @@
 Candidates are the stable poles of a subspace model. Those that the cross spectra need start a joint
 model of the band, which is refined, pruned by evidence and extended where its residual shows
 further modes. Modes of constant amplitude are harmonics that wander: they are left out, and the
-search is repeated.
+search is repeated. Of many channels those that add most to each other are searched first; the
+others are added to the model a few at a time, with the modes that only they show, so that the time
+is proportional to their number.
 """
 
 from __future__ import annotations
@@ -40,6 +42,8 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 # fraction of the frequency.
 _BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
 _MOST_HARMONICS = 6
+# Channels that are searched together, and that are added to these at a time.
+_FIRST, _MORE = 6, 6
 # A pole at a line that is narrower than so many of its widths is what masking left of it.
 _FOOT = 5.0
 # A mode is tried without if its loss, the others fixed, is below the first, or another one is
@@ -107,13 +111,25 @@ def search(
     level = sum(s.powers().sum(axis=0) for s in spectra.spectra)
     silent = [name for name, power in zip(every, level, strict=True) if not power > 0]
     spectra = spectra.select([c for c, name in enumerate(every) if name not in silent] or [0])
+    first = _informative(spectra, low, high)
     while True:
-        model, harmonics, after, poles = _explain(spectra, low, high, suspected, hints)
+        searched = spectra.select(first)
+        model, harmonics, after, poles = _explain(searched, low, high, suspected, hints)
         kept = _consistent(model)
-        if len(kept) == len(spectra.channels):
+        if len(kept) == len(first):
             break
-        spectra = spectra.select(kept)
+        # Another channel takes the place of one that is unlike the others.
+        fewer = {first[k] for k in range(len(first)) if k not in kept}
+        spectra = spectra.select([c for c in range(len(spectra.channels)) if c not in fewer])
+        first = _informative(spectra, low, high)
     model = _without_splits(model, len(hints)) if hints else model
+    if len(first) < len(spectra.channels):
+        harmonics = tuple(one.seen_by(first, spectra.longest) for one in harmonics)
+        for one in harmonics:
+            spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
+        model, used = _of_all_channels(model, spectra, first, low, high)
+        after = spectra.select(used)
+        harmonics = tuple(one.of_channels(used) for one in harmonics)
     # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
     width = 2 * model.zeta
     light = [hint for hint in hints if 2 * hint.damping_ratio < _FOOT * LINE_WIDTH]
@@ -135,6 +151,57 @@ def search(
     )
     left_out = tuple(name for name in every if name not in (*after.channels, *silent))
     return Found(modes, harmonics, after, model, (low, high), left_out, poles)
+
+
+def _informative(spectra: LogSpectra, low: float, high: float) -> list[int]:
+    """Return the channels that add most to each other, by a pivoted Cholesky decomposition.
+
+    In units of the median of each channel, so that they are those whose resonances stand out.
+    """
+    n = len(spectra.channels)
+    if n <= _FIRST:
+        return list(range(n))
+    longest = spectra.longest.band(low, high)
+    free = np.flatnonzero(longest.free)
+    scale = np.sqrt(np.median(longest.powers()[free], axis=0).clip(1e-300))
+    rest = longest.sums([free])[0].real / np.outer(scale, scale)
+    chosen: list[int] = []
+    while len(chosen) < _FIRST:
+        left = np.diagonal(rest).copy()
+        left[chosen] = -np.inf
+        best = int(left.argmax())
+        chosen.append(best)
+        rest = rest - np.outer(rest[:, best], rest[best]) / max(left[best], 1e-300)
+    return sorted(chosen)
+
+
+def _of_all_channels(
+    model: JointModel, spectra: LogSpectra, first: list[int], low: float, high: float
+) -> tuple[JointModel, list[int]]:
+    """Add the channels to a model of the first ones, with the modes that only they show.
+
+    Returns also which channels the modes explain.
+    """
+    poles = zip(model.f.tolist(), model.zeta.tolist(), model.phi.T + 0j, strict=True)
+    whole = _bin(spectra, [Candidate(*pole, 1.0) for pole in poles], low, high)
+    model = model.on(whole.of_channels(first))
+    n, order = len(first), list(first)
+    others = [c for c in range(whole.scale.size) if c not in first]
+    for start in range(0, len(others), _MORE):
+        added = others[start : start + _MORE]
+        part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
+        part = part.refined(2)
+        for _ in range(_ROUNDS):
+            more = _grow(part)
+            if more is None:
+                break
+            part = more.refined(2)
+        explained = [k for k in _consistent(part) if k >= n]
+        order += [added[k - n] for k in explained]
+        part = part.of_channels([*range(n), *explained])
+        model = model.joined(part, n, whole.of_channels(order))
+    place = np.argsort(order).tolist()
+    return model.of_channels(place), sorted(order)
 
 
 def _explain(
@@ -451,14 +518,14 @@ def _bin(spectra: LogSpectra, candidates: list[Candidate], low: float, high: flo
     matrix, foreign = np.zeros((2, n_bins, n, n), dtype=complex)
     count, frequency = np.zeros((2, n_bins))
     for s in spectra.spectra:
-        number = np.searchsorted(edges, s.frequency) - 1
-        within = s.free & (number >= 0) & (number < n_bins)
-        at = number[within]
-        np.add.at(count, at, s.count)
-        np.add.at(frequency, at, s.count * s.frequency[within])
-        np.add.at(matrix, at, s.count * s.matrix[within])
+        place = np.searchsorted(s.frequency, edges)
+        parts = [a + np.flatnonzero(s.free[a:b]) for a, b in pairwise(place.tolist())]
+        count += [s.count * part.size for part in parts]
+        frequency += [s.count * s.frequency[part].sum() for part in parts]
+        matrix += s.sums(parts)
         if s.foreign is not None:
-            np.add.at(foreign, at, s.count * s.foreign[within])
+            columns = (np.moveaxis(s.foreign[part], 1, 0).reshape(n, -1) for part in parts)
+            foreign += [s.count * own @ own.conj().T for own in columns]
     kept = count > 0
     count, frequency = count[kept], frequency[kept] / count[kept]
     matrix, foreign = matrix[kept] / count[:, None, None], foreign[kept] / count[:, None, None]

@@ -65,7 +65,7 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[
     candidates, poles = _cluster(poles)
     stable = [one for one in _merge(candidates) if low <= one.frequency <= high]
     place = np.searchsorted(longest.frequency[:-1], [one.frequency for one in stable])
-    levels = _smooth_level(np.diagonal(longest.matrix, axis1=1, axis2=2).real)[place]
+    levels = _smooth_level(longest.powers())[place]
     # From whitened to physical channels.
     rows = zip(stable, levels, strict=True)
     return [replace(one, shape=one.shape * level) for one, level in rows], poles
@@ -96,7 +96,7 @@ def _whitened(spectrum: CrossSpectrum) -> Iterator[ComplexArray]:
 
     Masked ordinates are replaced by their surroundings.
     """
-    matrix = _project(spectrum)
+    transforms = _project(spectrum)
     masked, free = np.flatnonzero(~spectrum.free), np.flatnonzero(spectrum.free)
     near: np.ndarray | None = None
     if masked.size and free.size > 2 * _NEAR_LINE:
@@ -105,33 +105,35 @@ def _whitened(spectrum: CrossSpectrum) -> Iterator[ComplexArray]:
         near = np.stack([free[np.clip(place + k, 0, free.size - 1)] for k in reach])
 
     def repaired(part: ComplexArray) -> ComplexArray:
-        part = part.copy()
         if near is not None:
             part[masked] = part[near].mean(axis=0)
         return part
 
-    level = _smooth_level(repaired(np.diagonal(matrix, axis1=1, axis2=2)).real)
+    powers = np.mean(np.abs(transforms) ** 2, axis=0)
+    level = _smooth_level(repaired(powers.astype(np.complex128)).real)
     for i in range(level.shape[1]):
-        yield repaired(matrix[:, i]) / (level[:, [i]] * level)
+        row = np.mean(transforms[:, :, i, None] * transforms.conj(), axis=0)
+        yield repaired(row) / (level[:, [i]] * level)
 
 
 def _project(spectrum: CrossSpectrum) -> ComplexArray:
-    """Return the matrices without the directions of what no mode causes."""
+    """Return the transforms without the directions of what no mode causes."""
     if spectrum.foreign is None:
-        return spectrum.matrix
-    matrix = spectrum.matrix.copy()
-    within = np.flatnonzero(np.trace(spectrum.foreign, axis1=1, axis2=2).real)
-    level = np.diagonal(matrix[within], axis1=1, axis2=2).real.mean(axis=0)
-    root = np.sqrt(level.clip(1e-300))
-    whole = np.outer(root, root)
-    directions, place = np.unique(spectrum.foreign[within], axis=0, return_inverse=True)
-    for k, foreign in enumerate(directions):
-        value, vector = np.linalg.eigh(foreign / whole)
-        kept = vector[:, value < 1e-6 * value[-1]]
-        project = kept @ kept.conj().T
+        return spectrum.transforms
+    shown = spectrum.foreign.any(axis=1)
+    within = np.flatnonzero(shown.any(axis=1))
+    root = np.sqrt(spectrum.powers()[within].mean(axis=0).clip(1e-300))
+    transforms = spectrum.transforms.copy()
+    patterns, place = np.unique(shown[within], axis=0, return_inverse=True)
+    for k, pattern in enumerate(patterns):
         at = within[place.ravel() == k]
-        matrix[at] = project @ (matrix[at] / whole) @ project * whole
-    return matrix
+        # A direction does not change within the band of what causes it.
+        foreign = spectrum.foreign[at[0]][:, pattern] / root[:, None]
+        u, s, _ = np.linalg.svd(foreign, full_matrices=False)
+        u = u[:, s > 1e-3 * s[0]]
+        rest = transforms[:, at] / root
+        transforms[:, at] = (rest - rest @ u.conj() @ u.T) * root
+    return transforms
 
 
 def _smooth_level(power: FloatArray) -> FloatArray:

@@ -9,7 +9,7 @@ mode's.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.linalg import eigh
@@ -35,19 +35,35 @@ _WIDER = 0.3
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Harmonic:
-    """A harmonic that wanders, with the covariance by which its direction is left out."""
+    """A harmonic that wanders, with its direction, which is left out."""
 
     frequency: float  # mean in Hz
     low: float  # of its band, in Hz
     high: float
     amplitude: float  # root mean square times √2 in the channel that shows it best, m/s²
     channel: int
-    covariance: ComplexArray  # (n_channels, n_channels)
+    vector: ComplexArray  # column v of its covariance v v*, in (m/s²)/Hz^½, (n_channels,)
+    first: int  # ordinate of the recording at which its signal begins
+    signal: ComplexArray  # its transform, of which the channels show ``vector`` times
 
     def expected(self, frequency: FloatArray) -> ComplexArray:
-        """Return the covariance in its band and zero elsewhere, frequency first."""
+        """Return the column in its band and zero elsewhere, ``(n, n_channels, 1)``."""
         within = (frequency >= self.low) & (frequency <= self.high)
-        return np.asarray(within[:, None, None] * self.covariance)
+        return np.asarray(within[:, None, None] * self.vector[:, None])
+
+    def seen_by(self, channels: Sequence[int], recording: CrossSpectrum) -> Harmonic:
+        """Return it for all channels of a recording, of which it was found in ``channels``."""
+        seen = recording.transforms[0, self.first : self.first + self.signal.size]
+        vector = self.signal.conj() @ seen / np.sum(np.abs(self.signal) ** 2)
+        vector[list(channels)] = self.vector
+        return replace(self, vector=vector, channel=channels[self.channel])
+
+    def of_channels(self, kept: Sequence[int]) -> Harmonic:
+        """Return it for some of its channels."""
+        vector = self.vector[list(kept)]
+        best = int(np.abs(vector).argmax())
+        amplitude = self.amplitude * float(abs(vector[best] / self.vector[self.channel]))
+        return replace(self, vector=vector, channel=best, amplitude=amplitude)
 
 
 def find_harmonic(
@@ -98,7 +114,6 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
     if frequency.size < _LEAST_ORDINATES:
         return None
     weights = np.stack([np.interp(frequency, model.data.frequency, w) for w in weight.T], axis=1)
-    assert recording.transforms is not None  # spectra of logs have them
     transforms = recording.transforms[0, first:last] * recording.free[first:last, None]
     z = np.sum(weights.conj() * transforms / model.data.scale, axis=1)
     noise = np.interp(frequency, model.data.frequency, 1 / precision)
@@ -111,6 +126,7 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
         return None
     windows = [slice(*np.searchsorted(frequency, [f0 * (1 - w), f0 * (1 + w)])) for w in _WIDTHS]
     sigmas = min(_constancy(z[w], level[w]) for w in (within, *windows))
+    size = 10 * float(np.sqrt(level[within].max()))  # far above its level: nothing is left of it
     physical = phi * model.data.scale
     channel = int(np.argmax(np.abs(physical)))
     more = _WIDER * float(wide[-1] - wide[0])
@@ -120,7 +136,9 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
         float(wide[-1]) + more,
         float(np.sqrt(2 * power.sum() / recording.duration) * abs(physical[channel])),
         channel,
-        1e2 * float(level[within].max()) * np.outer(physical, physical.conj()),
+        size * physical,
+        int(first) + within.start,
+        z[within] / size,
     )
 
 
