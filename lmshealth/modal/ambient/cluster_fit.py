@@ -36,7 +36,7 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 _UPDATES, _STRIDE = 25, 1.8
 # So many channels are fitted as they are. Of more, what is foreign is fitted where it is above this
 # share of the noise; least singular value of shapes that are independent.
-_FEW, _FOREIGN, _INDEPENDENT = 4, 0.3, 1e-3
+_FEW, _INDEPENDENT = 4, 0.1
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
 _COLLAPSED = 0.1
 # That with which a pole begins anew beside a line.
@@ -354,22 +354,24 @@ def _over(spectrum: CrossSpectrum, unit: FloatArray) -> CrossSpectrum:
 
 
 def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArray:
-    """Return an orthonormal basis of the shapes of modes and of what is foreign to them.
+    """Return an orthonormal basis of the directions in which the modes are seen best.
 
-    Both in units of the noise, in which nothing else distinguishes directions; of what is foreign
-    that which is above a share of the noise.
+    They are the shapes φ, and (1 + G G*)⁻¹ φ, which avoids what is foreign, at all ordinates; both
+    in units of the noise, in which nothing else distinguishes directions.
     """
-    columns = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
-    foreign = [s.foreign for s in spectra.spectra if s.foreign is not None]
-    if foreign:
-        parts = np.concatenate(foreign)  # (n_ordinates, n_channels, n)
-        rows = np.moveaxis(parts, 1, 0).reshape(parts.shape[1], -1)
-        vectors = np.linalg.eigh((rows @ rows.conj().T).real)[1].T
-        most = np.sum(np.abs(vectors @ parts) ** 2, axis=2).max(axis=0)
-        columns += list(vectors[most > _FOREIGN])
-    columns = [column / np.linalg.norm(column) for column in columns]
-    u, s, _ = np.linalg.svd(np.stack(columns, axis=1), full_matrices=False)
-    return np.asarray(u[:, s > _INDEPENDENT])
+    shapes = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
+    phi = np.stack(shapes, axis=1) / np.linalg.norm(shapes, axis=1)
+    columns = [phi]
+    for s in spectra.spectra:
+        if s.foreign is not None:
+            adjoint = np.swapaxes(s.foreign.conj(), 1, 2)
+            share = np.linalg.solve(np.eye(len(adjoint[0])) + adjoint @ s.foreign, adjoint @ phi)
+            best = phi - s.foreign @ share
+            best = best / np.linalg.norm(best, axis=1, keepdims=True)
+            rows = np.moveaxis(best, 1, 0).reshape(len(phi), -1) / np.sqrt(s.frequency.size)
+            columns += [rows.real, rows.imag]
+    u, size, _ = np.linalg.svd(np.concatenate(columns, axis=1), full_matrices=False)
+    return np.asarray(u[:, size > _INDEPENDENT])
 
 
 def mask_prominent_lines(data: ClusterData) -> ClusterData:

@@ -44,6 +44,8 @@ _BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
 _MOST_HARMONICS = 6
 # Channels that are searched together, and that are added to these at a time.
 _FIRST, _MORE = 6, 6
+# Of these, whose modes are not all refined, a residual shows a further mode from a larger gain on.
+_CLEARLY = 3.0
 # A pole at a line that is narrower than so many of its widths is what masking left of it.
 _FOOT = 5.0
 # A mode is tried without if its loss, the others fixed, is below the first, or another one is
@@ -130,7 +132,8 @@ def search(
         model, used = _of_all_channels(model, spectra, first, low, high)
         after = spectra.select(used)
         harmonics = tuple(one.of_channels(used) for one in harmonics)
-    # What is as narrow as a line, or is the foot of one, stays in the model, as foreign to modes.
+    # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
+    # foreign to modes.
     width = 2 * model.zeta
     light = [hint for hint in hints if 2 * hint.damping_ratio < _FOOT * LINE_WIDTH]
     narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
@@ -138,6 +141,7 @@ def search(
         near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH)
     )
     wide = (wide | narrow) & (width * model.f * spectra.duration > 1)
+    wide &= model.zeta < constants.MOST_DAMPING
     modes = tuple(
         Target(
             f"mode_{number}",
@@ -190,9 +194,9 @@ def _of_all_channels(
     for start in range(0, len(others), _MORE):
         added = others[start : start + _MORE]
         part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
-        part = part.refined(2)
+        part = part.refined(6)
         for _ in range(_ROUNDS):
-            more = _grow(part)
+            more = _grow(part, _CLEARLY * constants.LEAST_EXCESS)
             if more is None:
                 break
             part = more.refined(2)
@@ -314,10 +318,10 @@ def _doubtful(model: JointModel) -> list[int]:
     return [int(i) for i in losses.argsort() if losses[i] < _DOUBTFUL or near[i]][:_MOST_TRIED]
 
 
-def _grow(model: JointModel) -> JointModel | None:
+def _grow(model: JointModel, least: float = constants.LEAST_EXCESS) -> JointModel | None:
     """Add the mode that the residual shows most clearly; None where there is no evidence."""
     for gain, f, zeta, phi in _excesses(model)[:2]:
-        if gain < constants.LEAST_EXCESS:
+        if gain < least:
             break
         more = model.with_mode(f, zeta, phi)
         more = more.refined(3, more.nearest(f))
