@@ -25,8 +25,8 @@ from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_be
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import shown
 from lmshealth.modal.acceleration_survey import survey
-from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
-from lmshealth.modal.frf.measured import MeasuredResponse, read_responses
+from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf, read_measured
+from lmshealth.modal.deterministic.measured import MeasuredResponse, read_responses
 from lmshealth.modal.identification import ModalReading, read_ambient, read_decays, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes

@@ -37,8 +37,8 @@ from lmshealth.modal.ambient.search import (
     split_groups,
 )
 from lmshealth.modal.ambient.wandering import near_lines
-from lmshealth.modal.free_decay.identification import identify_decays
-from lmshealth.modal.frf.identification import read_frf
+from lmshealth.modal.deterministic.free_decays import identify_decays
+from lmshealth.modal.deterministic.frequency_response import read_frf
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import name_resonances
 from lmshealth.modal.targets import (

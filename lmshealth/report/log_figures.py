@@ -19,8 +19,8 @@ from lmshealth._private.files import write_bytes, write_text
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.search import Found
-from lmshealth.modal.frf.identification import FrfReading
-from lmshealth.modal.frf.measured import MeasuredResponse
+from lmshealth.modal.deterministic.frequency_response import FrfReading
+from lmshealth.modal.deterministic.measured import MeasuredResponse
 from lmshealth.modal.identification import ModalReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes

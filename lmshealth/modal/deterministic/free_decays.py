@@ -15,14 +15,15 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.free_decay.decay_fit import (
+from lmshealth.modal.deterministic.decay_fit import (
     DecayEstimate,
-    DecayFit,
     estimate,
     fit_decays,
+    peak_snr,
     stationarity,
 )
-from lmshealth.modal.free_decay.transient_likelihood import transform_decays
+from lmshealth.modal.deterministic.likelihood import transform_decays
+from lmshealth.modal.deterministic.poles import PoleFit
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
 from lmshealth.modal.naming import assign, is_near, pairing_probability
 from lmshealth.modal.targets import (
@@ -255,8 +256,8 @@ def _fit_band(
     Right after a stop the machine still moves and is nonlinear: two poles within a Fourier
     frequency, or a strong uncertain one, show it.
     """
-    nonstationary: DecayFit | None = None
-    stationary: DecayFit | None = None
+    nonstationary: PoleFit | None = None
+    stationary: PoleFit | None = None
     for skip in _SKIPS:
         blocks = tuple(transform_decays(samples, sample_rate, *ends) for samples in cut(skip))
         fit = fit_decays(blocks, displacement=channels[0].kind == "displacement")
@@ -321,7 +322,7 @@ def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], Range
 
 
 def _accept(
-    fit: DecayFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
+    fit: PoleFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
 ) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
     source, lines = _SOURCES[channels[0].kind], fit.is_line()
@@ -329,7 +330,9 @@ def _accept(
     modal: list[int] = []
 
     def pole(i: int, rejection: Rejection | None) -> _Pole:
-        return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
+        return _Pole(
+            float(fit.frequency[i]), float(fit.damping_ratio[i]), peak_snr(fit, i), rejection
+        )
 
     for i, f in enumerate(fit.frequency.tolist()):
         if not limits[0] <= f <= limits[1]:
@@ -357,7 +360,7 @@ def _accept(
     return _BandModes(source, (*poles, *found), modes.select(credible))
 
 
-def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
+def _incredible(fit: PoleFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
     """Return why the k-th estimate, of pole i, is not credible; None if it is."""
     n = result.excitation.size
     f, zeta = np.exp(result.mean[[k, n + k]]).tolist()

@@ -1,11 +1,12 @@
 """Fit of a frequency response: number of modes, noise and distortion, covariance."""
 
 from dataclasses import dataclass, replace
+from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
 
-from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, stack
 from lmshealth.modal import constants
 from lmshealth.modal.credibility import (
     Credibility,
@@ -14,23 +15,31 @@ from lmshealth.modal.credibility import (
     small_sample,
     widened,
 )
-from lmshealth.modal.frf.rational import (
-    ModelOrder,
-    Ordinates,
-    Solution,
-    best_place,
-    refine,
-    slopes,
-    solve,
+from lmshealth.modal.deterministic.likelihood import BandSpectra, ModalLikelihood, pole_terms
+from lmshealth.modal.deterministic.poles import (
+    PoleFit,
+    best_pole,
+    evidence_needed,
+    maximise,
     vector_fit,
 )
-from lmshealth.modal.frf.responses import smooth_noise
+from lmshealth.modal.deterministic.responses import Ordinates, smooth_noise
 from lmshealth.modal.modes import paired
 
 # Powers of s, downwards and upwards. Weak modes outside the band bias those inside by up to one
 # standard deviation with four powers, by half of one with six. Powers enter in pairs: an even one
 # for elasticity, an odd one for loss.
 FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
+# A transient is smooth over a band: powers of s.
+_TRANSIENT_POWERS = (-1, 0, 1)
+# Damping ratios at which modes are searched for, and the largest one.
+_TRIED_DAMPING, _MOST_DAMPING = (0.003, 0.01, 0.03, 0.1), 0.7
+# Damping ratio that is left of a mode all of whose damping is that of a window, at most.
+NO_DAMPING = 1e-9
+# Relative singular value below which a direction of the powers is dropped.
+_THIN = 1e-12
+# Tolerance in log likelihood of a fit.
+_TOLERANCE = 1e-4
 # Lines over which the noise of a record that is not periodic is averaged.
 _NOISE_LINES = 41
 # Least standard deviation of unknown noise over the largest response: six digits.
@@ -82,7 +91,7 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     Order, noise, distortion and covariance are those of the section Model in the README of the
     folder [Pintelon2012].
     """
-    start = ModelOrder(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
+    start = _Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
     state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
@@ -97,11 +106,11 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
 def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
     """Remove the damping that an exponential window exp(-t/τ) has added, 1/τ of ζω.
 
-    A mode whose decay is that of the window keeps a damping below `LEAST_DAMPING`.
+    A mode whose decay is that of the window keeps one below `NO_DAMPING`.
     """
     m = fit.estimate.size // 2
     w, zeta = 2 * np.pi * np.exp(fit.estimate[:m]), np.exp(fit.estimate[m:])
-    decay = np.maximum(zeta * w - 1 / time_constant, 1e-9 * zeta * w)
+    decay = np.maximum(zeta * w - 1 / time_constant, NO_DAMPING / 2 * w)
     own = np.hypot(w * np.sqrt(1 - zeta**2), decay)
     turn = np.eye(2 * m)
     turn[m:, m:] = np.diag(zeta * w / decay)
@@ -115,14 +124,108 @@ def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
+class _Order:
+    """Order of a model, with start values of its modes."""
+
+    theta: FloatArray  # [ln f, ln ζ] of the modes, (2 n_modes,)
+    low: int  # lowest power of s
+    high: int  # highest power of s
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return self.theta.size // 2
+
+    @property
+    def modes(self) -> tuple[FloatArray, FloatArray]:
+        """Natural frequency in Hz and damping ratio, shape ``(n_modes,)`` each."""
+        f, zeta = np.exp(np.split(self.theta, 2))
+        return f, zeta
+
+    def unknowns(self, transient: bool) -> int:
+        """Count real unknowns."""
+        each, powers = (6, len(_TRANSIENT_POWERS)) if transient else (4, 0)
+        return each * self.n_modes + self.high - self.low + 1 + powers
+
+    def with_mode(self, f: float, zeta: float) -> Self:
+        """Add a mode at a frequency in Hz."""
+        n = self.n_modes
+        return replace(self, theta=np.insert(self.theta, [n, 2 * n], np.log([f, zeta])))
+
+    def without_mode(self, i: int) -> Self:
+        """Remove a mode."""
+        return replace(self, theta=np.delete(self.theta, [i, i + self.n_modes]))
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Solution:
+    """A model with its linear unknowns; ``parts`` holds the modes and the background."""
+
+    fit: PoleFit
+    background: ComplexArray  # orthonormal times the input, of the powers, (n_lines, n_background)
+    error: ComplexArray  # measured less fitted answer, (n_lines,)
+    response: ComplexArray  # the fitted H, (n_lines,)
+    parts: FloatArray  # sum of the powers of the parts of H, (n_lines,)
+
+
+def _spectra(
+    ordinates: Ordinates, order: _Order, variance: FloatArray
+) -> tuple[BandSpectra, ComplexArray]:
+    """Return the spectra of a record, and what represents modes outside their band in H.
+
+    That has real factors; its columns, ``(n_lines, n)``, are orthonormal times the input.
+    """
+    frequency, given = ordinates.frequency, ordinates.given
+    s = 1j * frequency / np.sqrt(frequency[0] * frequency[-1])
+    powers = s[:, None] ** np.arange(order.low, order.high + 1)
+    powers = powers / np.linalg.norm(given[:, None] * powers, axis=0)
+    base, size, turn = np.linalg.svd(stack(given[:, None] * powers), full_matrices=False)
+    kept = size > _THIN * size[0]
+    base, background = base[:, kept], powers @ (turn[kept] / size[kept, None]).T
+    if ordinates.transient:
+        base = np.hstack([base, stack(s[:, None] ** np.array(_TRANSIENT_POWERS))])
+    block = BandSpectra(
+        frequency, ordinates.answer[None, :, None], 1 / ordinates.spacing, np.inf, base,
+        force=given, transient=ordinates.transient, noise=variance,
+    )  # fmt: skip
+    return block, background
+
+
+def _solve(
+    ordinates: Ordinates, order: _Order, variance: FloatArray, *, refine: bool = False
+) -> _Solution:
+    """Fit the linear unknowns, with ``refine`` the poles, too, at known variances of the lines."""
+    m = order.n_modes
+    block, background = _spectra(ordinates, order, variance)
+    likelihood = ModalLikelihood.of_known_noise(block, m)
+    p = likelihood.clip(order.theta)
+    if refine:
+        fit = maximise(likelihood, p, np.arange(2 * m), tolerance=_TOLERANCE)
+    else:
+        fit = PoleFit(likelihood, p, likelihood.evaluate(p))
+    (found,) = fit.at.fits
+    residual = found.residual[:, 0]
+    error = (residual[: variance.size] + 1j * residual[variance.size :]) * np.sqrt(variance)
+    (up, _), (down, _) = pole_terms(block, fit.frequency, fit.damping_ratio)
+    residue = np.array([fit.sizes(i)[0][0, 0] for i in range(m)], dtype=complex)[:, None]
+    parts = (up * residue + down * residue.conj()).T
+    fitted = parts.sum(axis=1) + background @ found.sizes[0, : background.shape[1], 0]
+    # Powers and poles of a background may cancel each other; modes do not.
+    parts = parts[:, fit.damping_ratio <= constants.FRF_MOST_DAMPING]
+    rest = fitted - parts.sum(axis=1)
+    power = np.sum(np.abs(parts) ** 2, axis=1) + np.abs(rest) ** 2
+    return _Solution(fit, background, error, fitted, power)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
 class _State:
     """An order at its maximum of likelihood, with the variance of its error."""
 
     ordinates: Ordinates
-    order: ModelOrder
+    order: _Order
     variance: FloatArray
     distortion: float
-    solution: Solution
+    solution: _Solution
 
     @property
     def white(self) -> ComplexArray:
@@ -151,7 +254,7 @@ class _State:
         """Gain that modes and background need."""
         order, each = self.order, 6 if self.ordinates.transient else 4
         heavy = int(np.count_nonzero(order.modes[1] > constants.FRF_MOST_DAMPING))
-        modes = each * np.log(2 * self.variance.size) + constants.FRF_EVIDENCE_MARGIN
+        modes = 2 * evidence_needed(self.solution.fit.likelihood)
         background = constants.FRF_BACKGROUND_COST * (each * heavy + order.high - order.low)
         return float((order.n_modes - heavy) * modes + background)
 
@@ -161,23 +264,21 @@ def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> floa
     return (smaller.cost - larger.cost) / dependent_lines - larger.penalty + smaller.penalty
 
 
-def _settle(
-    ordinates: Ordinates, order: ModelOrder, variance: FloatArray, rounds: int = 2
-) -> _State:
+def _settle(ordinates: Ordinates, order: _Order, variance: FloatArray, rounds: int = 2) -> _State:
     """Maximise the likelihood over poles and variance alternately."""
     for _ in range(rounds):
-        order = refine(ordinates, order, variance)
-        solution = solve(ordinates, order, variance)
+        solution = _solve(ordinates, order, variance, refine=True)
+        order = replace(order, theta=solution.fit.p)
         before = variance
         variance, distortion = _error_variance(ordinates, order, solution)
         if np.abs(np.log(variance / before)).max() < 0.05:
             break
-    solution = solve(ordinates, order, variance)
+    solution = _solve(ordinates, order, variance)
     return _State(ordinates, order, variance, distortion, solution)
 
 
 def _error_variance(
-    ordinates: Ordinates, order: ModelOrder, solution: Solution
+    ordinates: Ordinates, order: _Order, solution: _Solution
 ) -> tuple[FloatArray, float]:
     """Return the variance of the error of each line, and the distortion as a share of H."""
     n = solution.error.size
@@ -247,7 +348,11 @@ def _restart(state: _State) -> _State:
     for n in range(1, constants.FRF_MOST_MODES + 1):
         if not ordinates.scatter and n > best.order.n_modes + 1:
             break
-        order = vector_fit(ordinates, state.order, n)
+        solved = state.solution
+        (block,) = solved.fit.likelihood.blocks
+        block = replace(block, noise=ordinates.noise)
+        poles = vector_fit(block, solved.background, n)
+        order = replace(state.order, theta=np.log(np.concatenate(poles)))
         if order.unknowns(transient=False) >= state.variance.size:
             break
         trial = _settle(ordinates, order, ordinates.noise)
@@ -268,7 +373,7 @@ def _without_outliers(larger: _State, smaller: _State) -> _State:
     return without
 
 
-def _larger(state: _State) -> list[ModelOrder]:
+def _larger(state: _State) -> list[_Order]:
     """Return models with a further mode or two further powers that may be worth a fit."""
     ordinates, order = state.ordinates, state.order
     larger = []
@@ -279,13 +384,24 @@ def _larger(state: _State) -> list[ModelOrder]:
     error = np.sum(np.abs(state.white) ** 2)
     gains = [
         2 * float(error - np.sum(np.abs(solution.error) ** 2 / state.variance))
-        for solution in (solve(ordinates, o, state.variance) for o in larger)
+        for solution in (_solve(ordinates, o, state.variance) for o in larger)
     ]
     if order.n_modes < constants.FRF_MOST_MODES:
-        f, zeta, gain = best_place(ordinates, state.variance, state.solution)
+        f, zeta, gain = best_pole(state.solution.fit, *_places(ordinates))
         larger.append(order.with_mode(f, zeta))
-        gains.append(gain)
+        gains.append(2 * gain)
     return [o for o, gain in zip(larger, gains, strict=True) if gain > _WORTH]
+
+
+def _places(ordinates: Ordinates) -> tuple[FloatArray, FloatArray]:
+    """Return frequencies in Hz and damping ratios at which a further mode is tried."""
+    low, high = ordinates.frequency[[0, -1]].tolist()
+    grids = [np.geomspace(low, high, 2 + int(np.log(high / low) / z)) for z in _TRIED_DAMPING]
+    zeta = [
+        np.clip(ordinates.spacing / f, z, _MOST_DAMPING)
+        for z, f in zip(_TRIED_DAMPING, grids, strict=True)
+    ]
+    return np.concatenate(grids), np.concatenate(zeta)
 
 
 def _is_admissible(trial: _State, before: _State) -> bool:
@@ -338,8 +454,8 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     both = paired(rank, m)
     noise_cov, cov, credibility = _covariances(state)
     f, zeta = order.modes
-    centre = np.sqrt(ordinates.frequency[0] * ordinates.frequency[-1])
-    peak = np.abs(solution.residues / (zeta * f / centre)) ** 2
+    residues = np.array([solution.fit.sizes(i)[0][0, 0] for i in range(m)], dtype=complex)
+    peak = np.abs(residues * ordinates.spacing / (2 * np.pi * zeta * f)) ** 2
     level = state.variance / np.abs(ordinates.given) ** 2
     distortion = state.distortion**2 * np.interp(f, ordinates.frequency, solution.parts)
     over = np.divide(peak, distortion, out=np.full(m, np.inf), where=distortion > 0)
@@ -372,7 +488,7 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray, tuple[Credibili
     The factors of the second on that of a known variance and independent lines are returned, too.
     """
     ordinates, lines = state.ordinates, state.dependent_lines
-    slope = slopes(ordinates, state.order, state.variance, state.solution)
+    slope = np.sqrt(2) * state.solution.fit.at.fits[0].tangent[:, :, 0].T
     prior = np.eye(slope.shape[1]) / _PRIOR_STD**2
     inverse = np.asarray(np.linalg.inv(slope.T @ slope + prior), dtype=np.float64)
     if not ordinates.scatter:
