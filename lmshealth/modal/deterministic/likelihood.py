@@ -87,11 +87,12 @@ def pole_terms(
     moves = np.array([pole, -omega * zeta * (1 + 1j * zeta / root)])
 
     def term(pole: ComplexArray, moves: ComplexArray) -> tuple[ComplexArray, ComplexArray]:
-        turn, rest = np.ones((1, 1), complex), s - pole[:, None]
+        rest = np.asarray(s - pole[:, None], dtype=np.complex128)
+        turn = np.ones((1, 1), dtype=np.complex128)
         if np.isfinite(rate):
             turn = np.exp(-rest / rate)
-            rest = rate * (1 - turn)
-        value = 1 / (block.duration * rest)
+            rest = np.asarray(rate * (1 - turn), dtype=np.complex128)
+        value = np.reciprocal(block.duration * rest)
         return value, block.duration * value**2 * turn * moves[..., None]
 
     return term(pole, moves), term(pole.conj(), moves.conj())

@@ -1,7 +1,6 @@
 """Fit of a frequency response: number of modes, noise and distortion, covariance."""
 
 from dataclasses import dataclass, replace
-from typing import Self
 
 import numpy as np
 from scipy.optimize import minimize_scalar
@@ -91,15 +90,15 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     Order, noise, distortion and covariance are those of the section Model in the README of the
     folder [Pintelon2012].
     """
-    start = _Order(np.empty(0), -FEWEST_POWERS, FEWEST_POWERS)
-    state = _restart(_grow(_settle(ordinates, start, ordinates.noise)))
+    start = np.empty(0), (-FEWEST_POWERS, FEWEST_POWERS)
+    state = _restart(_grow(_settle(ordinates, *start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
         if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
             break
         state = _grow(_without_lines(state, keep))
     state = _shrink(state)
-    state = _settle(state.ordinates, state.order, state.variance, _ROUNDS)
+    state = _settle(state.ordinates, state.theta, state.powers, state.variance, rounds=_ROUNDS)
     return _conclude(state, ordinates)
 
 
@@ -123,116 +122,73 @@ def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Order:
-    """Order of a model, with start values of its modes."""
-
-    theta: FloatArray  # [ln f, ln ζ] of the modes, (2 n_modes,)
-    low: int  # lowest power of s
-    high: int  # highest power of s
-
-    @property
-    def n_modes(self) -> int:
-        """Number of modes."""
-        return self.theta.size // 2
-
-    @property
-    def modes(self) -> tuple[FloatArray, FloatArray]:
-        """Natural frequency in Hz and damping ratio, shape ``(n_modes,)`` each."""
-        f, zeta = np.exp(np.split(self.theta, 2))
-        return f, zeta
-
-    def unknowns(self, transient: bool) -> int:
-        """Count real unknowns."""
-        each, powers = (6, len(_TRANSIENT_POWERS)) if transient else (4, 0)
-        return each * self.n_modes + self.high - self.low + 1 + powers
-
-    def with_mode(self, f: float, zeta: float) -> Self:
-        """Add a mode at a frequency in Hz."""
-        n = self.n_modes
-        return replace(self, theta=np.insert(self.theta, [n, 2 * n], np.log([f, zeta])))
-
-    def without_mode(self, i: int) -> Self:
-        """Remove a mode."""
-        return replace(self, theta=np.delete(self.theta, [i, i + self.n_modes]))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Solution:
-    """A model with its linear unknowns; ``parts`` holds the modes and the background."""
-
-    fit: PoleFit
-    background: ComplexArray  # orthonormal times the input, of the powers, (n_lines, n_background)
-    error: ComplexArray  # measured less fitted answer, (n_lines,)
-    response: ComplexArray  # the fitted H, (n_lines,)
-    parts: FloatArray  # sum of the powers of the parts of H, (n_lines,)
-
-
-def _spectra(
-    ordinates: Ordinates, order: _Order, variance: FloatArray
-) -> tuple[BandSpectra, ComplexArray]:
-    """Return the spectra of a record, and what represents modes outside their band in H.
-
-    That has real factors; its columns, ``(n_lines, n)``, are orthonormal times the input.
-    """
-    frequency, given = ordinates.frequency, ordinates.given
-    s = 1j * frequency / np.sqrt(frequency[0] * frequency[-1])
-    powers = s[:, None] ** np.arange(order.low, order.high + 1)
-    powers = powers / np.linalg.norm(given[:, None] * powers, axis=0)
-    base, size, turn = np.linalg.svd(stack(given[:, None] * powers), full_matrices=False)
-    kept = size > _THIN * size[0]
-    base, background = base[:, kept], powers @ (turn[kept] / size[kept, None]).T
-    if ordinates.transient:
-        base = np.hstack([base, stack(s[:, None] ** np.array(_TRANSIENT_POWERS))])
-    block = BandSpectra(
-        frequency, ordinates.answer[None, :, None], 1 / ordinates.spacing, np.inf, base,
-        force=given, transient=ordinates.transient, noise=variance,
-    )  # fmt: skip
-    return block, background
-
-
-def _solve(
-    ordinates: Ordinates, order: _Order, variance: FloatArray, *, refine: bool = False
-) -> _Solution:
-    """Fit the linear unknowns, with ``refine`` the poles, too, at known variances of the lines."""
-    m = order.n_modes
-    block, background = _spectra(ordinates, order, variance)
-    likelihood = ModalLikelihood.of_known_noise(block, m)
-    p = likelihood.clip(order.theta)
-    if refine:
-        fit = maximise(likelihood, p, np.arange(2 * m), tolerance=_TOLERANCE)
-    else:
-        fit = PoleFit(likelihood, p, likelihood.evaluate(p))
-    (found,) = fit.at.fits
-    residual = found.residual[:, 0]
-    error = (residual[: variance.size] + 1j * residual[variance.size :]) * np.sqrt(variance)
-    (up, _), (down, _) = pole_terms(block, fit.frequency, fit.damping_ratio)
-    residue = np.array([fit.sizes(i)[0][0, 0] for i in range(m)], dtype=complex)[:, None]
-    parts = (up * residue + down * residue.conj()).T
-    fitted = parts.sum(axis=1) + background @ found.sizes[0, : background.shape[1], 0]
-    # Powers and poles of a background may cancel each other; modes do not.
-    parts = parts[:, fit.damping_ratio <= constants.FRF_MOST_DAMPING]
-    rest = fitted - parts.sum(axis=1)
-    power = np.sum(np.abs(parts) ** 2, axis=1) + np.abs(rest) ** 2
-    return _Solution(fit, background, error, fitted, power)
+Powers = tuple[int, int]
+"""Lowest and highest power of s."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
-    """An order at its maximum of likelihood, with the variance of its error."""
+    """A model at its maximum of likelihood, with the variance of its error."""
 
     ordinates: Ordinates
-    order: _Order
-    variance: FloatArray
-    distortion: float
-    solution: _Solution
+    powers: Powers
+    poles: PoleFit
+    variance: FloatArray  # of the error, (n_lines,)
+    distortion: float  # as a share of H
+    background: ComplexArray  # with real sizes: modes outside the band in H, (n_lines, n)
+
+    @property
+    def theta(self) -> FloatArray:
+        """``[ln f, ln ζ]`` of the modes, shape ``(2 n_modes,)``."""
+        return self.poles.p
+
+    @property
+    def modes(self) -> tuple[FloatArray, FloatArray]:
+        """Natural frequency in Hz and damping ratio, shape ``(n_modes,)`` each."""
+        return self.poles.frequency, self.poles.damping_ratio
+
+    @property
+    def n_modes(self) -> int:
+        """Number of modes."""
+        return self.poles.likelihood.n_modes
+
+    @property
+    def error(self) -> ComplexArray:
+        """Measured less fitted answer, shape ``(n_lines,)``."""
+        real, imag = np.split(self.poles.at.fits[0].residual[:, 0], 2)
+        return np.asarray((real + 1j * imag) * np.sqrt(self.variance))
+
+    @property
+    def residues(self) -> ComplexArray:
+        """Residues times the spacing of the lines, shape ``(n_modes,)``."""
+        return np.array([self.poles.sizes(i)[0][0, 0] for i in range(self.n_modes)], dtype=complex)
+
+    def _modal(self) -> ComplexArray:
+        """Return the parts of H by the modes, shape ``(n_modes, n_lines)``."""
+        (block,) = self.poles.likelihood.blocks
+        (up, _), (down, _) = pole_terms(block, *self.modes)
+        return np.asarray(up * self.residues[:, None] + down * self.residues.conj()[:, None])
+
+    @property
+    def response(self) -> ComplexArray:
+        """The fitted H, shape ``(n_lines,)``."""
+        sizes = self.poles.at.fits[0].sizes[0, : self.background.shape[1], 0]
+        return np.asarray(self._modal().sum(axis=0) + self.background @ sizes)
+
+    @property
+    def parts(self) -> FloatArray:
+        """Sum of the powers of the parts of H: of modes and background, shape ``(n_lines,)``."""
+        # Powers and poles of a background may cancel each other; modes do not.
+        modal = self._modal()[self.modes[1] <= constants.FRF_MOST_DAMPING]
+        rest = self.response - modal.sum(axis=0)
+        return np.asarray(np.sum(np.abs(modal) ** 2, axis=0) + np.abs(rest) ** 2)
 
     @property
     def white(self) -> ComplexArray:
         """Whitened error of the response, its phase relative to the input."""
         given = self.ordinates.given
         turn = np.abs(given) / np.where(given == 0, 1, given)
-        return np.asarray(self.solution.error * turn / np.sqrt(self.variance))
+        return np.asarray(self.error * turn / np.sqrt(self.variance))
 
     @property
     def cost(self) -> float:
@@ -252,11 +208,48 @@ class _State:
     @property
     def penalty(self) -> float:
         """Gain that modes and background need."""
-        order, each = self.order, 6 if self.ordinates.transient else 4
-        heavy = int(np.count_nonzero(order.modes[1] > constants.FRF_MOST_DAMPING))
-        modes = 2 * evidence_needed(self.solution.fit.likelihood)
-        background = constants.FRF_BACKGROUND_COST * (each * heavy + order.high - order.low)
-        return float((order.n_modes - heavy) * modes + background)
+        (low, high), each = self.powers, 6 if self.ordinates.transient else 4
+        heavy = int(np.count_nonzero(self.modes[1] > constants.FRF_MOST_DAMPING))
+        modes = 2 * evidence_needed(self.poles.likelihood)
+        background = constants.FRF_BACKGROUND_COST * (each * heavy + high - low)
+        return float((self.n_modes - heavy) * modes + background)
+
+
+def _unknowns(ordinates: Ordinates, theta: FloatArray, powers: Powers) -> int:
+    """Count real unknowns."""
+    each, more = (6, len(_TRANSIENT_POWERS)) if ordinates.transient else (4, 0)
+    return each * theta.size // 2 + powers[1] - powers[0] + 1 + more
+
+
+def _solve(
+    ordinates: Ordinates,
+    theta: FloatArray,
+    powers: Powers,
+    variance: FloatArray,
+    *,
+    refine: bool = False,
+) -> _State:
+    """Fit the linear unknowns, with ``refine`` the poles, too, at known variances of the lines."""
+    frequency, given, n = ordinates.frequency, ordinates.given, theta.size // 2
+    s = 1j * frequency / np.sqrt(frequency[0] * frequency[-1])
+    columns = s[:, None] ** np.arange(powers[0], powers[1] + 1)
+    columns = columns / np.linalg.norm(given[:, None] * columns, axis=0)
+    base, size, turn = np.linalg.svd(stack(given[:, None] * columns), full_matrices=False)
+    kept = size > _THIN * size[0]
+    base, background = base[:, kept], columns @ (turn[kept] / size[kept, None]).T
+    if ordinates.transient:
+        base = np.hstack([base, stack(s[:, None] ** np.array(_TRANSIENT_POWERS))])
+    block = BandSpectra(
+        frequency, ordinates.answer[None, :, None], 1 / ordinates.spacing, np.inf, base,
+        force=given, transient=ordinates.transient, noise=variance,
+    )  # fmt: skip
+    likelihood = ModalLikelihood.of_known_noise(block, n)
+    p = likelihood.clip(theta)
+    if refine:
+        poles = maximise(likelihood, p, np.arange(2 * n), tolerance=_TOLERANCE)
+    else:
+        poles = PoleFit(likelihood, p, likelihood.evaluate(p))
+    return _State(ordinates, powers, poles, variance, 0.0, background)
 
 
 def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> float:
@@ -264,31 +257,36 @@ def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> floa
     return (smaller.cost - larger.cost) / dependent_lines - larger.penalty + smaller.penalty
 
 
-def _settle(ordinates: Ordinates, order: _Order, variance: FloatArray, rounds: int = 2) -> _State:
+def _settle(
+    ordinates: Ordinates,
+    theta: FloatArray,
+    powers: Powers,
+    variance: FloatArray,
+    *,
+    rounds: int = 2,
+) -> _State:
     """Maximise the likelihood over poles and variance alternately."""
+    distortion = 0.0
     for _ in range(rounds):
-        solution = _solve(ordinates, order, variance, refine=True)
-        order = replace(order, theta=solution.fit.p)
-        before = variance
-        variance, distortion = _error_variance(ordinates, order, solution)
+        state = _solve(ordinates, theta, powers, variance, refine=True)
+        theta, before = state.theta, variance
+        variance, distortion = _error_variance(state)
         if np.abs(np.log(variance / before)).max() < 0.05:
             break
-    solution = _solve(ordinates, order, variance)
-    return _State(ordinates, order, variance, distortion, solution)
+    return replace(_solve(ordinates, theta, powers, variance), distortion=distortion)
 
 
-def _error_variance(
-    ordinates: Ordinates, order: _Order, solution: _Solution
-) -> tuple[FloatArray, float]:
+def _error_variance(state: _State) -> tuple[FloatArray, float]:
     """Return the variance of the error of each line, and the distortion as a share of H."""
-    n = solution.error.size
+    ordinates, n = state.ordinates, state.variance.size
     # Corrected for the degrees of freedom of the fit.
-    power = np.abs(solution.error) ** 2 * (n / (n - order.unknowns(ordinates.transient) / 2))
+    left = n - _unknowns(ordinates, state.theta, state.powers) / 2
+    power = np.abs(state.error) ** 2 * (n / left)
     if not ordinates.scatter:
         # Lines that were measured before have as many digits as the file.
         floor = (_DIGITS * np.abs(ordinates.answer).max()) ** 2 if ordinates.periodic else 0.0
-        return np.maximum(smooth_noise(power, solution.parts, _NOISE_LINES), floor), 0.0
-    parts = solution.parts * np.abs(ordinates.given) ** 2
+        return np.maximum(smooth_noise(power, state.parts, _NOISE_LINES), floor), 0.0
+    parts = state.parts * np.abs(ordinates.given) ** 2
 
     def cost(ln_share: float) -> float:
         total = ordinates.noise + np.exp(ln_share) * parts
@@ -303,7 +301,7 @@ def _error_variance(
 
 def _without_lines(state: _State, keep: BoolArray) -> _State:
     """Fit without some of the lines."""
-    return _settle(state.ordinates.only(keep), state.order, state.variance[keep])
+    return _settle(state.ordinates.only(keep), state.theta, state.powers, state.variance[keep])
 
 
 def _inliers(state: _State) -> BoolArray:
@@ -315,7 +313,7 @@ def _inliers(state: _State) -> BoolArray:
     if not state.ordinates.periodic:
         return np.asarray(np.convolve(odd, np.ones(5), mode="same") == 0)
     # Lines of a distorted resonance are no outliers.
-    f, zeta = state.order.modes
+    f, zeta = state.modes
     near = np.abs(state.ordinates.frequency[:, None] - f) < 2 * zeta * f
     distorted = state.variance > 2 * state.ordinates.noise
     return np.asarray(~odd | (distorted & near.any(axis=1)))
@@ -326,9 +324,9 @@ def _grow(state: _State) -> _State:
     fewest = (1 - constants.MOST_OUTLIERS) * state.variance.size
     while True:
         trials = [
-            _settle(state.ordinates, order, state.variance)
+            _settle(state.ordinates, *order, state.variance)
             for order in _larger(state)
-            if order.unknowns(state.ordinates.transient) < state.variance.size
+            if _unknowns(state.ordinates, *order) < state.variance.size
         ]
         gains = [_gain(t, state) if _is_admissible(t, state) else -np.inf for t in trials]
         if not gains or max(gains) <= 0:
@@ -346,16 +344,14 @@ def _restart(state: _State) -> _State:
         return state
     best = state
     for n in range(1, constants.FRF_MOST_MODES + 1):
-        if not ordinates.scatter and n > best.order.n_modes + 1:
+        if not ordinates.scatter and n > best.n_modes + 1:
             break
-        solved = state.solution
-        (block,) = solved.fit.likelihood.blocks
+        (block,) = state.poles.likelihood.blocks
         block = replace(block, noise=ordinates.noise)
-        poles = vector_fit(block, solved.background, n)
-        order = replace(state.order, theta=np.log(np.concatenate(poles)))
-        if order.unknowns(transient=False) >= state.variance.size:
+        theta = np.log(np.concatenate(vector_fit(block, state.background, n)))
+        if _unknowns(ordinates, theta, state.powers) >= state.variance.size:
             break
-        trial = _settle(ordinates, order, ordinates.noise)
+        trial = _settle(ordinates, theta, state.powers, ordinates.noise)
         less = trial.distortion <= constants.LESS_DISTORTED * best.distortion
         if less and _gain(trial, best) > 0 and _is_admissible(trial, best):
             best = trial
@@ -373,24 +369,24 @@ def _without_outliers(larger: _State, smaller: _State) -> _State:
     return without
 
 
-def _larger(state: _State) -> list[_Order]:
+def _larger(state: _State) -> list[tuple[FloatArray, Powers]]:
     """Return models with a further mode or two further powers that may be worth a fit."""
-    ordinates, order = state.ordinates, state.order
-    larger = []
-    if order.low > -_MOST_POWERS:
-        larger.append(replace(order, low=order.low - _POWER_STEP))
-    if order.high < _MOST_POWERS:
-        larger.append(replace(order, high=order.high + _POWER_STEP))
-    error = np.sum(np.abs(state.white) ** 2)
+    ordinates, theta, (low, high), n = state.ordinates, state.theta, state.powers, state.n_modes
+    larger: list[tuple[FloatArray, Powers]] = []
+    if low > -_MOST_POWERS:
+        larger.append((theta, (low - _POWER_STEP, high)))
+    if high < _MOST_POWERS:
+        larger.append((theta, (low, high + _POWER_STEP)))
+    profile = state.poles.at.profile
     gains = [
-        2 * float(error - np.sum(np.abs(solution.error) ** 2 / state.variance))
-        for solution in (_solve(ordinates, o, state.variance) for o in larger)
+        2 * (profile - _solve(ordinates, *order, state.variance).poles.at.profile)
+        for order in larger
     ]
-    if order.n_modes < constants.FRF_MOST_MODES:
-        f, zeta, gain = best_pole(state.solution.fit, *_places(ordinates))
-        larger.append(order.with_mode(f, zeta))
+    if n < constants.FRF_MOST_MODES:
+        f, zeta, gain = best_pole(state.poles, *_places(ordinates))
+        larger.append((np.insert(theta, [n, 2 * n], np.log([f, zeta])), state.powers))
         gains.append(2 * gain)
-    return [o for o, gain in zip(larger, gains, strict=True) if gain > _WORTH]
+    return [order for order, gain in zip(larger, gains, strict=True) if gain > _WORTH]
 
 
 def _places(ordinates: Ordinates) -> tuple[FloatArray, FloatArray]:
@@ -410,7 +406,7 @@ def _is_admissible(trial: _State, before: _State) -> bool:
     # A mode narrower than a line at an end of the band represents one outside.
     if narrow[:_END].any() or narrow[-_END:].any():
         return False
-    f, zeta = trial.order.modes
+    f, zeta = trial.modes
     near = np.abs(f[:, None] - f) < np.maximum.outer(zeta * f, zeta * f)
     # Modes within a half-power bandwidth must reduce the distortion.
     if near.sum() == f.size:
@@ -420,7 +416,7 @@ def _is_admissible(trial: _State, before: _State) -> bool:
 
 def _wide_enough(state: _State) -> BoolArray:
     """Return which lines are not the centre of a mode that is narrower than their distance."""
-    f, zeta = state.order.modes
+    f, zeta = state.modes
     frequency = state.ordinates.frequency
     is_narrow = 2 * zeta * f < state.ordinates.spacing
     if state.ordinates.periodic:
@@ -434,11 +430,12 @@ def _wide_enough(state: _State) -> BoolArray:
 
 def _shrink(state: _State) -> _State:
     """Remove modes that the others have made superfluous; correlated errors reduce their gain."""
-    while state.order.n_modes:
+    while n := state.n_modes:
         trials = [
-            _settle(state.ordinates, state.order.without_mode(i), state.variance)
-            for i in range(state.order.n_modes)
-        ]
+            _settle(state.ordinates, np.delete(state.theta, [i, i + n]), state.powers,
+                    state.variance)
+            for i in range(n)
+        ]  # fmt: skip
         gains = [_gain(state, trial, state.dependent_lines) for trial in trials]
         if min(gains) > 0:
             break
@@ -448,34 +445,32 @@ def _shrink(state: _State) -> _State:
 
 def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     """Collect estimates with their covariance, modes ascending."""
-    ordinates, order, solution = state.ordinates, state.order, state.solution
-    m, n = order.n_modes, state.variance.size
-    rank = np.argsort(order.theta[:m], kind="stable")
+    ordinates, m = state.ordinates, state.n_modes
+    rank = np.argsort(state.theta[:m], kind="stable")
     both = paired(rank, m)
     noise_cov, cov, credibility = _covariances(state)
-    f, zeta = order.modes
-    residues = np.array([solution.fit.sizes(i)[0][0, 0] for i in range(m)], dtype=complex)
-    peak = np.abs(residues * ordinates.spacing / (2 * np.pi * zeta * f)) ** 2
+    f, zeta = state.modes
+    peak = np.abs(state.residues * ordinates.spacing / (2 * np.pi * zeta * f)) ** 2
     level = state.variance / np.abs(ordinates.given) ** 2
-    distortion = state.distortion**2 * np.interp(f, ordinates.frequency, solution.parts)
+    distortion = state.distortion**2 * np.interp(f, ordinates.frequency, state.parts)
     over = np.divide(peak, distortion, out=np.full(m, np.inf), where=distortion > 0)
     outlying = ~np.isin(everything.frequency, ordinates.frequency)
-    expected = np.interp(everything.frequency, ordinates.frequency, solution.response)
+    expected = np.interp(everything.frequency, ordinates.frequency, state.response)
     error = (everything.answer - everything.given * expected)[outlying]
-    excess = np.sum(np.abs(solution.error) ** 2 / ordinates.noise)
-    excess /= n - order.unknowns(ordinates.transient) / 2
+    excess = np.sum(np.abs(state.error) ** 2 / ordinates.noise)
+    excess /= state.variance.size - _unknowns(ordinates, state.theta, state.powers) / 2
     if not (ordinates.scatter or ordinates.transient):
         ordinates = replace(ordinates, noise=state.variance)
     return ResponseFit(
         ordinates=ordinates,
         outliers=np.column_stack([everything.frequency[outlying], np.abs(error)]),
-        estimate=order.theta[both],
+        estimate=state.theta[both],
         cov=cov[np.ix_(both, both)],
         credibility=tuple(credibility[i] for i in rank),
         noise_cov=noise_cov[np.ix_(both, both)],
         snr=(peak / np.interp(f, ordinates.frequency, level))[rank],
         over_distortion=over[rank],
-        response=solution.response,
+        response=state.response,
         chi_square=float(excess) if ordinates.scatter else float("nan"),
         distortion=state.distortion,
         colour=state.colour,
@@ -488,7 +483,7 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray, tuple[Credibili
     The factors of the second on that of a known variance and independent lines are returned, too.
     """
     ordinates, lines = state.ordinates, state.dependent_lines
-    slope = np.sqrt(2) * state.solution.fit.at.fits[0].tangent[:, :, 0].T
+    slope = np.sqrt(2) * state.poles.at.fits[0].tangent[:, :, 0].T
     prior = np.eye(slope.shape[1]) / _PRIOR_STD**2
     inverse = np.asarray(np.linalg.inv(slope.T @ slope + prior), dtype=np.float64)
     if not ordinates.scatter:
@@ -499,10 +494,10 @@ def _covariances(state: _State) -> tuple[FloatArray, FloatArray, tuple[Credibili
         by_noise = inverse @ (slope.T @ (share * slope) + prior) @ inverse
         by_noise *= small_sample(ordinates.freedom, unbiased=True)
         by_distortion = inverse @ (slope.T @ ((1 - share) * slope)) @ inverse
-        f, zeta = state.order.modes
+        f, zeta = state.modes
         own = np.tile(np.sqrt(np.maximum(lines, 2 * zeta * f / ordinates.spacing)), 2)
         error = by_noise + by_distortion
         cov = by_noise * lines + by_distortion * np.outer(own, own)
-    credibility = (Credibility(),) * state.order.n_modes
+    credibility = (Credibility(),) * state.n_modes
     credibility = widened(credibility, "noise-estimate", inverse, error)
     return by_noise, cov, widened(credibility, "dependent-lines", error, cov)
