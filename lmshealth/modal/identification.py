@@ -262,7 +262,9 @@ def _read_response(
     if stage is not None:
         low, high = band or (0.0, np.inf)
         near = tuple(t for t in choose_targets(stage) if low <= t.frequency <= high)
-        modes = name_resonances(both, near, log.name).publish(both, wanted, poles)
+        named = name_resonances(both, near, log.name)
+        # Tracking assigns modes without a name: a sweep may excite one of several alone.
+        modes = named.publish(both, wanted, poles, unclear=True)
     segments = with_few_lengths(stationary(find_phases(log), 0))
     top = min(band[1] if band else np.inf, _TOP * log.sample_rate)
     spectra = _plain_spectra(limited.channels, segments, log.sample_rate, top)

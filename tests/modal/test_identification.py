@@ -930,6 +930,18 @@ def test_blows_are_read_from_the_response_of_the_channel_that_shows_a_mode_best(
     assert identify(struck_log(), band=(30.0, 150.0)).names == ("mode_1", "mode_2")
 
 
+def test_a_mode_of_a_response_that_may_be_several_has_no_name() -> None:
+    """A hammer excites one of two modes whose searches overlap: tracking has to assign it."""
+    force, answer = hammer.strike(rng(), hammer.Hammer(((62.0, 0.02, 1.0),), seconds=1.0))
+    log = make_log({"current_force": force, "acc_0": answer}, hammer.RATE)
+    modes = identify(log, make_stage([("low", 59.0, 0.02), ("high", 65.0, 0.02)]))
+    assert (modes.names, modes.sources) == (("",), ("frf",))
+    assert [(row.mode, row.reason) for row in modes.refused] == [
+        ("low", "ambiguous"),
+        ("high", "ambiguous"),
+    ]
+
+
 def test_a_servo_s_current_is_no_excitation() -> None:
     """Pulses of a motor's current are not blows: its log is identified as ambient."""
     modes = identify(struck_log(name="current_motor"), band=(30.0, 150.0))
