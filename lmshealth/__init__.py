@@ -23,8 +23,8 @@ if TYPE_CHECKING:
     from lmshealth.life.posterior.fit import fit_life as fit_life
     from lmshealth.life.prognosis import prognose as prognose
     from lmshealth.life.verdict import judge as judge
-    from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
-    from lmshealth.modal.frf.identification import read_frf as read_frf
+    from lmshealth.modal.deterministic.free_decays import identify_decays as identify_decays
+    from lmshealth.modal.deterministic.frequency_response import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
     from lmshealth.modal.log_estimates import LogEstimates as LogEstimates
     from lmshealth.stage.description import load_stage as load_stage
@@ -46,14 +46,14 @@ _HOMES = {
     "decide": "life.maintenance_decision",
     "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
-    "identify_decays": "modal.free_decay.identification",
+    "identify_decays": "modal.deterministic.free_decays",
     "infer": "life.health",
     "infer_drifts": "life.health",
     "judge": "life.verdict",
     "load_stage": "stage.description",
     "plan": "stage.planning",
     "prognose": "life.prognosis",
-    "read_frf": "modal.frf.identification",
+    "read_frf": "modal.deterministic.frequency_response",
     "read_log": "io.reading",
     "run": "batch.run",
     "track": "tracking.track",

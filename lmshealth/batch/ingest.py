@@ -25,7 +25,7 @@ from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_m
 from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
-from lmshealth.modal.identification import read_ambient
+from lmshealth.modal.identification import read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
@@ -481,7 +481,7 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any])
             by = _none_of(stages)
             raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
         by = described.digest
-        reading = read_ambient(log, described)
+        reading = read_modes(log, described)
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
         rms, shapes = loop_error(log), mode_shapes(modes, reading.fitted)

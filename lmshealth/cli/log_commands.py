@@ -25,10 +25,9 @@ from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_be
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import shown
 from lmshealth.modal.acceleration_survey import survey
-from lmshealth.modal.free_decay.identification import identify_decays
-from lmshealth.modal.frf.identification import FrfReading, read_frf, read_measured
-from lmshealth.modal.frf.measured import MeasuredResponse, read_responses
-from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf, read_measured
+from lmshealth.modal.deterministic.measured import MeasuredResponse, read_responses
+from lmshealth.modal.identification import ModalReading, read_ambient, read_decays, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
@@ -157,7 +156,7 @@ def _propose_stage(path: Path, log: Log) -> tuple[int, int] | None:
     used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
-            modes = read_ambient(log, channels=used, progress=report).modes
+            modes = read_modes(log, channels=used, progress=report).modes
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])
@@ -177,8 +176,8 @@ def _propose_stage(path: Path, log: Log) -> tuple[int, int] | None:
 @click.option(
     "--part",
     type=click.Choice(["constant", "settling"]),
-    default="constant",
-    help="Segments of constant velocity (or a whole log at rest), or free decays after moves.",
+    help="Use segments of constant velocity (or a whole log at rest), or free decays after moves; "
+    "default: the response to a measured excitation, else the first that can be used.",
 )
 @options.reading_options
 @click.option(
@@ -254,13 +253,13 @@ def _names(listed: str) -> list[str]:
     return list(names)
 
 
-def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> AmbientReading:
+def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> ModalReading:
     """Identify the modes of a log by the chosen part of it."""
     chosen: Any = {"channels": given["channels"], "band": given["band"]}
-    if given["part"] == "constant":
-        return read_ambient(log, given["stage"], **chosen, progress=report)
-    found = identify_decays(log, given["stage"], **chosen)
-    return AmbientReading(found, log_figures.settling_spectra(log, given["channels"]))
+    if given["part"] == "settling":
+        return read_decays(log, given["stage"], **chosen)
+    read = read_ambient if given["part"] == "constant" else read_modes
+    return read(log, given["stage"], **chosen, progress=report)
 
 
 def _check_outputs(given: dict[str, Any]) -> None:

@@ -96,6 +96,12 @@ PRIOR_FLOORS = (5.0, 2.0, 1.0), (0.3, 2.0, 1.0)
 WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0)
 WIDTHS_STATIC = (0.03, 0.2, 1.0)
 
+# Frequency responses and free decays
+
+# Gain in log likelihood beyond the Bayesian information criterion that a pole needs, as the best of
+# many places gains by chance.
+POLE_EVIDENCE_MARGIN = 5.0
+
 # Frequency responses
 
 # Least samples of a stretch, and of a period.
@@ -116,10 +122,9 @@ UNKNOWN_NOISE = 1e-4
 TRANSIENT = 1e-3
 # Probability that noise alone makes an outlier, and the largest share of lines that may be ones.
 OUTLIER_FALSE_ALARM, MOST_OUTLIERS = 1e-3, 0.1
-# Most modes of one response. A mode must gain this in -2 ln L beyond the Bayesian information
-# criterion, as the best of many places gains by chance; a background of powers and heavily damped
-# poles needs this per unknown (Akaike's criterion): lacking, it would bias the modes.
-FRF_MOST_MODES, FRF_EVIDENCE_MARGIN, FRF_BACKGROUND_COST = 8, 10.0, 2.0
+# Most modes of one response. A background of powers and heavily damped poles needs this in -2 ln L
+# per unknown (Akaike's criterion): lacking, it would bias the modes.
+FRF_MOST_MODES, FRF_BACKGROUND_COST = 8, 2.0
 # Damping ratio above which a pole belongs to the background.
 FRF_MOST_DAMPING = 0.2
 # Gain in -2 ln L from which on a distortion is included: 1 % of linear responses reach it. Two
@@ -163,9 +168,8 @@ DECAY_PERIODS, DECAY_ORDINATES = 4.0, 12
 DECAY_FALSE_ALARM = 1e-3
 # Probability of the residual's correlation below which decays are not in stationary noise.
 NOT_STATIONARY = 1e-3
-# Most poles of a band, and gain in log likelihood beyond the Bayesian information criterion that
-# one needs.
-DECAY_MOST_POLES, DECAY_EVIDENCE_MARGIN = 6, 5.0
+# Most poles of a band.
+DECAY_MOST_POLES = 6
 # A damping less than this many standard deviations from zero is too uncertain; where the mode
 # fades by less than this share over the record it may be a line.
 DECAY_DAMPING_SIGMAS, LEAST_FADING = 3.0, 0.6

@@ -1,14 +1,19 @@
-"""Identification of modes under ambient excitation, with and without a stage description.
+"""Identification of the modes of a log, with and without a stage description.
 
-Lines are masked, a search of all channels finds what resonates, groups of resonances are fitted by
-one Whittle likelihood of all channels, as channels of one log share the excitation, and what is
-credible is published. A description gives hints to the search, and names to what was found.
+A log with a measured excitation is identified from its response, any other from its stationary
+segments, and one that only moves and stops from its free decays.
+
+Under ambient excitation lines are masked, a search of all channels finds what resonates, groups of
+resonances are fitted by one Whittle likelihood of all channels, as channels of one log share the
+excitation, and what is credible is published. A description gives hints to the search, and names to
+what was found.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
+from itertools import chain, pairwise
+from typing import Any
 
 import numpy as np
 
@@ -32,10 +37,23 @@ from lmshealth.modal.ambient.search import (
     split_groups,
 )
 from lmshealth.modal.ambient.wandering import near_lines
+from lmshealth.modal.deterministic.free_decays import identify_decays
+from lmshealth.modal.deterministic.frequency_response import read_frf
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import name_resonances
-from lmshealth.modal.targets import Target, check_band, choose_channels, choose_targets
-from lmshealth.signal.segments import Segment, find_phases, stationary, with_few_lengths
+from lmshealth.modal.targets import (
+    Target,
+    check_band,
+    choose_channels,
+    choose_targets,
+)
+from lmshealth.signal.segments import (
+    Segment,
+    find_phases,
+    select_segments,
+    stationary,
+    with_few_lengths,
+)
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
     LogSpectra,
@@ -62,10 +80,15 @@ _UNLIKE = (
 )
 # A cluster is fitted below this share of the sample rate.
 _TOP = 0.49
+# Channels of a current whose names begin so hold an excitation: any other is that of the servo,
+# which responds to the modes itself.
+_EXCITATIONS = ("current_force", "current_excitation")
+# Standard deviations within which modes that two channels show are one.
+_SAME_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class AmbientReading:
+class ModalReading:
     """Modes of a log, and what they were identified from."""
 
     modes: Modes
@@ -83,7 +106,13 @@ def identify(
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
 ) -> Modes:
-    r"""Identify the modes of a log under ambient excitation, with their covariance.
+    r"""Identify the modes of a log by the method for what it carries, with their covariance.
+
+    A channel ``current_force…`` or ``current_excitation…`` holds a measured excitation: blows of a
+    hammer, a sweep, a multisine or noise. Then the frequency responses of all channels to it are
+    fitted, and each mode is that of the channel that shows it best. Otherwise the segments of
+    constant velocity, or all of a log at rest, are identified under ambient excitation; where none
+    is long enough, the free decays after the moves of the set point are.
 
     Parameters
     ----------
@@ -129,7 +158,140 @@ def identify(
     ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
     126.3 ± 0.2 Hz, 1.6% ± 0.1%
     """
-    return read_ambient(log, stage, channels=channels, band=band).modes
+    return read_modes(log, stage, channels=channels, band=band).modes
+
+
+def read_modes(
+    log: Log,
+    stage: Stage | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
+    progress: Callable[[str, int, int], None] = lambda step, done, total: None,
+) -> ModalReading:
+    """Identify modes as `identify` does; return them with what they were identified from.
+
+    Where the excitation was measured but cannot be used, the modes are refused for it, and are
+    those of ambient excitation. `BadLog` and `BadStage` as `identify`.
+    """
+    chosen: Any = {"channels": channels, "band": band}
+    for source in log.channels:
+        if source.kind != "current" or not source.name.startswith(_EXCITATIONS):
+            continue
+        try:
+            return _read_response(log, source, stage, **chosen)
+        except BadLog as why:
+            if why.reason != "coherence":  # of an excitation that was at rest nothing is to be read
+                place: Any = {"channel": source.name, "source": "frf"}
+                unused = Refusal(log.name, why.reason, why.detail, **place)
+                log = replace(log, refused=(*log.refused, unused))
+    try:
+        return read_ambient(log, stage, **chosen, progress=progress)
+    except BadLog as why:
+        if why.reason != "too-short":
+            raise
+        try:
+            reading = read_decays(log, stage, **chosen)
+        except BadLog:
+            raise why from None
+        if not reading.modes.names:
+            raise
+        return reading
+
+
+def read_decays(
+    log: Log,
+    stage: Stage | None = None,
+    *,
+    channels: Sequence[str] | None = None,
+    band: tuple[float, float] | None = None,
+) -> ModalReading:
+    """Identify modes as `identify_decays` does; return them with the spectra of the decays."""
+    modes = identify_decays(log, stage, channels=channels, band=band)
+    used = choose_channels(log, channels)
+    segments, top = select_segments(log, "settling"), _TOP * log.sample_rate
+    return ModalReading(modes, _plain_spectra(used, segments, log.sample_rate, top))
+
+
+def _plain_spectra(
+    channels: tuple[Channel, ...], segments: Sequence[Segment], sample_rate: float, top: float
+) -> LogSpectra:
+    """Return spectra up to a frequency in Hz from which no line is subtracted."""
+    everywhere = [ResonanceRange(0.0, np.inf, 0.0)]
+    return LogSpectra(
+        tuple(channel.name for channel in channels),
+        tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
+        cross_spectra(channels, segments, sample_rate, top, ceiling=top, resonances=everywhere),
+    )
+
+
+def _read_response(
+    log: Log,
+    source: Channel,
+    stage: Stage | None,
+    *,
+    channels: Sequence[str] | None,
+    band: tuple[float, float] | None,
+) -> ModalReading:
+    """Identify the modes of the responses of all channels to an excitation.
+
+    `BadLog` if no channel has a response.
+    """
+    check_band(log, band)
+    used = choose_channels(log, channels)
+    wanted = () if stage is None else choose_targets(stage, band)
+    if wanted:
+        spans = _spans(log, np.inf, wanted, None)
+        band = spans[0][0], spans[-1][1]
+    found: list[Modes] = []
+    lost: list[BadLog] = []
+    for channel in used:
+        try:
+            found.append(read_frf(log, source.name, channel.name, band=band).modes)
+        except BadLog as why:
+            lost.append(why)
+    if not found:
+        raise lost[0]
+    rows = dict.fromkeys(chain(log.refused, *(modes.refused for modes in found)))
+    refused = [row for row in rows if row.frequency is None]
+    lines = dict.fromkeys(chain.from_iterable(modes.lines for modes in found))
+    both = numbered(merge(_clearest(found), [*lines], refused))
+    poles = {f"pole_{k}": row for k, row in enumerate(rows) if row.frequency is not None}
+    modes = both
+    if stage is not None:
+        low, high = band or (0.0, np.inf)
+        near = tuple(t for t in choose_targets(stage) if low <= t.frequency <= high)
+        named = name_resonances(both, near, log.name)
+        # Tracking assigns modes without a name: a sweep may excite one of several alone.
+        modes = named.publish(both, wanted, poles, unclear=True)
+    segments = with_few_lengths(stationary(find_phases(log), 0))
+    top = min(band[1] if band else np.inf, _TOP * log.sample_rate)
+    spectra = _plain_spectra(used, segments, log.sample_rate, top)
+    return ModalReading(modes, spectra, rejected=tuple(poles.values()))
+
+
+def _clearest(found: Sequence[Modes]) -> list[Modes]:
+    """Keep each mode in the channel that shows it with the least standard deviation.
+
+    ``found`` are the modes of one channel each, from the same blows or periods: as the excitation
+    that was not measured is common to all, estimates of one mode are no independent ones.
+    """
+    order = [
+        (std / f, c, i)
+        for c, modes in enumerate(found)
+        for i, (std, f) in enumerate(zip(modes.frequency_std, modes.frequency, strict=True))
+    ]
+    kept: list[list[int]] = [[] for _ in found]
+    for std, c, i in sorted(order):
+        others = [
+            abs(float(modes.ln_frequency[k] - found[c].ln_frequency[i]))
+            for other, modes in enumerate(found)
+            for k in kept[other]
+            if other != c
+        ]
+        if min(others, default=np.inf) > max(_SAME_SIGMAS * std, found[c].damping_ratio[i]):
+            kept[c].append(i)
+    return [modes.select(sorted(own)) for modes, own in zip(found, kept, strict=True)]
 
 
 def read_ambient(
@@ -139,8 +301,8 @@ def read_ambient(
     channels: Sequence[str] | None = None,
     band: tuple[float, float] | None = None,
     progress: Callable[[str, int, int], None] = lambda step, done, total: None,
-) -> AmbientReading:
-    """Identify modes as `identify` does; return them with the spectra and their fit."""
+) -> ModalReading:
+    """Identify modes under ambient excitation; return them with the spectra and their fit."""
     check_band(log, band)
     log = replace(log, channels=choose_channels(log, channels))
     hints, short = () if stage is None else choose_targets(stage, band), list[Refusal]()
@@ -191,9 +353,7 @@ def read_ambient(
     else:
         nothing = _nothing_found(log, lines, rejected)
         modes = replace(modes, refused=(*modes.refused, nothing))
-    return AmbientReading(
-        modes, whole, tuple(one.fitted for one in fitted), tuple(rejected), sought
-    )
+    return ModalReading(modes, whole, tuple(one.fitted for one in fitted), tuple(rejected), sought)
 
 
 def _wandering(sought: Sequence[Found]) -> tuple[Line, ...]:

@@ -181,18 +181,29 @@ class Named:
     log: str
 
     def publish(
-        self, modes: Modes, wanted: Sequence[Target], rejected: dict[str, Refusal]
+        self,
+        modes: Modes,
+        wanted: Sequence[Target],
+        rejected: dict[str, Refusal],
+        *,
+        unclear: bool = False,
     ) -> Modes:
         """Return the wanted ones of credible modes, and refuse those that are not there.
 
-        ``rejected`` are the resonances of the log that are not credible, by provisional name.
+        ``rejected`` are the resonances of the log that are not credible, by provisional name. With
+        ``unclear`` those that may be several of the wanted ones are returned without a name.
         """
         by_name = {target.name: target for target in wanted}
-        index = [i for i, name in enumerate(modes.names) if self.names.get(name) in by_name]
+        index = [
+            i
+            for i, (name, f) in enumerate(zip(modes.names, modes.frequency.tolist(), strict=True))
+            if self.names.get(name) in by_name
+            or (unclear and self._is_open(name) and any(is_near(t, f) for t in wanted))
+        ]
         named = modes.select(index)
-        names = tuple(self.names[name] for name in named.names)
+        names = tuple(self.names.get(name, "") for name in named.names)
         flags = tuple(
-            " ".join(flag for flag in (own, *self._flags(by_name[name], f, zeta)) if flag)
+            " ".join(flag for flag in (own, *self._flags(by_name.get(name), f, zeta)) if flag)
             for own, name, f, zeta in zip(
                 named.flags, names, named.frequency, named.damping_ratio, strict=True
             )
@@ -211,8 +222,14 @@ class Named:
             )
         return replace(named, names=names, flags=flags, refused=(*modes.refused, *refused))
 
-    def _flags(self, target: Target, f: float, zeta: float) -> Iterator[str]:
-        """Yield the flags of a named mode that follow from its description."""
+    def _is_open(self, name: str) -> bool:
+        """Return whether a resonance is likely one of several described modes."""
+        return name not in self.names and name not in self.undescribed
+
+    def _flags(self, target: Target | None, f: float, zeta: float) -> Iterator[str]:
+        """Yield the flags of a mode that follow from its description, none without a name."""
+        if target is None:
+            return
         shift = abs(np.log(f / target.frequency)) / np.log1p(target.search)
         ratio = abs(np.log(zeta / target.damping_ratio)) / np.log(constants.DAMPING_SPAN)
         if shift > constants.AT_BOUND or ratio > constants.AT_BOUND:

@@ -16,23 +16,19 @@ from scipy.stats import gamma
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
-from lmshealth.errors import BadLog
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.search import Found
-from lmshealth.modal.frf.identification import FrfReading
-from lmshealth.modal.frf.measured import MeasuredResponse
-from lmshealth.modal.identification import AmbientReading
+from lmshealth.modal.deterministic.frequency_response import FrfReading
+from lmshealth.modal.deterministic.measured import MeasuredResponse
+from lmshealth.modal.identification import ModalReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
-from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures, tables
 from lmshealth.report.rendering import render
 from lmshealth.report.text import spell
-from lmshealth.signal.segments import select_segments
-from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
 
@@ -68,7 +64,7 @@ class LogFigure(NamedTuple):
 
 def modes_figure(
     log: Log,
-    reading: AmbientReading,
+    reading: ModalReading,
     stage: Stage | None = None,
     *,
     band: tuple[float, float] | None = None,
@@ -94,7 +90,7 @@ def modes_figure(
     return LogFigure(f"Modes of {log.name}", (width, height + below), draw, modes)
 
 
-def _without_harmonics(fit: FittedSpectrum, reading: AmbientReading) -> FittedSpectrum:
+def _without_harmonics(fit: FittedSpectrum, reading: ModalReading) -> FittedSpectrum:
     """Subtract what stands for harmonics that wander: the expectation of modes and floors."""
     density = fit.density
     for part in reading.sought:
@@ -314,21 +310,6 @@ def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
         for panel in panels:
             span: Any = {"color": figures.RED, "alpha": 0.15, "lw": 0}
             panel.axvspan(line.low, line.high, **span, label="band of a line that wanders")
-
-
-def settling_spectra(log: Log, channels: Sequence[str] | None) -> LogSpectra:
-    """Return the spectra of free decays, as `identify_decays` uses them; `BadLog` without any."""
-    used = choose_channels(log, channels)
-    segments = select_segments(log, "settling")
-    if not segments:
-        raise BadLog(log.name, "too-short", "no free decay after a move to plot")
-    everywhere = ResonanceRange(0.0, np.inf, 0.0)  # nothing is subtracted
-    top = 0.49 * log.sample_rate
-    return LogSpectra(
-        tuple(channel.name for channel in used),
-        tuple("delta_e" if c.kind == "displacement" else "acc" for c in used),
-        cross_spectra(used, segments, log.sample_rate, top, resonances=[everywhere]),
-    )
 
 
 def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refusal, ...]:

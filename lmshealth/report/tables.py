@@ -14,7 +14,7 @@ from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
 from lmshealth.life.maintenance_decision import ProbabilityBounds, Service
-from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.deterministic.frequency_response import FrfReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes

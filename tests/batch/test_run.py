@@ -48,7 +48,7 @@ from lmshealth.life.posterior import fit as life_posterior
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.prognosis import prognose
-from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
@@ -58,8 +58,10 @@ from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
 from studies.harness import servers
+from studies.modes.frf import hammer
 from tests.assessments import Maker, make
-from tests.signals import sine, write_archive, write_archive_stage, write_log
+from tests.signals import ARCHIVE_MODES, sine, write_archive, write_archive_stage, write_log
+from tests.stops import Ring, stop
 
 __all__ = ["make"]
 
@@ -120,6 +122,58 @@ def done(tmp_path_factory: pytest.TempPathFactory) -> Done:
 def modes_only(tmp_path: Path) -> Stage:
     """Load a description without health parameters: quick to run."""
     return load_stage(str(write_archive_stage(tmp_path / "stage", health=False)))
+
+
+def write_other_log(path: Path, day: int, rate: float, signals: dict[str, np.ndarray]) -> None:
+    """Write a log of the archive's machine with columns of other kinds."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        for column, values in signals.items():
+            file[column] = values
+        file.attrs.update(stage="test-A", recorded_at=f"2024-03-{day:02d}T08:00:00Z",
+                          travel_km=f"{1000 + day}", sample_rate_hz=f"{rate:g}")  # fmt: skip
+
+
+def test_blows_and_stops_are_rows_of_modes(tmp_path: Path, modes_only: Stage) -> None:
+    """A folder of ambient vibration, of blows and of stops gives both modes of each log.
+
+    Estimates are within four standard deviations of the truth. Those of one response are
+    correlated, those of different bands of decays are not.
+    """
+    logs, rng = tmp_path / "logs", np.random.default_rng(5)
+    write_log(logs / "ambient.h5", 1.0, 0)
+    truth = {name: (f, zeta) for name, f, zeta, _ in ARCHIVE_MODES}
+    for day in (1, 2):
+        modes = tuple((f, zeta, 1.0) for f, zeta in truth.values())
+        force, answer = hammer.strike(rng, hammer.Hammer(modes, blows=3, seconds=1.0))
+        signals = {"current_force_a": force, "acc_feed_m_s2": answer}
+        write_other_log(logs / f"blows-{day}.h5", day, hammer.RATE, signals)
+    rings = [Ring(f, zeta, ambient=0.02) for f, zeta in truth.values()]
+    parts = [
+        (rng.standard_normal(150), stop(rng, rings, 500, 500.0, 0.02)[0])  # a move, and its stop
+        for _ in range(4)
+    ]
+    still = np.concatenate([np.r_[np.full(150, 100.0), np.zeros(500)]] * 4)
+    signals = {"acc_feed_m_s2": np.ravel([np.concatenate(part) for part in parts])}
+    write_other_log(logs / "stops.h5", 3, 500.0, signals | {"reference_velocity_mm_s": still})
+    result = run(logs, [modes_only], tmp_path / "out")
+    assert result.n_refused == 0
+    found = rows(tmp_path / "out" / "modes.csv")
+    sources = [(row["log"], row["mode"], row["source"]) for row in found]
+    assert sorted(sources) == [
+        (f"{log}.h5", mode, source)
+        for log, source in (("ambient", "acc"), ("blows-1", "frf"), ("blows-2", "frf"),
+                            ("stops", "acc"))
+        for mode in ("pitch", "roll")
+    ]  # fmt: skip
+    for row in found:
+        f, zeta = truth[row["mode"]]
+        off = (float(row["frequency_hz"]) - f) / float(row["frequency_std_hz"])
+        off_zeta = (float(row["damping_ratio"]) - zeta) / float(row["damping_ratio_std"])
+        assert max(abs(off), abs(off_zeta)) < 4, row
+    joint = {row["log"] for row in rows(tmp_path / "out" / "modes_cov.csv")
+             if row["mode_a"] != row["mode_b"] and float(row["cov_ln_f"])}  # fmt: skip
+    assert {"blows-1.h5", "blows-2.h5"} <= joint
 
 
 @pytest.mark.slow
@@ -597,13 +651,13 @@ def test_what_the_computer_failed_at_is_tried_again(
     """A full disk or memory is no fault of a log: it is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 3)
 
-    def fail(log: Log, stage: Stage) -> AmbientReading:
+    def fail(log: Log, stage: Stage) -> ModalReading:
         if log.name == "log-01.h5":
             raise error
-        return read_ambient(log, stage)
+        return read_modes(log, stage)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ingesting, "read_ambient", fail)
+        patch.setattr(ingesting, "read_modes", fail)
         first = run(logs, [modes_only], tmp_path / "out")
     assert (first.n_refused, first.n_remembered) == (1, 0)
     refused = rows(tmp_path / "out" / "refused.csv")

@@ -24,11 +24,12 @@ from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import BinnedSpectra, fit_modes
 from lmshealth.modal.ambient.cluster_modes import ClusterFit
 from lmshealth.modal.ambient.search import Found, search
-from lmshealth.modal.identification import identify
+from lmshealth.modal.identification import identify, read_ambient, read_modes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.targets import Target, clusters
 from lmshealth.signal import segments, spectra
 from lmshealth.signal.spectra import LogSpectra
+from studies.modes.frf import hammer
 from tests.bands import as_if_white
 from tests.signals import (
     Mode,
@@ -41,6 +42,7 @@ from tests.signals import (
     sine,
     white,
 )
+from tests.stops import Ring, stop
 
 RATE = 1000.0
 LMS_Y = (("roll", 126.4, 0.0176), ("pitch", 136.6, 0.0151), ("yaw", 155.0, 0.0176))
@@ -887,3 +889,103 @@ def test_many_short_pieces_keep_the_damping(needs: Callable[[str], None]) -> Non
     upper = int(np.abs(modes.frequency - 78).argmin())
     error = modes.damping_ratio[upper] - 0.0238
     assert abs(error) < 3 * modes.damping_ratio_std[upper] and modes.snr.max() < 1e5
+
+
+# What a log carries decides how it is read.
+
+STRUCK = ((62.0, 0.02, 1.0), (105.0, 0.015, -0.7))
+STRUCK_STAGE = make_stage([(n, f, z) for n, (f, z, _) in zip("ab", STRUCK, strict=True)])
+
+
+def struck_log(*, blows: int = 4, double: tuple[int, ...] = (), name: str = "current_force") -> Log:
+    """Make a log of blows with two accelerometers, of which the second hardly shows mode a."""
+    test = hammer.Hammer(STRUCK, blows, 1.0, white=0.03, double=double, share=(0.5, 0.7))
+    force, first = hammer.strike(rng(), test)
+    second = hammer.respond(((62.0, 0.02, 0.05), (105.0, 0.015, 1.0)), force)
+    second = second + 0.003 * np.abs(second).max() * rng(2).standard_normal(second.size)
+    return make_log({name: force, "acc_0": first, "acc_1": second}, hammer.RATE)
+
+
+def stops_log(move: float, *, noise: float = 0.02) -> Log:
+    """Make a log of four moves of so many seconds with a stop of one second after each."""
+    still, values, velocity = 500, list[np.ndarray](), list[np.ndarray]()
+    for k in range(4):
+        moving = round(500 * move)
+        ring = stop(rng(k), [Ring(62.0, 0.02, ambient=0.02)], still, 500.0, noise)[0]
+        values += [rng(k + 9).standard_normal(moving), ring]
+        velocity += [np.full(moving, 0.1), np.zeros(still)]
+    signals = {"acc_0": np.concatenate(values)}
+    return make_log(signals, 500.0, velocity=np.concatenate(velocity))
+
+
+def test_blows_are_read_from_the_response_of_the_channel_that_shows_a_mode_best() -> None:
+    """Both modes of a description are found within four standard deviations, once each."""
+    reading = read_modes(struck_log(), STRUCK_STAGE)
+    modes = reading.modes
+    assert (modes.names, modes.sources) == (("a", "b"), ("frf", "frf"))
+    assert modes.channels == ("acc_0", "acc_1")
+    for name, (f, zeta, _) in zip(modes.names, STRUCK, strict=True):
+        assert np.abs(deviations(modes, name, f, zeta)).max() < 4
+    assert reading.spectra.channels == ("acc_0", "acc_1")
+    assert identify(struck_log(), band=(30.0, 150.0)).names == ("mode_1", "mode_2")
+
+
+def test_a_mode_of_a_response_that_may_be_several_has_no_name() -> None:
+    """A hammer excites one of two modes whose searches overlap: tracking has to assign it."""
+    force, answer = hammer.strike(rng(), hammer.Hammer(((62.0, 0.02, 1.0),), seconds=1.0))
+    log = make_log({"current_force": force, "acc_0": answer}, hammer.RATE)
+    modes = identify(log, make_stage([("low", 59.0, 0.02), ("high", 65.0, 0.02)]))
+    assert (modes.names, modes.sources) == (("",), ("frf",))
+    assert [(row.mode, row.reason) for row in modes.refused] == [
+        ("low", "ambiguous"),
+        ("high", "ambiguous"),
+    ]
+
+
+def test_a_servo_s_current_is_no_excitation() -> None:
+    """Pulses of a motor's current are not blows: its log is identified as ambient."""
+    modes = identify(struck_log(name="current_motor"), band=(30.0, 150.0))
+    assert "frf" not in modes.sources
+
+
+def test_blows_that_cannot_be_used_are_refused_and_ambient_vibration_is_read() -> None:
+    """Every blow hits twice: the force is refused for that, and the log is none without modes."""
+    log = struck_log(blows=3, double=(0, 1, 2))
+    modes = identify(log, STRUCK_STAGE)
+    (row,) = (row for row in modes.refused if row.channel == "current_force")
+    assert row.reason == "double-hit"
+    assert "frf" not in modes.sources
+
+
+@pytest.mark.parametrize("more", [(), ("current",), ("current_force",)])
+def test_ambient_logs_are_read_as_before(more: tuple[str, ...]) -> None:
+    """Neither a servo's current nor a hammer at rest changes a bit of the modes."""
+    log = one_mode_log(30.0)
+    noise = Channel("", "current", rng(5).standard_normal(log.channels[0].values.size))
+    own = tuple(replace(noise, name=name) for name in more)
+    plain = read_ambient(log, make_stage(ROLL)).modes
+    found = identify(replace(log, channels=(*log.channels, *own)), make_stage(ROLL))
+    assert found.names == plain.names == ("roll",)
+    np.testing.assert_array_equal(found.estimate, plain.estimate)
+    np.testing.assert_array_equal(found.cov, plain.cov)
+    assert found.refused == plain.refused
+
+
+def test_a_log_that_only_moves_and_stops_is_read_from_its_decays() -> None:
+    """Moves of 0.3 s are too short for the mode, its decays are not; those of 4 s are used."""
+    stage = make_stage([("a", 62.0, 0.02)])
+    log = stops_log(0.3)
+    with pytest.raises(BadLog, match="too-short"):
+        read_ambient(log, stage)
+    modes = identify(log, stage)
+    assert modes.names == ("a",)
+    assert np.abs(deviations(modes, "a", 62.0, 0.02)).max() < 4
+    moving = stops_log(4.0)
+    assert identify(moving, stage).refused == read_ambient(moving, stage).modes.refused
+
+
+def test_stops_that_excite_nothing_leave_the_log_too_short() -> None:
+    """Where decays show no mode either, the refusal is that of the segments."""
+    log = stops_log(0.3, noise=50.0)
+    with pytest.raises(BadLog, match=r"too-short.*no segment of constant velocity"):
+        identify(log, make_stage([("a", 62.0, 0.02)]))

@@ -15,7 +15,7 @@ from matplotlib.text import Annotation, Text
 
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.ambient.wandering import Harmonic
-from lmshealth.modal.identification import AmbientReading, read_ambient
+from lmshealth.modal.identification import ModalReading, read_ambient
 from lmshealth.modal.mode_shapes import ModeShapes
 from lmshealth.modal.modes import Modes, estimates_only, merge, numbered
 from lmshealth.report.log_figures import (
@@ -56,12 +56,12 @@ def some_modes(ln_f_std: float, *frequencies: float) -> Modes:
     return numbered(merge([found], [Line(50.0, 10.0, "m/s²", "mains", "acc_n")], [refused]))
 
 
-def read(log: Log, modes: Modes) -> AmbientReading:
+def read(log: Log, modes: Modes) -> ModalReading:
     """Give the spectra of a whole log."""
     segments = find_segments(log, 1.0)
     spectra = cross_spectra(log.channels, segments, RATE, 0.49 * RATE)
     names = tuple(channel.name for channel in log.channels)
-    return AmbientReading(modes, LogSpectra(names, ("acc",) * len(names), spectra))
+    return ModalReading(modes, LogSpectra(names, ("acc",) * len(names), spectra))
 
 
 def draw(figure: LogFigure) -> Figure:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.modal.free_decay.identification import identify_decays
+from lmshealth.modal.deterministic.free_decays import identify_decays
 from tests.claims import Claims
 from tests.signals import deviations, make_stage
 from tests.statistical.evidence import covered

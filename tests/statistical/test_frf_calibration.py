@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.modal.frf.identification import read_frf
+from lmshealth.modal.deterministic.frequency_response import read_frf
 from studies.modes.frf.records import BAND, MODES, RATE, Machine, at_random, periodic
 from tests.claims import Claims
 from tests.signals import make_log

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
-from lmshealth.modal.free_decay.transient_likelihood import (
-    DecaySpectra,
-    TransientLikelihood,
+from lmshealth.modal.deterministic.likelihood import (
+    BandSpectra,
+    ModalLikelihood,
     pole_columns,
     unit_level,
 )
@@ -139,8 +139,9 @@ def decay_bound(
     # So fast that nothing aliases; the band alone counts.
     n_samples = int(np.ceil(20 * recording.band[1] * duration))
     fourier = fourier_frequencies(duration, recording.band)
-    nothing = np.empty((fourier.size, 0), dtype=complex)
-    block = DecaySpectra(fourier, nothing, duration, n_samples / duration, nothing)
+    empty = np.empty((fourier.size, 0), dtype=complex)
+    rate, base = n_samples / duration, np.empty((2 * fourier.size, 0))
+    block = BandSpectra(fourier, empty, duration, rate, base)
     columns, _ = pole_columns(block, f, zeta)
     exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
     sizes = amplitude * (1 - np.exp(exponent * duration)) * np.sqrt(duration / 2)
@@ -148,7 +149,7 @@ def decay_bound(
     block = replace(block, ordinates=stacked[:, : fourier.size] + 1j * stacked[:, fourier.size :])
     units = np.array([unit_level(*pair, duration) for pair in zip(f, zeta, strict=True)])
     levels = np.log(recording.noise)
-    likelihood = TransientLikelihood((block,), modes.shapes.T, units, levels)
+    likelihood = ModalLikelihood((block,), modes.shapes.T, units, levels)
     p = np.concatenate([np.log(f), np.log(zeta), np.sqrt(ambient * units), levels, np.zeros(n)])
     unknown = np.delete(np.arange(3 * m + n), 2 * m + np.flatnonzero(ambient == 0))
     return marginal_covariance(likelihood.evaluate(p).fisher[np.ix_(unknown, unknown)], 2 * m)

@@ -34,7 +34,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import WARNINGS
 from lmshealth.io.reading import read_log
-from lmshealth.modal.frf.measured import read_responses
+from lmshealth.modal.deterministic.measured import read_responses
 from studies.harness.claims import Claim, counted
 from studies.harness.study import Row, Study
 from studies.inputs.foreign_files import dialects, writers

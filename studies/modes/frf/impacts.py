@@ -21,9 +21,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth import LmshealthError, read_frf
-from lmshealth.modal.frf.blows import find_hits, from_blows
-from lmshealth.modal.frf.response_fit import fit_response, without_window
-from lmshealth.modal.frf.responses import Pair
+from lmshealth.modal.deterministic.blows import find_hits, from_blows
+from lmshealth.modal.deterministic.response_fit import fit_response, without_window
+from lmshealth.modal.deterministic.responses import Pair
 from studies.harness.claims import Claim, counted, covered
 from studies.harness.data.logs import make_log
 from studies.harness.study import Row, Study, judge_scores

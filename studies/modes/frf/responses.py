@@ -35,7 +35,7 @@ from scipy.stats import chi2
 from lmshealth import read_frf, read_log
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log
-from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.deterministic.frequency_response import FrfReading
 from models.dynamics.stages import stage_named
 from models.recordings.formats import write_log
 from models.recordings.sweep import Sweep, record_sweep, without_loop

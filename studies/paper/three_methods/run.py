@@ -33,7 +33,7 @@ from scipy.stats import chi2
 
 from lmshealth import identify, load_stage, read_frf, read_log
 from lmshealth.io.log import Log
-from lmshealth.modal.frf.identification import FrfReading
+from lmshealth.modal.deterministic.frequency_response import FrfReading
 from models.dynamics.plant import GUIDE_MODES, SENSORS
 from models.dynamics.stages import NOMINAL, Condition, stage_named
 from models.recordings.formats import write_log

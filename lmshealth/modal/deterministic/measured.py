@@ -26,8 +26,7 @@ from lmshealth.io.metadata import parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, corrupt, listed, shown, visible
 from lmshealth.modal import constants
-from lmshealth.modal.frf.rational import Ordinates
-from lmshealth.modal.frf.responses import Frf, average_noise
+from lmshealth.modal.deterministic.responses import Frf, Ordinates, average_noise
 
 _FORMATS = (CSV.name, UFF.name, TRACE.name)
 _HERTZ = {"hz": 1.0, "khz": 1e3, "rad_s": 1 / (2 * np.pi)}

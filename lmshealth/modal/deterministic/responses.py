@@ -3,8 +3,9 @@
 Noise of the lines comes from the sensors and from forces that excite the same modes.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
+from typing import Self
 
 import numpy as np
 from scipy import fft, signal
@@ -12,13 +13,12 @@ from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
 from scipy.stats import f as fisher
 
-from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal import constants
 from lmshealth.modal.credibility import inverse_bias
-from lmshealth.modal.frf.periods import cut_periods
-from lmshealth.modal.frf.rational import Ordinates
+from lmshealth.modal.deterministic.periods import cut_periods
 
 _LEAST_RATIO, _LARGEST_RATIO = 1e-6, 1e6
 
@@ -60,6 +60,39 @@ _FREEDOM = 16
 # Blocks of a record, half overlapping, that a coherence is averaged over.
 _BLOCKS = 8
 _ROUNDING = 1e-9  # share of the largest amplitude
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Ordinates(ReadOnly):
+    """Spectra of an input and an output at the lines of a band, arrays ``(n_lines,)``."""
+
+    frequency: FloatArray  # in Hz, ascending
+    given: ComplexArray  # amplitudes of the input
+    answer: ComplexArray  # of the output
+    noise: FloatArray  # variance of answer - H given by noise; without periods a start value
+    freedom: float  # complex degrees of freedom of each variance; 0 where it is unknown
+    periodic: bool  # means over whole periods or blows: no transient, noise from their scatter
+    at_rest: bool = False  # at both ends of the record: no transient
+
+    @property
+    def transient(self) -> bool:
+        """Whether the answer has a transient."""
+        return not (self.periodic or self.at_rest)
+
+    @property
+    def scatter(self) -> bool:
+        """Whether the noise is that of a scatter; otherwise it is that of the residual."""
+        return self.periodic and self.freedom > 0
+
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring lines in Hz."""
+        return float(np.median(np.diff(self.frequency)))
+
+    def only(self, keep: BoolArray) -> Self:
+        """Keep some of the lines."""
+        lines = ("frequency", "given", "answer", "noise")
+        return replace(self, **{name: getattr(self, name)[keep] for name in lines})
 
 
 @dataclass(frozen=True, slots=True, eq=False)

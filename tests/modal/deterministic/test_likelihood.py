@@ -1,17 +1,19 @@
-"""Transients, and the restricted likelihood of decays."""
+"""Columns of modes, and the restricted likelihood of decays and of responses to a force."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from lmshealth._private.arrays import stack
-from lmshealth.modal.free_decay.transient_likelihood import (
-    DecaySpectra,
-    TransientLikelihood,
+from lmshealth.modal.deterministic.likelihood import (
+    BandSpectra,
+    ModalLikelihood,
     pole_columns,
+    pole_terms,
     transform_decays,
-    transient,
     unit_level,
 )
 from tests.stops import ring
@@ -30,13 +32,13 @@ def two_modes(rng: np.random.Generator, n_segments: int, n: int) -> np.ndarray:
 
 
 def likelihood_of(
-    blocks: tuple[DecaySpectra, ...], *, displacement: bool = False
-) -> TransientLikelihood:
+    blocks: tuple[BandSpectra, ...], *, displacement: bool = False
+) -> ModalLikelihood:
     """Make the likelihood of two modes in two channels."""
     levels = np.full(2, np.log(0.02**2 * 2 / RATE))
     units = np.array([unit_level(f, z, 1.0) for f, z in ((60.0, 0.01), (67.3, 0.02))])
     shapes = np.exp(levels[0] / 2) * np.array([[1.0, 0.6], [1.0, -0.6]])
-    return TransientLikelihood(blocks, shapes, units, levels, displacement)
+    return ModalLikelihood(blocks, shapes, units, levels, displacement)
 
 
 @pytest.mark.parametrize("displacement", [False, True])
@@ -68,7 +70,7 @@ def test_the_restricted_likelihood_does_not_depend_on_the_unit_of_the_sizes() ->
     for scale in (1.0, 1e3):
         likelihood = likelihood_of((transform_decays(scale * x, RATE, 40, 90),))
         shift = 2 * np.log(scale)
-        likelihood = TransientLikelihood(
+        likelihood = ModalLikelihood(
             likelihood.blocks,
             likelihood.shapes * scale,
             likelihood.units,
@@ -98,11 +100,17 @@ def test_a_decay_of_any_length_is_its_transient_and_nothing_else() -> None:
     assert amplitude == pytest.approx(2.0 * np.exp(0.7j))
 
 
-def test_derivatives_of_a_transient_are_differences_of_it() -> None:
-    """Derivatives of the columns by ln f and ln ζ agree with differences."""
-    block = transform_decays(np.zeros((1, 400, 1)), RATE, 40, 90)
+@pytest.mark.parametrize("rate", [RATE, np.inf])
+@pytest.mark.parametrize("forced", [False, True])
+def test_derivatives_of_columns_are_differences_of_them(rate: float, forced: bool) -> None:
+    """Derivatives by ln f and ln ζ agree with differences: transients, responses, with aliases."""
+    block = replace(transform_decays(np.zeros((1, 400, 1)), RATE, 40, 90), sample_rate=rate)
+    if forced:
+        force = np.random.default_rng(3).standard_normal((2, block.frequency.size))
+        block = replace(block, force=force[0] + 1j * force[1])
     f, zeta = np.array([60.3, 71.0]), np.array([0.01, 0.002])
-    _, slopes = pole_columns(block, f, zeta)
+    columns, slopes = pole_columns(block, f, zeta)
+    assert columns.shape == (2, 2 * block.frequency.size, 4 if forced else 2)
     step = np.exp(1e-6)
     by_f = pole_columns(block, f * step, zeta)[0] - pole_columns(block, f / step, zeta)[0]
     by_zeta = pole_columns(block, f, zeta * step)[0] - pole_columns(block, f, zeta / step)[0]
@@ -114,8 +122,8 @@ def test_a_linear_trend_lies_in_the_base() -> None:
     """What drifts and what is constant is taken out exactly."""
     x = (3.0 + 0.01 * np.arange(300.0))[None, :, None]
     block = transform_decays(x, RATE, 5, 40)
-    y = block.ordinates[0, :, 0]
-    assert np.abs(y - block.base @ (block.base.conj().T @ y)).max() < 1e-4 * np.abs(y).max()
+    y = stack(block.ordinates[0, :, 0])
+    assert np.abs(y - block.base @ (block.base.T @ y)).max() < 1e-4 * np.abs(y).max()
 
 
 def test_what_a_record_cuts_off_an_ambient_response_lies_along_its_transients() -> None:
@@ -140,17 +148,18 @@ def test_what_a_record_cuts_off_an_ambient_response_lies_along_its_transients() 
         covariance[0]
         + 2 * np.cos(2 * np.pi * np.outer(k / n, np.arange(1, 16000))) @ covariance[1:]
     )
-    block = DecaySpectra(
+    block = BandSpectra(
         k * RATE / n,
         np.empty((1, k.size, 1), complex),
         n / RATE,
         RATE,
-        np.empty((k.size, 0), complex),
+        np.empty((2 * k.size, 0)),
     )
     pole = np.exp(omega / RATE * (-zeta + 1j * root))
     back = np.exp(-2j * np.pi * k / n)
     both = np.stack([1 / (1 - pole * back), 1 / (1 - pole.conj() * back)], axis=1)
-    np.testing.assert_allclose(transient(block, np.array([f]), np.array([zeta])), both[:, :1])
+    (up, _), (down, _) = pole_terms(block, np.array([f]), np.array([zeta]))
+    np.testing.assert_allclose(n * np.concatenate([up, down]).T, both)
     q, _ = np.linalg.qr(both)
     keep = np.eye(k.size) - q @ q.conj().T
     assert np.abs(found - np.diag(density)).max() > 0.1 * density.max()

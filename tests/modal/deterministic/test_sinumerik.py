@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.modal.frf.identification import read_measured
-from lmshealth.modal.frf.measured import read_responses
+from lmshealth.modal.deterministic.frequency_response import read_measured
+from lmshealth.modal.deterministic.measured import read_responses
 from tests.io.formats.test_instruments import X, trace
 
 DIGITS = "0123456789abcdefghijklmnopqrstuvwxyzABCDEFGHIJKLMNOPQRSTUVWXYZ!#$`()*+-/:;=?@[]^_{|}~"

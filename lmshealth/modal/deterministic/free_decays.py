@@ -4,8 +4,8 @@ The decays of a log share frequencies, dampings and noise; sizes and phases diff
 The noise comes from the sensors and from forces that still excite the same modes.
 """
 
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -15,16 +15,17 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.free_decay.decay_fit import (
+from lmshealth.modal.deterministic.decay_fit import (
     DecayEstimate,
-    DecayFit,
     estimate,
     fit_decays,
+    peak_snr,
     stationarity,
 )
-from lmshealth.modal.free_decay.transient_likelihood import transform_decays
+from lmshealth.modal.deterministic.likelihood import transform_decays
+from lmshealth.modal.deterministic.poles import PoleFit
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
-from lmshealth.modal.naming import assign, is_near, pairing_probability
+from lmshealth.modal.naming import Named, assign, is_near, pairing_probability
 from lmshealth.modal.targets import (
     Target,
     check_band,
@@ -124,40 +125,51 @@ def identify_decays(
         group = tuple(c for c in used if c.kind == kind)
         if group:
             found += _fit_bands(log, group, decays, limits, targets)
-    if not targets:
-        return _number(log, found)
-    named, ambiguous = _name(targets, found)
-    names = {name for modes in named for name in modes.names}
-    refused = [
-        Refusal(log.name, *(ambiguous.get(t.name) or _why_missing(t, found))[:2], mode=t.name)
-        for t in targets
-        if t.name not in names
-    ]
-    return merge(named, (), (*log.refused, *refused))
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _Pole:
-    """A decaying resonance: Hz, damping ratio, SNR of each channel, why it is no mode."""
-
-    frequency: float
-    damping: float
-    snr: FloatArray
-    rejection: Rejection | None
+    modes = numbered(merge(_distinct(found), (), log.refused))
+    rejected = sorted((row for band in found for row in band.rejected), key=lambda row: -row[0])
+    if targets:
+        refused = {f"pole_{k}": Refusal(log.name, *why[:2], frequency=why.frequency)
+                   for k, (_, why) in enumerate(rejected)}  # fmt: skip
+        return _named(modes, targets, log.name).publish(modes, targets, refused)
+    if not modes.names:
+        nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
+        raise BadLog(log.name, *(rejected[0][1][:2] if rejected else nothing))
+    return modes
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandModes:
-    """Poles of a band of one kind of channels, and the modes of those that are accepted."""
+    """Modes of a band of one kind of channels, and its other resonances with their SNR."""
 
-    source: str
-    poles: tuple[_Pole, ...]
     modes: Modes
+    rejected: tuple[tuple[float, Rejection], ...]
 
     @property
-    def accepted(self) -> list[_Pole]:
-        """The poles of the modes."""
-        return [pole for pole in self.poles if pole.rejection is None]
+    def strongest_rejection(self) -> str:
+        """Why the strongest resonance is no mode; empty where it is one."""
+        snr, why = max(self.rejected, key=lambda row: row[0], default=(0.0, Rejection("", "")))
+        return why.reason if snr > self.modes.snr.max(initial=0.0) else ""
+
+
+def _named(modes: Modes, targets: tuple[Target, ...], log: str) -> Named:
+    """Name the resonances of decays; the machine may be anywhere within the searches."""
+    f, zeta = modes.frequency.tolist(), modes.damping_ratio.tolist()
+    names, ambiguous = assign(f, targets, pairing_probability(f, targets, damping=zeta))
+    own = {given: name for given, name in zip(modes.names, names, strict=True) if name}
+    return Named(own, frozenset(), ambiguous, frozenset(), targets, log)
+
+
+def _distinct(bands: Sequence[_BandModes]) -> list[Modes]:
+    """Return the modes of all bands; of Δe only those that accelerometers do not show."""
+    found = [band.modes for band in bands]
+    seen = np.concatenate([np.empty(0), *(m.frequency for m in found if "acc" in m.sources)])
+    return [
+        modes if "acc" in modes.sources else modes.select([
+            i for i, (f, zeta) in enumerate(zip(modes.frequency, modes.damping_ratio, strict=True))
+            if (np.abs(f / seen - 1) >= 2 * zeta).all()
+        ])
+        for modes in found
+    ]  # fmt: skip
 
 
 def _limits(
@@ -255,8 +267,8 @@ def _fit_band(
     Right after a stop the machine still moves and is nonlinear: two poles within a Fourier
     frequency, or a strong uncertain one, show it.
     """
-    nonstationary: DecayFit | None = None
-    stationary: DecayFit | None = None
+    nonstationary: PoleFit | None = None
+    stationary: PoleFit | None = None
     for skip in _SKIPS:
         blocks = tuple(transform_decays(samples, sample_rate, *ends) for samples in cut(skip))
         fit = fit_decays(blocks, displacement=channels[0].kind == "displacement")
@@ -268,16 +280,10 @@ def _fit_band(
         stationary = stationary or fit
         if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
             band = _accept(fit, channels, limits)
-            strongest = _strongest(band.poles)
-            why = strongest.rejection if strongest else None
-            if why is None or why.reason not in _TOO_EARLY:
+            if band.strongest_rejection not in _TOO_EARLY:
                 return [band]
     best = stationary or nonstationary
     return [_accept(best, channels, limits, linear=best is stationary)] if best else []
-
-
-def _strongest(poles: Iterable[_Pole]) -> _Pole | None:
-    return max(poles, key=lambda pole: pole.snr.max(), default=None)
 
 
 def _reach(duration: float, f: float) -> float:
@@ -321,43 +327,39 @@ def _bands(peaks: list[float], duration: float) -> list[tuple[list[float], Range
 
 
 def _accept(
-    fit: DecayFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
+    fit: PoleFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
 ) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
-    source, lines = _SOURCES[channels[0].kind], fit.is_line()
-    poles: list[_Pole] = []
-    modal: list[int] = []
-
-    def pole(i: int, rejection: Rejection | None) -> _Pole:
-        return _Pole(float(fit.frequency[i]), float(fit.damping_ratio[i]), fit.snr(i), rejection)
-
+    lines, modal, rejected = fit.is_line(), list[int](), list[tuple[float, Rejection]]()
     for i, f in enumerate(fit.frequency.tolist()):
         if not limits[0] <= f <= limits[1]:
             continue
-        if not linear:
-            detail = (
-                f"the resonance at {f:.5g} Hz is no sum of decays in stationary noise, however "
-                "late the decay is started"
-            )
-            poles.append(pole(i, Rejection("not-linear", detail)))
-        elif lines[i]:
-            poles.append(pole(i, Rejection("line-not-mode", f"{f:.5g} Hz does not decay")))
-        else:
+        if linear and not lines[i]:
             modal.append(i)
+            continue
+        why = Rejection("line-not-mode", f"{f:.5g} Hz does not decay", f)
+        if not linear:
+            unlike = f"the resonance at {f:.5g} Hz is no sum of decays in stationary noise, however"
+            why = Rejection("not-linear", f"{unlike} late the decay is started", f)
+        rejected.append((float(peak_snr(fit, i).max()), why))
     if not modal:
-        nothing = estimates_only(np.empty(0), np.empty((0, 0)), np.empty(0), source, ())
-        return _BandModes(source, tuple(poles), nothing)
+        return _BandModes(merge((), (), ()), tuple(rejected))
     result = estimate(fit, modal)
-    found = [pole(i, _incredible(fit, i, result, k)) for k, i in enumerate(modal)]
-    snr = np.array([one.snr for one in found])
+    snr = np.array([peak_snr(fit, i) for i in modal])
     best = [channels[c].name for c in snr.argmax(axis=1)]
-    own = result.mean, result.cov, snr.max(axis=1)
-    modes = estimates_only(*own, source, best, result.credibility)
-    credible = [k for k, one in enumerate(found) if one.rejection is None]
-    return _BandModes(source, (*poles, *found), modes.select(credible))
+    own = result.mean, result.cov, snr.max(axis=1), _SOURCES[channels[0].kind]
+    modes = estimates_only(*own, best, result.credibility)
+    credible = []
+    for k, i in enumerate(modal):
+        if (incredible := _incredible(fit, i, result, k)) is None:
+            credible.append(k)
+        else:
+            f = float(modes.frequency[k])
+            rejected.append((float(modes.snr[k]), incredible._replace(frequency=f)))
+    return _BandModes(modes.select(credible), tuple(rejected))
 
 
-def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
+def _incredible(fit: PoleFit, i: int, result: DecayEstimate, k: int) -> Rejection | None:
     """Return why the k-th estimate, of pole i, is not credible; None if it is."""
     n = result.excitation.size
     f, zeta = np.exp(result.mean[[k, n + k]]).tolist()
@@ -392,61 +394,3 @@ def _incredible(fit: DecayFit, i: int, result: DecayEstimate, k: int) -> Rejecti
             "too-close", f"{f:.5g} Hz has another pole {apart.min() * f:.2g} Hz from it"
         )
     return None
-
-
-def _number(log: Log, bands: list[_BandModes]) -> Modes:
-    """Merge and number the modes; of Δe only those that accelerometers do not show."""
-    seen = [pole for band in bands if band.source == "acc" for pole in band.accepted]
-    kept = []
-    for band in bands:
-        others = () if band.source == "acc" else seen
-        new = [
-            i
-            for i, pole in enumerate(band.accepted)
-            if all(abs(pole.frequency / p.frequency - 1) >= 2 * pole.damping for p in others)
-        ]
-        kept.append(band.modes.select(new))
-    modes = numbered(merge(kept, (), log.refused))
-    if not modes.names:
-        strongest = _strongest(pole for band in bands for pole in band.poles)
-        nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
-        raise BadLog(log.name, *((strongest and strongest.rejection) or nothing)[:2])
-    return modes
-
-
-def _name(
-    targets: Sequence[Target], bands: list[_BandModes]
-) -> tuple[list[Modes], dict[str, Rejection]]:
-    """Assign accelerometers' modes to the targets, then those of Δe to the remaining ones."""
-    named: list[Modes] = []
-    ambiguous: dict[str, Rejection] = {}
-    for source in _SOURCES.values():
-        taken = {name for modes in named for name in modes.names}
-        missing = [target for target in targets if target.name not in taken]
-        poles = [pole for band in bands if band.source == source for pole in band.accepted]
-        poles.sort(key=lambda pole: pole.frequency)
-        f, zeta = [pole.frequency for pole in poles], [pole.damping for pole in poles]
-        assigned, unclear = assign(f, missing, pairing_probability(f, missing, damping=zeta))
-        ambiguous |= unclear
-        names = dict(zip(poles, assigned, strict=True))
-        for band in bands:
-            own = {i: names[pole] for i, pole in enumerate(band.accepted) if names.get(pole)}
-            named.append(replace(band.modes.select([*own]), names=tuple(own.values())))
-    return named, ambiguous
-
-
-def _why_missing(target: Target, bands: list[_BandModes]) -> Rejection:
-    """Return why a mode was not found, from the strongest resonance within its search."""
-    poles = (pole for band in bands for pole in band.poles)
-    strongest = _strongest(pole for pole in poles if is_near(target, pole.frequency))
-    if strongest is None:
-        return Rejection(
-            "not-excited",
-            f"nothing decays within {100 * target.search:.0f} % of {target.frequency:.4g} Hz; "
-            "excite it more, or identify it while the stage moves",
-        )
-    return strongest.rejection or Rejection(
-        "outside-search",
-        f"the damping {strongest.damping:.2g} at {strongest.frequency:.5g} Hz is not within a "
-        f"factor of {constants.DAMPING_SPAN:g} of {target.damping_ratio:.2g}",
-    )

@@ -8,25 +8,30 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import linalg, stats
+from scipy import stats
 from scipy.special import softmax
 
-from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, stack
+from lmshealth._private.arrays import FloatArray, stack
 from lmshealth.modal import constants
 from lmshealth.modal.credibility import Credibility, widened
-from lmshealth.modal.free_decay.transient_likelihood import (
-    DecaySpectra,
-    Evaluation,
+from lmshealth.modal.deterministic.likelihood import (
+    BandSpectra,
     IntArray,
-    TransientLikelihood,
-    transient,
+    ModalLikelihood,
+    pole_terms,
     unit_level,
+)
+from lmshealth.modal.deterministic.poles import (
+    PoleFit,
+    best_pole,
+    evidence_needed,
+    invert,
+    maximise,
 )
 from lmshealth.modal.modes import paired
 
-_MOST_STEPS, _STEP_TOLERANCE = 60, 1e-5
-# Step of the difference of the Hessian in standard deviations.
-_DIFFERENCE = 0.02
+# Accuracy of a maximum, relative.
+_CLOSE = 1e-5
 # Levels of the ambient response: start where none is found, least level, and the log posterior
 # below the largest from which on they are left out.
 _FIRST_AVERAGE_LEVEL, _LEAST_LEVEL, _UNLIKELY = 0.5, 0.1, 6.0
@@ -38,135 +43,51 @@ _STAYS = 2.0
 # Poles tried per Fourier frequency, and their dampings.
 _TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
 _FIRST_LEVEL = 0.3  # of the ambient response
-# A line's damping is within this share of the least one.
-_AT_BOUND = 0.01
 # Least start value of the noise as a share of the mean power: rounding.
 _LEAST_NOISE = 1e-12
 # Tolerance in log likelihood while poles are counted.
 _ROUGH = 0.02
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class DecayFit:
-    """Poles of the decays in a band, at the maximum of the likelihood."""
-
-    likelihood: TransientLikelihood
-    p: FloatArray  # (n_parameters,)
-    at: Evaluation
-
-    @property
-    def frequency(self) -> FloatArray:
-        """Natural frequencies in Hz, shape ``(n_modes,)``."""
-        return np.exp(self.p[: self.likelihood.n_modes])
-
-    @property
-    def damping_ratio(self) -> FloatArray:
-        """Damping ratios, shape ``(n_modes,)``."""
-        m = self.likelihood.n_modes
-        return np.exp(self.p[m : 2 * m])
-
-    def is_line(self) -> BoolArray:
-        """Return which modes do not decay over the record, shape ``(n_modes,)``."""
-        m, p = self.likelihood.n_modes, self.p
-        return np.asarray(p[m : 2 * m] < self.likelihood.least_damping(p) + _AT_BOUND)
-
-    def sizes(self, mode: int) -> list[ComplexArray]:
-        """Return the complex size of a mode's transient, per block ``(n_channels, n_segments)``."""
-        k = 2 * (mode - self.likelihood.n_modes)  # columns of the modes are the last ones
-        return [fit.sizes[:, k] + 1j * fit.sizes[:, k + 1] for fit in self.at.fits]
-
-    def white_level(self) -> FloatArray:
-        """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
-        m, n = self.likelihood.n_modes, self.likelihood.n_channels
-        return np.exp(self.p[3 * m : 3 * m + n])
-
-    def snr(self, mode: int) -> FloatArray:
-        """Return the largest mean ordinate of a mode's decays over the noise, ``(n_channels,)``.
-
-        It corresponds to S / (4 ζ² S_e) of an ambient response.
-        """
-        block, size = self.likelihood.blocks[0], self.sizes(mode)[0]
-        own = slice(mode, mode + 1)
-        top = np.abs(transient(block, self.frequency[own], self.damping_ratio[own])).max()
-        n_samples = block.sample_rate * block.duration
-        mean = np.mean(np.abs(size) ** 2, axis=1) * (top / n_samples) ** 2
-        return np.asarray(mean / self.white_level())
-
-    def excitation(self, mode: int, level: float) -> float:
-        """Return the mean square of a vibration at the stops over that of the ambient response.
-
-        ``level`` is the ambient response h of the mode.
-        """
-        f, zeta = float(self.frequency[mode]), float(self.damping_ratio[mode])
-        exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
-        shape = self.likelihood.shapes[mode]
-        squares = []
-        for block, size in zip(self.likelihood.blocks, self.sizes(mode), strict=True):
-            start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
-            # Projection on the mode's shape, every channel in units of its noise.
-            along = (shape / self.white_level()) @ start / (shape**2 / self.white_level()).sum()
-            squares.append(np.abs(along) ** 2)
-        # Twice the variance π f S / (4 ζ) of the response to a force of density S.
-        ambient = np.pi * f / (2 * zeta) * level**2 / self.likelihood.units[mode]
-        return float(np.mean(np.concatenate(squares)) / ambient)
+def white_level(found: PoleFit) -> FloatArray:
+    """Return the density of the white noise in mid-band, shape ``(n_channels,)``."""
+    m, n = found.likelihood.n_modes, found.likelihood.n_channels
+    return np.exp(found.p[3 * m : 3 * m + n])
 
 
-def maximise(
-    likelihood: TransientLikelihood,
-    p: FloatArray,
-    free: IntArray,
-    *,
-    tolerance: float = _STEP_TOLERANCE,
-) -> DecayFit:
-    """Maximise over the free parameters by quasi-Newton steps from the Fisher information.
+def peak_snr(found: PoleFit, mode: int) -> FloatArray:
+    """Return the largest mean ordinate of a mode's decays over the noise, ``(n_channels,)``.
 
-    The search ends where a step gains less than ``tolerance`` in log likelihood.
+    It corresponds to S / (4 ζ² S_e) of an ambient response.
     """
-    at = likelihood.evaluate(p)
-    metric, fresh = likelihood.metric(at), True
-    for _ in range(_MOST_STEPS):
-        step = _step(metric, at.gradient, likelihood.movable(p, at.gradient, free))
-        if -at.gradient @ step / 2 < tolerance:
-            break
-        reach = likelihood.reach(p)
-        moved = _shorten(likelihood, p, np.clip(step, -reach, reach), at)
-        if moved is None and fresh:
-            break
-        if moved is None:
-            metric, fresh = likelihood.metric(at), True
-            continue
-        step, change = moved[0] - p, moved[1].gradient - at.gradient
-        along, fresh = metric @ step, False
-        expected, seen = float(step @ along), float(step @ change)
-        if seen >= 1e-2 * expected:  # the update of Broyden, Fletcher, Goldfarb and Shanno
-            metric = metric - np.outer(along, along) / expected + np.outer(change, change) / seen
-        p, at = moved
-    return DecayFit(likelihood, p, at)
+    block, size = found.likelihood.blocks[0], found.sizes(mode)[0]
+    own = slice(mode, mode + 1)
+    (up, _), _ = pole_terms(block, found.frequency[own], found.damping_ratio[own])
+    mean = np.mean(np.abs(size) ** 2, axis=1) * np.abs(up).max() ** 2
+    return np.asarray(mean / white_level(found))
 
 
-def _step(metric: FloatArray, gradient: FloatArray, free: IntArray) -> FloatArray:
-    """Return the step of the free parameters, whose scales differ by 10⁵."""
-    scale = np.sqrt(np.diag(metric)[free])
-    system = metric[np.ix_(free, free)] / np.outer(scale, scale) + 1e-9 * np.eye(free.size)
-    step = np.zeros(gradient.size)
-    step[free] = -np.linalg.solve(system, gradient[free] / scale) / scale
-    return step
+def _excitation(found: PoleFit, mode: int, level: float) -> float:
+    """Return the mean square of a vibration at the stops over that of the ambient response.
 
-
-def _shorten(
-    likelihood: TransientLikelihood, p: FloatArray, step: FloatArray, at: Evaluation
-) -> tuple[FloatArray, Evaluation] | None:
-    """Shorten a step until the likelihood improves; None where it does not."""
-    for share in (1.0, 0.3, 0.1, 0.03, 0.01, 1e-3):
-        tried = likelihood.clip(p + share * step)
-        there = likelihood.evaluate(tried)
-        if there.value < at.value:
-            return tried, there
-    return None
+    ``level`` is the ambient response h of the mode.
+    """
+    f, zeta = float(found.frequency[mode]), float(found.damping_ratio[mode])
+    exponent = 2 * np.pi * f * (-zeta + 1j * np.sqrt(1 - zeta**2))
+    shape, noise = found.likelihood.shapes[mode], white_level(found)
+    squares = []
+    for block, size in zip(found.likelihood.blocks, found.sizes(mode), strict=True):
+        start = size * np.sqrt(2 / block.duration) / (1 - np.exp(exponent * block.duration))
+        # Projection on the mode's shape, every channel in units of its noise.
+        along = (shape / noise) @ start / (shape**2 / noise).sum()
+        squares.append(np.abs(along) ** 2)
+    # Twice the variance π f S / (4 ζ) of the response to a force of density S.
+    ambient = np.pi * f / (2 * zeta) * level**2 / found.likelihood.units[mode]
+    return float(np.mean(np.concatenate(squares)) / ambient)
 
 
 def average_ambient(
-    likelihood: TransientLikelihood, p: FloatArray, mode: int, free: IntArray
+    likelihood: ModalLikelihood, p: FloatArray, mode: int, free: IntArray
 ) -> tuple[FloatArray, FloatArray]:
     """Average the posterior over the ambient response of a mode; ``free`` are the other parameters.
 
@@ -183,7 +104,7 @@ def average_ambient(
     if abs(best.p[mode] - p[mode]) > _STAYS * likelihood.reach(p)[mode]:
         # A level far above the noise of a clean decay displaces the mode, and another pole takes
         # its place: start from the least level.
-        start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _STEP_TOLERANCE))
+        start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _CLOSE))
         weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
         best = levels[int(np.argmax(weight))]
     metric = likelihood.metric(best.at)
@@ -203,14 +124,14 @@ def average_ambient(
 
 
 def _average_levels(
-    likelihood: TransientLikelihood, p: FloatArray, place: int, free: IntArray, step: float
-) -> tuple[FloatArray, list[DecayFit]]:
+    likelihood: ModalLikelihood, p: FloatArray, place: int, free: IntArray, step: float
+) -> tuple[FloatArray, list[PoleFit]]:
     """Maximise at levels in both directions from a first one, until they are unlikely.
 
     Returns the log posterior of each level on a log grid, the other parameters integrated, and the
     maximum at each level.
     """
-    found: list[tuple[float, DecayFit]] = []
+    found: list[tuple[float, PoleFit]] = []
     for way in (1, -1):
         at = p.copy()
         if way < 0:
@@ -230,26 +151,6 @@ def _average_levels(
     return np.array([weight for weight, _ in kept]), [level for _, level in kept]
 
 
-def invert(found: DecayFit, free: IntArray) -> FloatArray:
-    """Invert the Hessian, or the Fisher information where that has no inverse.
-
-    Returns the covariance of the free parameters, shape ``(n_free, n_free)``.
-    """
-    likelihood, p = found.likelihood, found.p
-    scale, reach = 1 / np.sqrt(np.diag(likelihood.metric(found.at))), likelihood.reach(p)
-    rows = []  # differences of the gradient
-    for j in free:
-        step = np.zeros(p.size)
-        step[j] = _DIFFERENCE * min(scale[j], reach[j])
-        up, down = likelihood.evaluate(p + step), likelihood.evaluate(p - step)
-        rows.append((up.gradient - down.gradient)[free] / (2 * step[j]))
-    try:
-        factor = np.linalg.cholesky(np.add(rows, np.transpose(rows)) / 2)
-    except np.linalg.LinAlgError:
-        factor = np.linalg.cholesky(found.at.fisher[np.ix_(free, free)])
-    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class DecayEstimate:
     """Modes of a band with their joint covariance."""
@@ -261,7 +162,7 @@ class DecayEstimate:
     excitation: FloatArray
 
 
-def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) -> DecayFit:
+def fit_decays(blocks: tuple[BandSpectra, ...], *, displacement: bool = False) -> PoleFit:
     """Add poles while the Bayesian information criterion improves.
 
     The result has no modes where the band holds only noise.
@@ -274,48 +175,28 @@ def fit_decays(blocks: tuple[DecaySpectra, ...], *, displacement: bool = False) 
     means = np.mean([np.mean(power, axis=(0, 1)) for power in powers], axis=0)
     medians = np.maximum(medians, _LEAST_NOISE * means).clip(np.finfo(float).tiny)
     levels = np.log(medians / np.log(2))
-    likelihood = TransientLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
+    likelihood = ModalLikelihood(blocks, np.empty((0, n)), np.empty(0), levels, displacement)
     start = np.concatenate([levels, np.zeros(n)])
     found = maximise(likelihood, start, np.arange(2 * n))
-    sizes = [block.ordinates.shape for block in blocks]
-    # All ordinates constrain a pole and its ambient response; those of a segment its sizes.
-    total = sum(2 * s * k * n for s, k, _ in sizes)
-    own = sum(2 * s * n * np.log(2 * k) for s, k, _ in sizes)
-    needed = 1.5 * np.log(total) + own / 2 + constants.DECAY_EVIDENCE_MARGIN
     while found.likelihood.n_modes < constants.DECAY_MOST_POLES:
         more = _add_pole(found, *_best_pole(found))
         gain = found.at.profile - more.at.profile
-        if gain < needed:
+        if gain < evidence_needed(found.likelihood):
             break
         found = more
     return found
 
 
-def _best_pole(found: DecayFit) -> tuple[float, float]:
+def _best_pole(found: PoleFit) -> tuple[float, float]:
     """Return frequency and damping of the pole that explains most of the residual."""
     longest = max(found.likelihood.blocks, key=lambda block: block.duration)
     step = 1 / (_TRIALS * longest.duration)
     grid = np.arange(longest.frequency[0] + 2 * step, longest.frequency[-1] - step, step)
     f, zeta = (values.ravel() for values in np.meshgrid(grid, _DAMPINGS))
-    gain = np.zeros(f.size)
-    for block in found.likelihood.blocks:
-        density = found.likelihood.density(block, found.p)
-        known = [block.base, transient(block, found.frequency, found.damping_ratio)]
-        tried = transient(block, f, zeta)
-        for c in range(density.shape[1]):
-            scale = 1 / np.sqrt(density[:, c, c, None])
-            q, _ = np.linalg.qr(scale * np.concatenate(known, axis=1))
-            data, columns = (
-                x - q @ (q.conj().T @ x)
-                for x in (scale * block.ordinates[:, :, c].T, scale * tried)
-            )
-            shown = np.sum(np.abs(columns.conj().T @ data) ** 2, axis=1)
-            gain += shown / np.sum(np.abs(columns) ** 2, axis=0)
-    best = int(np.argmax(gain))
-    return float(f[best]), float(zeta[best])
+    return best_pole(found, f, zeta)[:2]
 
 
-def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
+def _add_pole(found: PoleFit, f: float, zeta: float) -> PoleFit:
     """Fit one more pole, first without its ambient response, then with the shape of its decays."""
     before, m = found.likelihood, found.likelihood.n_modes
     start = np.insert(found.p, [m, 2 * m, 3 * m], [np.log(f), np.log(zeta), 0.0])
@@ -326,7 +207,7 @@ def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
     without, start = np.delete(np.arange(start.size), 3 * m + 2), likelihood.clip(start)
     first = maximise(likelihood, start, without, tolerance=_ROUGH)
     # The real shape that its decays have in common.
-    scale, sizes = np.sqrt(first.white_level()), np.concatenate(first.sizes(m), axis=1)
+    scale, sizes = np.sqrt(white_level(first)), np.concatenate(first.sizes(m), axis=1)
     seen = np.concatenate([sizes.real, sizes.imag], axis=1) / scale[:, None]
     shape = np.linalg.svd(seen, full_matrices=False)[0][:, 0] * scale
     likelihood = replace(likelihood, shapes=np.vstack([before.shapes, shape]))
@@ -336,7 +217,7 @@ def _add_pole(found: DecayFit, f: float, zeta: float) -> DecayFit:
     return maximise(likelihood, start, free, tolerance=_ROUGH)
 
 
-def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstimate:
+def estimate(found: PoleFit, modes: Sequence[int] | None = None) -> DecayEstimate:
     """Estimate modes of a band, by default all, averaged over their ambient responses."""
     likelihood, m = found.likelihood, found.likelihood.n_modes
     modes = range(m) if modes is None else modes
@@ -363,11 +244,11 @@ def estimate(found: DecayFit, modes: Sequence[int] | None = None) -> DecayEstima
         scales[np.ix_(pair, pair)] = wide @ np.linalg.inv(narrow)
     cov = scales @ joint @ scales.T
     credibility = widened((Credibility(),) * n, "ambient-level", joint, cov)
-    excitation = [found.excitation(i, float(p[2 * m + i])) for i in modes]
+    excitation = [_excitation(found, i, float(p[2 * m + i])) for i in modes]
     return DecayEstimate(mean, cov, credibility, np.array(excitation))
 
 
-def stationarity(found: DecayFit) -> float:
+def stationarity(found: PoleFit) -> float:
     """Return the p value of a test whether the residual is stationary over the record.
 
     Noise whose power varies over the record correlates neighbouring ordinates. The lag-one products

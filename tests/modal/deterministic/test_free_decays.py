@@ -12,7 +12,7 @@ import pytest
 
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.log import Log
-from lmshealth.modal.free_decay.identification import identify_decays
+from lmshealth.modal.deterministic.free_decays import identify_decays
 from lmshealth.modal.modes import Modes
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Stage

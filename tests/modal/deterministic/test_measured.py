@@ -13,8 +13,8 @@ import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import load_columns
-from lmshealth.modal.frf.identification import read_measured
-from lmshealth.modal.frf.measured import read_responses
+from lmshealth.modal.deterministic.frequency_response import read_measured
+from lmshealth.modal.deterministic.measured import read_responses
 from studies.modes.frf.records import Machine
 
 F = np.arange(0.0, 200.0, 0.5)

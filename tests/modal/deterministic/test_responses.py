@@ -7,8 +7,14 @@ import pytest
 from scipy.ndimage import uniform_filter1d
 
 from lmshealth.errors import BadLog
-from lmshealth.modal.frf.rational import Ordinates
-from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record, smooth_noise
+from lmshealth.modal.deterministic.responses import (
+    Frf,
+    Ordinates,
+    Pair,
+    from_periods,
+    from_record,
+    smooth_noise,
+)
 from studies.modes.frf.records import RATE, Machine, at_random, multisine, periodic
 from tests.signals import make_log
 

@@ -10,8 +10,14 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.frf.rational import Ordinates
-from lmshealth.modal.frf.responses import Frf, Pair, average_noise, check_lines, estimates
+from lmshealth.modal.deterministic.responses import (
+    Frf,
+    Ordinates,
+    Pair,
+    average_noise,
+    check_lines,
+    estimates,
+)
 
 # Pulses that the filter of the force channel makes of one are no further apart, in samples.
 _RINGING = 4

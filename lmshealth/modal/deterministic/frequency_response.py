@@ -9,17 +9,18 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.frf.blows import find_hits, from_blows
-from lmshealth.modal.frf.measured import MeasuredResponse, from_measured
-from lmshealth.modal.frf.periods import find_period
-from lmshealth.modal.frf.rational import LEAST_DAMPING, Ordinates
-from lmshealth.modal.frf.response_fit import (
+from lmshealth.modal.deterministic.blows import find_hits, from_blows
+from lmshealth.modal.deterministic.likelihood import least_damping
+from lmshealth.modal.deterministic.measured import MeasuredResponse, from_measured
+from lmshealth.modal.deterministic.periods import find_period
+from lmshealth.modal.deterministic.response_fit import (
     FEWEST_POWERS,
+    NO_DAMPING,
     ResponseFit,
     fit_response,
     without_window,
 )
-from lmshealth.modal.frf.responses import Frf, Pair, from_periods, from_record
+from lmshealth.modal.deterministic.responses import Frf, Ordinates, Pair, from_periods, from_record
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
 from lmshealth.modal.targets import check_band
 from lmshealth.signal.segments import find_phases
@@ -349,7 +350,7 @@ def _incredible(frf: Frf, fit: ResponseFit, i: int) -> Rejection | None:
     if zeta > constants.FRF_MOST_DAMPING:
         most = constants.FRF_MOST_DAMPING
         return Rejection("overdamped", f"damping {zeta:.2g}, at most {most:g}: background, no mode")
-    if zeta < LEAST_DAMPING:
+    if zeta < NO_DAMPING:
         detail = "all of its damping is that of the exponential window; choose a longer window"
         return Rejection("too-uncertain", detail)
     if unresolved := _unresolved(frf, fit.ordinates, f, zeta):
@@ -379,7 +380,8 @@ def _unresolved(frf: Frf, ordinates: Ordinates, f: float, zeta: float) -> Reject
     if ordinates.periodic:
         reach = constants.BANDWIDTHS_OF_LINES * zeta * f
         n = int(np.count_nonzero(np.abs(ordinates.frequency - f) <= reach))
-        if n < constants.LINES_OF_MODE and zeta < 2 * LEAST_DAMPING:
+        least = least_damping(np.array(f), 1 / spacing)
+        if n < constants.LINES_OF_MODE and zeta < 2 * least:
             detail = f"damping {zeta:.1g}, the least of the fit: it may be a line, as of mains"
             step = "choose a period of the excitation that is no multiple of that of the line"
             return Rejection("line-not-mode", f"{detail}; {step}")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.modal.frf.periods import cut_periods, find_period
+from lmshealth.modal.deterministic.periods import cut_periods, find_period
 
 PERIOD, N = 1234.567, 20_000
 LOW, HIGH = 5, 200

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lmshealth.errors import BadLog
-from lmshealth.modal.frf.blows import find_hits
-from lmshealth.modal.frf.identification import FrfReading, read_frf
+from lmshealth.modal.deterministic.blows import find_hits
+from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf
 from studies.harness.data.logs import make_log
 from studies.modes.frf.hammer import RATE, Hammer, strike
 

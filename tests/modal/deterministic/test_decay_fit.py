@@ -5,27 +5,26 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.modal.free_decay.decay_fit import (
-    DecayFit,
+from lmshealth.modal.deterministic.decay_fit import (
     average_ambient,
     estimate,
     fit_decays,
-    invert,
-    maximise,
+    peak_snr,
     stationarity,
 )
-from lmshealth.modal.free_decay.transient_likelihood import (
-    TransientLikelihood,
+from lmshealth.modal.deterministic.likelihood import (
+    ModalLikelihood,
     transform_decays,
     unit_level,
 )
+from lmshealth.modal.deterministic.poles import PoleFit, invert, maximise
 from tests.signals import sine
 from tests.stops import Ring, stop
 
 RATE = 400.0
 
 
-def fitted(x: np.ndarray, low: float = 35.0, high: float = 90.0) -> DecayFit:
+def fitted(x: np.ndarray, low: float = 35.0, high: float = 90.0) -> PoleFit:
     """Fit decays of shape ``(n_segments, n_channels, n_samples)`` in a band."""
     return fit_decays((transform_decays(np.swapaxes(x, 1, 2), RATE, low, high),))
 
@@ -58,7 +57,7 @@ def test_signal_to_noise_ratio_is_that_of_the_largest_ordinate() -> None:
     found = fitted(x)
     block = found.likelihood.blocks[0]
     top = np.mean(np.abs(block.ordinates[..., 0]) ** 2, axis=0).max()
-    assert found.snr(0)[0] == pytest.approx(top / (1e-6 * 2 / RATE), rel=0.2)
+    assert peak_snr(found, 0)[0] == pytest.approx(top / (1e-6 * 2 / RATE), rel=0.2)
 
 
 def test_excitation_compares_a_stop_with_the_ambient_response() -> None:
@@ -118,11 +117,11 @@ def test_noise_that_dies_away_is_found_out() -> None:
 LEVEL = float(np.log(0.02**2 * 2 / RATE))
 
 
-def one_mode(x: np.ndarray, zeta: float = 0.01) -> tuple[TransientLikelihood, np.ndarray]:
+def one_mode(x: np.ndarray, zeta: float = 0.01) -> tuple[ModalLikelihood, np.ndarray]:
     """Make the likelihood of one mode near 60 Hz from ``(n_segments, n_samples)``, and a start."""
     block = transform_decays(x[:, :, None], RATE, 42, 80)
     unit = unit_level(60.37, zeta, 1.0)
-    likelihood = TransientLikelihood(
+    likelihood = ModalLikelihood(
         (block,), np.full((1, 1), np.exp(LEVEL / 2)), np.array([unit]), np.array([LEVEL])
     )
     return likelihood, np.array([np.log(60.37), np.log(zeta), 1.0, LEVEL, 0.0])

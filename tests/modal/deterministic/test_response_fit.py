@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.modal.frf.rational import Ordinates
-from lmshealth.modal.frf.response_fit import ResponseFit, fit_response
+from lmshealth.modal.deterministic.response_fit import ResponseFit, fit_response
+from lmshealth.modal.deterministic.responses import Ordinates
 
 LINES = np.arange(40.0, 120.0, 0.25)
 

@@ -16,7 +16,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.io.reading import read_log
-from lmshealth.modal.frf.identification import FrfReading, read_frf
+from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf
 from lmshealth.modal.naming import name_response, why_unnamed
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import stage_named

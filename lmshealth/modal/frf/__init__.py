@@ -1,1 +1,0 @@
-"""Modal identification from frequency response functions."""
