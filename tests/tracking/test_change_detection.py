@@ -179,7 +179,7 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
 
 def suspect(sums: FloatArray, first: int, loop_changes: Sequence[int] = ()) -> int | None:
     """Return the log since which the following error, or else innovations, differ."""
-    start, size = worst_window(sums, first)
+    start, size = worst_window([*sums], first)
     by_loop = recent_loop_change(loop_changes, first, len(sums) - 2)
     return (start if size > constants.SUSPICION_GATE else None) if by_loop is None else by_loop
 

@@ -17,10 +17,10 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage, Usage
 from lmshealth.tracking import constants
 from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking.change_detection import loop_evidence
+from lmshealth.tracking.change_detection import Event, loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History, StepKind
-from lmshealth.tracking.track import Event, Track, consistency, track
+from lmshealth.tracking.track import Track, consistency, track
 from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
