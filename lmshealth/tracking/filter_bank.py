@@ -9,7 +9,7 @@ from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from math import prod
+from math import log, log1p, prod
 from typing import Self
 
 import numpy as np
@@ -46,6 +46,16 @@ class Hyperparameters(Rows):
     def healthy(self) -> BoolArray:
         """Whether each set has no rate, or one that decays (running-in), shape ``(n,)``."""
         return np.asarray((self.rate_std == 0) | (self.rate_decay > 0))
+
+    @cached_property
+    def groups(self) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the healthy and of the changing sets."""
+        return np.flatnonzero(self.healthy), np.flatnonzero(~self.healthy)
+
+    @cached_property
+    def decays(self) -> bool:
+        """Whether a rate of any set decays."""
+        return bool((self.rate_decay > 0).any())
 
     @cached_property
     def wander_variance(self) -> FloatArray:
@@ -103,9 +113,9 @@ def _scales(n_sources: int) -> list[tuple[tuple[float, float], ...]]:
     ]
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class FilterBank(Rows):
-    """Filters of all hyperparameters that are left, at one log."""
+    """Filters of all hyperparameters that are left, at one log; their weights are kept."""
 
     hyperparameters: Hyperparameters
     log_weight: FloatArray  # log of prior times evidence so far, ``(n,)``
@@ -130,7 +140,7 @@ class FilterBank(Rows):
         state[:, :own, :own], state[:, -1, :own] = self.cov, self.mean
         return replace(self, state=state)
 
-    @property
+    @cached_property
     def weight(self) -> FloatArray:
         """Posterior probability of each filter, shape ``(n,)``."""
         return np.asarray(np.exp(self.log_weight - self.log_evidence))
@@ -142,19 +152,20 @@ class FilterBank(Rows):
 
     def log_bayes_factor(self) -> float:
         """Return the log evidence of the changing filters over the healthy ones."""
-        healthy = self.hyperparameters.healthy
-        if healthy.all() or not healthy.any():
+        healthy, changing = self.hyperparameters.groups
+        if not healthy.size or not changing.size:
             return 0.0
         chance = constants.HEALTHY_PROBABILITY
-        changing = np.logaddexp.reduce(self.log_weight[~healthy])
-        odds = changing - np.logaddexp.reduce(self.log_weight[healthy])
-        return float(odds + (np.log(chance) - np.log1p(-chance)))
+        odds = np.logaddexp.reduce(self.log_weight[changing])
+        odds -= np.logaddexp.reduce(self.log_weight[healthy])
+        return float(odds) + log(chance) - log1p(-chance)
 
     def pruned(self) -> Self:
         """Remove filters with a negligible share of their group; both groups stay."""
-        healthy, odds = self.hyperparameters.healthy, self.log_weight
-        best = (odds[group].max(initial=-np.inf) for group in (healthy, ~healthy))
-        keep = odds > np.where(healthy, *best) + _NEGLIGIBLE
+        keep = np.empty(self.log_weight.size, dtype=bool)
+        for group in self.hyperparameters.groups:
+            odds = self.log_weight[group]
+            keep[group] = odds > odds.max(initial=-np.inf) + _NEGLIGIBLE
         return self if keep.all() else self[keep]
 
     def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
@@ -174,35 +185,46 @@ class Innovation:
     outlying: FloatArray  # probability that they are outliers, ``(n_rows,)``
 
     @property
+    def kept(self) -> np.ndarray:
+        """Indices of those that are more probably no outliers."""
+        return np.flatnonzero(self.outlying <= 0.5)
+
+    @property
     def nis(self) -> float:
         """Normalised innovation squared of those that are more probably no outliers."""
-        kept = np.flatnonzero(self.outlying <= 0.5)
-        mean, cov = self.mean[kept], self.cov[kept[:, None], kept]
+        mean, cov, kept = self.mean, self.cov, self.kept
+        if kept.size < mean.size:
+            mean, cov = mean[kept], cov[kept[:, None], kept]
         return float(mean @ np.linalg.solve(cov, mean))
 
 
-class FilterModel:
-    """State space and measurements of a history, as the filters use them.
+@dataclass(frozen=True, slots=True, eq=False)
+class Observation:
+    """The estimates that one log has, as all filters use them."""
 
-    `values` are the estimates ``[ln f, ln ζ]``, ``(n_logs, 2 n_series)``, `scale_of` the index of
-    the source of each row, and `grid` the hyperparameters that a bank starts with.
+    rows: np.ndarray  # of ``[ln f, ln ζ]`` of all series, ``(n_rows,)``
+    values: FloatArray  # ``(n_rows,)``
+    matrix: FloatArray  # measurement matrix without steps, ``(n_rows, first_step)``
+    cov: FloatArray  # covariance of the errors as stated, ``(n_rows, n_rows)``
+    source: np.ndarray  # index of the source of each, ``(n_rows,)``
+    extra: FloatArray | None  # variances of unknown covariates, ``(n_rows,)``; None without any
+
+
+class FilterModel:
+    """State space and observations of a history, as the filters use them.
+
+    `observations` has those of each log, `sources` are the sources of the estimates, `mode_of` is
+    the index of the mode of each row, ``(2 n_series,)``, and `grid` has the hyperparameters that a
+    bank starts with.
     """
 
     def __init__(self, space: StateSpace) -> None:
         self.space = space
-        history, r = space.history, len(space.history.series)
-        self.values = np.hstack([history.ln_frequency, history.ln_damping])
-        self.there = np.isfinite(self.values)
+        history = space.history
         self.sources = tuple(dict.fromkeys(one.source for one in history.series))
-        self.scale_of = np.array([self.sources.index(one.source) for one in history.series] * 2)
         self.grid = hyperparameter_grid(len(self.sources))
         self.mode_of = np.tile(history.mode_of(), 2)
-        # Variance of ln f due to unknown covariates.
-        self.extra = np.zeros((len(history.logs), 2 * r))
-        for regressor in space.regressed:
-            self.extra[:, :r] += regressor.unknown[:, None]
-        self.unknown: BoolArray = np.any(self.extra != 0, axis=1)
-        self.rows = [np.flatnonzero(own) for own in self.there]
+        self.observations = self._observations()
         # Covariance of a wander as large as the errors of each mode's first estimate.
         std = np.zeros(space.n_modes)
         for i, mode in enumerate(history.modes):
@@ -211,7 +233,32 @@ class FilterModel:
             std[i] = np.sqrt(first[0]) if first.size else 0.0
         self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
+        self.single = np.eye(std.size)
         self.noise, self.noise_shares = self._process_noise()
+
+    def _observations(self) -> list[Observation]:
+        """Return the estimates of each log; logs with the same rows are taken at once."""
+        history, r = self.space.history, len(self.space.history.series)
+        values = np.hstack([history.ln_frequency, history.ln_damping])
+        source = np.array([self.sources.index(one.source) for one in history.series] * 2)
+        # Variance of ln f due to unknown covariates.
+        unknown = sum((one.unknown for one in self.space.regressed), np.zeros(len(values)))
+        found: dict[int, Observation] = {}
+        patterns, place = np.unique(np.isfinite(values), axis=0, return_inverse=True)
+        for i, there in enumerate(patterns):
+            rows, logs = np.flatnonzero(there), np.flatnonzero(place.ravel() == i)
+            own = values[logs[:, None], rows]
+            matrices = self.space.fixed[logs[:, None], rows]
+            covs = history.cov[logs[:, None, None], rows[:, None], rows]
+            for j, k in enumerate(logs.tolist()):
+                extra = np.where(rows < r, unknown[k], 0.0) if unknown[k] else None
+                found[k] = Observation(rows, own[j], matrices[j], covs[j], source[rows], extra)
+        return [found[k] for k in range(len(values))]
+
+    def matrix(self, k: int) -> FloatArray:
+        """Return the measurement matrix of the estimates that log k has, ``(n_rows, size)``."""
+        own = self.observations[k]
+        return self.space.matrix(k)[own.rows] if self.space.steps else own.matrix
 
     def _process_noise(self) -> tuple[FloatArray, FloatArray]:
         """Return covariances of the parts of process noise, and their shares in every log.
@@ -221,7 +268,7 @@ class FilterModel:
         ``(7, (5 n_modes)²)``. The shares, ``(n_logs, 7)``, are of variances per life.
         """
         space, size = self.space, 5 * self.space.n_modes
-        level, rate, single = space.level, space.rate, np.eye(space.n_modes)
+        level, rate, single = space.level, space.rate, self.single
         parts = np.zeros((7, size, size))
         parts[0, level, level], parts[6, space.damping, space.damping] = single, single
         parts[5, space.wander, space.wander] = self.wander_cov
@@ -260,15 +307,14 @@ def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
         state[:, wander] *= keep
         state[:, :, wander] *= keep
         # A level moves by this part of a life times its rate.
-        moved = np.full(keep.shape, space.ticks[k])
-        decays = own.rate_decay > 0
-        if decays.any():
+        moved = space.ticks[k]
+        if own.decays:
             decay = own.rate_decay[:, None, None]
             left = np.exp(-decay * moved)
-            moved[decays] = ((1 - left) / np.where(decay > 0, decay, 1.0))[decays]
+            moved = np.where(decay > 0, (1 - left) / np.where(decay > 0, decay, 1.0), moved)
         state[:, level] += moved * state[:, rate]
         state[:, :, level] += moved * state[:, :, rate]
-        if decays.any():
+        if own.decays:
             state[:, rate] *= left
             state[:, :, rate] *= left
         noise = (own.process_noise * model.noise_shares[k]) @ model.noise
@@ -305,27 +351,27 @@ def update(
     Where innovations are large, the estimates of a mode or of all modes may be outliers: every
     filter is the mixture of these hypotheses, reduced to its mean and covariance.
     """
-    rows, space = model.rows[k], model.space
+    given, rows = model.observations[k], model.observations[k].rows
     if not rows.size:
         return bank, Innovation(rows, np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0))
-    matrix, value = space.matrix(k)[rows], model.values[k, rows]
-    scales = bank.hyperparameters.scales[:, model.scale_of[rows]]
-    errors = space.history.cov[k][rows[:, None], rows] * (scales[:, :, None] * scales[:, None])
+    matrix, scales = model.matrix(k), bank.hyperparameters.scales[:, given.source]
+    errors = given.cov * (scales[:, :, None] * scales[:, None])
     # One product of all states with the matrix instead of one each. Its last row is the innovation
     # with the opposite sign.
     n, rest, size = bank.state.shape
     crossed = (bank.state.reshape(-1, size) @ matrix.T).reshape(n, rest, -1)
-    crossed[:, -1] -= value
+    crossed[:, -1] -= given.values
     total = matrix @ crossed[:, :-1] + errors
-    if model.unknown[k]:
-        diagonal(total)[:] += model.extra[k, rows]
+    if given.extra is not None:
+        diagonal(total)[:] += given.extra
     centre, cov = mixture(bank.weight, -crossed[:, -1], total)
     standardised = centre / np.sqrt(cov.diagonal())
     updated, outlying = _condition(bank, crossed, total), np.zeros(rows.size)
     if outliers and np.abs(standardised).max() > constants.OUTLIER_GATE:
         hypotheses, found = _outliers(model.mode_of[rows], standardised), [updated]
         own = errors.diagonal(axis1=1, axis2=2)
-        wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
+        is_ln_f = rows < len(model.mode_of) // 2
+        wide = np.where(is_ln_f, constants.LN_F_STD, constants.LN_ZETA_STD)
         for mask, chance, gross in hypotheses:
             wider = total.copy()
             more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own

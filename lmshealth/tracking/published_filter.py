@@ -14,15 +14,22 @@ from filterpy.kalman import KalmanFilter, predict, update
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import FilterBank, FilterModel, Innovation, begin_step
+from lmshealth.tracking.filter_bank import (
+    FilterBank,
+    FilterModel,
+    Innovation,
+    Observation,
+    begin_step,
+)
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10
-# Least value of a nuisance that matters, and the factor by which it may differ.
+# Least value of a nuisance that matters, and the factor by which it may differ; that of scales.
 _TOLERANCES = (
     ("level_walk", 1e-9, 1.5), ("rate_walk", 1e-5, 1.5), ("settling", 1e-8, 1.5),
-    ("running_in", 1e-4, 1.5), ("wander", 0.03, 1.3), ("scales", 0.0, 1.05),
+    ("running_in", 1e-4, 1.5), ("wander", 0.03, 1.3),
 )  # fmt: skip
+_MOST_RESCALING = 1.05
 # Eigenvalues of correlations below this are rounding.
 _SINGULAR = 1e-10
 
@@ -57,38 +64,44 @@ class Nuisances(Rows):
     def differ(self, other: Self) -> bool:
         """Return whether nuisances of the machine differ by more than states depend on them."""
         for name, least, factor in _TOLERANCES:
-            own, their = (getattr(one, name) + least for one in (self, other))
-            if (np.abs(np.log(own / their)) > np.log(factor)).any():
+            ratio = (getattr(self, name) + least) / (getattr(other, name) + least)
+            if not 1 / factor <= ratio <= factor:
                 return True
-        return False
+        ratio = self.scales / other.scales
+        return bool(ratio.max() > _MOST_RESCALING or ratio.min() < 1 / _MOST_RESCALING)
 
 
 def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k: int) -> Nuisances:
     """Select the nuisances of log k from the posterior of the bank after it.
 
-    Random walks and scales are geometric means over the posterior, because those of few improbable
-    filters are larger by orders of magnitude; the random walk of rates is that of the changing
-    filters. Running-in, by which rates of the bank decay, enters as noise of its size.
+    The random walk of ln f and scales are geometric means over the posterior, because those of few
+    improbable filters are larger by orders of magnitude; other variances are means, that of the
+    random walk of rates over the changing filters. Running-in, by which rates of the bank decay, enters as noise of its size.
     """
     own, share, space = bank.hyperparameters, bank.weight, model.space
-    changing = share if own.healthy.all() else np.where(own.healthy, 0.0, share)
-    spread = own.wander_variance
-    wander = float(share @ spread)
-    decays = np.where(own.rate_decay > 0, share, 0.0)
-    running_in = decays.sum()
-    rates = bank.mean[:, space.rate] ** 2
-    rates += np.einsum("gii->gi", bank.cov[:, space.rate, space.rate])
-    weight = np.ones(model.values.shape[1])
+    spread = share * own.wander_variance
+    wander = spread.sum()
+    changing = own.groups[1]
+    # Their weights among themselves: against those of healthy filters they may be 0.
+    odds = np.exp(bank.log_weight[changing] - bank.log_weight[changing].max(initial=-np.inf))
+    running_in, moved = np.zeros(()), np.zeros(())
+    if own.decays:
+        decays = np.where(own.rate_decay > 0, share, 0.0)
+        running_in = decays.sum()
+        rates = bank.mean[:, space.rate] ** 2
+        rates += np.einsum("gii->gi", bank.cov[:, space.rate, space.rate])
+        moved = decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2
+    weight = np.ones(model.mode_of.size)
     weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
     return Nuisances(
         level_walk=_geometric(share, own.level_walk**2),
-        rate_walk=_geometric(changing / changing.sum(), own.rate_walk**2),
+        rate_walk=odds @ own.rate_walk[changing] ** 2 / (odds.sum() or 1.0),
         settling=share @ own.settling**2,
         running_in=running_in,
-        wander=np.array(wander),
-        wander_keep=share @ (spread * own.wander_keep) / (wander or 1.0),
+        wander=wander,
+        wander_keep=spread @ own.wander_keep / (wander or 1.0),
         scales=_geometric(share, own.scales),
-        moved=decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2,
+        moved=moved,
         weight=weight,
         reopened=np.array(False),
     )
@@ -126,10 +139,9 @@ def filter_log(model: FilterModel, before: Gaussian, own: Nuisances, k: int) -> 
     """Predict to log k from the state before it, and update with its estimates."""
     move, noise = _transition(model, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    rows = model.rows[k]
-    if rows.size:
-        errors, matrix = _errors(model, own, k), model.space.matrix(k)[rows]
-        mean, cov = update(mean, cov, model.values[k, rows], errors, matrix)
+    given = model.observations[k]
+    if given.rows.size:
+        mean, cov = update(mean, cov, given.values, _errors(given, own), model.matrix(k))
     return Gaussian(mean, cov)
 
 
@@ -139,22 +151,22 @@ def undecided(model: FilterModel, before: Gaussian, own: Nuisances, k: int) -> G
     Half of the squared innovation is added to the variance of the error and of the quantity:
     both explanations are within two standard deviations.
     """
-    rows, space = model.rows[k], model.space
+    space, given, rows = model.space, model.observations[k], model.observations[k].rows
     move, noise = _transition(model, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    matrix = space.matrix(k)[rows]
-    half = (model.values[k, rows] - matrix @ mean) ** 2 / 2
+    matrix = model.matrix(k)
+    half = (given.values - matrix @ mean) ** 2 / 2
     half[own.weight[rows] >= 0.5] = 0.0
     first = np.where(rows < len(space.history.series), space.level.start, space.damping.start)
     jump = np.zeros(space.size)
     np.maximum.at(jump, first + model.mode_of[rows], half)
-    errors = _errors(model, replace(own, weight=np.ones_like(own.weight)), k) + np.diag(half)
-    return Gaussian(*update(mean, cov + np.diag(jump), model.values[k, rows], errors, matrix))
+    errors = _errors(given, replace(own, weight=np.ones_like(own.weight))) + np.diag(half)
+    return Gaussian(*update(mean, cov + np.diag(jump), given.values, errors, matrix))
 
 
 def smooth_states(model: FilterModel, nuisances: Nuisances) -> tuple[FloatArray, FloatArray]:
     """Filter and smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965]."""
-    n, size = len(model.values), model.space.size
+    n, size = len(model.observations), model.space.size
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
     state = prior(model)
@@ -167,32 +179,26 @@ def smooth_states(model: FilterModel, nuisances: Nuisances) -> tuple[FloatArray,
     return smoothed[0], smoothed[1]
 
 
-def _errors(model: FilterModel, own: Nuisances, k: int) -> FloatArray:
-    """Return the covariance of the errors of the estimates of log k."""
-    rows = model.rows[k]
-    scale = own.scales[model.scale_of[rows]] / np.sqrt(own.weight[rows])
-    errors: FloatArray = model.space.history.cov[k][rows[:, None], rows]
-    errors *= scale[:, None] * scale
-    if model.unknown[k]:
-        errors += np.diag(model.extra[k, rows])
-    return errors
+def _errors(given: Observation, own: Nuisances) -> FloatArray:
+    """Return the covariance of the errors of the estimates of one log."""
+    scale = own.scales[given.source] / np.sqrt(own.weight[given.rows])
+    errors: FloatArray = given.cov * (scale[:, None] * scale)
+    return errors if given.extra is None else errors + np.diag(given.extra)
 
 
 def _transition(model: FilterModel, own: Nuisances, k: int) -> tuple[FloatArray, FloatArray]:
     """Return transition matrix and covariance of the process noise into log k."""
-    space = model.space
+    space, size = model.space, model.space.wander.stop
     move, noise = np.eye(space.size), np.zeros((space.size, space.size))
-    tick, wander = space.ticks[k], space.wander
     if k == 0:
-        noise[wander, wander] = own.wander * model.wander_cov
+        noise[space.wander, space.wander] = own.wander * model.wander_cov
     elif space.seen[k]:
-        move[space.level, space.rate] = tick * np.eye(space.n_modes)
-        move[wander, wander] *= own.wander_keep
-        drive = own.rate_walk * np.array([tick**3 / 3, tick**2 / 2, tick])
-        settling = own.settling * space.settling[k] + own.running_in * own.moved
-        fresh, damping = (1 - own.wander_keep**2) * own.wander, constants.DAMPING_WALK**2 * tick
-        variances = np.array([own.level_walk * tick, settling, *drive, fresh, damping])
-        size = wander.stop
+        move[space.level, space.rate] = space.ticks[k] * model.single
+        move[space.wander, space.wander] *= own.wander_keep
+        walk, fresh = own.rate_walk, (1 - own.wander_keep**2) * own.wander
+        parts = (own.level_walk, own.settling, walk, walk, walk, fresh, constants.DAMPING_WALK**2)
+        variances = parts * model.noise_shares[k]
+        variances[1] += own.running_in * own.moved
         noise[:size, :size] = (variances @ model.noise).reshape(size, size)
     begun = [(j, step) for j, step in enumerate(space.steps) if step.first == k]
     if k and (own.reopened or any(s.kind == "reset" or not s.declared for _, s in begun)):

@@ -22,7 +22,7 @@ class StateSpace:
     Rates and random walks are per life of `constants.LOGS_PER_LIFE` logs at their mean distance so
     far. `ticks` are the parts of it between each log that has estimates (`seen`) and the one
     before, and `settling` the parts of the variance of settling, ``(n_logs,)`` each; `size` is the
-    length of the state.
+    length of the state; `fixed` has the measurement matrices without steps.
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
@@ -51,7 +51,7 @@ class StateSpace:
         # Contrast ℓ - ℓ₀ of the first entries of a state, ``(n_modes, 4 n_modes)``.
         one, none = np.eye(m), np.zeros((m, m))
         self.drift: FloatArray = np.hstack([one, none, none, -one])
-        self._fixed = self._without_steps()
+        self.fixed = self._without_steps()
         self._jumps = [(step, self._jump_matrix(step)) for step in steps]
 
     def with_step(self, step: Step) -> Self:
@@ -64,7 +64,7 @@ class StateSpace:
 
     def matrix(self, k: int) -> FloatArray:
         """Return the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
-        fixed: FloatArray = self._fixed[k]
+        fixed: FloatArray = self.fixed[k]
         if not self.steps:
             return fixed
         matrix = np.zeros((fixed.shape[0], self.size))

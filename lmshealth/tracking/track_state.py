@@ -161,10 +161,11 @@ def _filter(state: TrackState, k: int) -> TrackState:
     bank = bank.pruned()
     state, nuisances = _with_nuisances(state, select_nuisances(model, bank, found, k), k)
     before = state.published.padded(model.space.size)
-    kept = found.outlying <= 0.5
-    innovations = np.full(model.values.shape[1], np.nan)
+    kept = found.kept
+    innovations = np.full(model.mode_of.size, np.nan)
     innovations[found.rows[kept]] = found.standardised[kept]
-    epoch = Epoch(nuisances, found.nis, innovations, tuple(found.rows[~kept].tolist()))
+    outlying = () if kept.size == found.rows.size else tuple(np.delete(found.rows, kept).tolist())
+    epoch = Epoch(nuisances, found.nis, innovations, outlying)
     most, last = constants.MOST_INNOVATION, state.checkpoints[-1:]
     sums = last[0].sums if last else np.zeros((2, innovations.size + 2))
     sums = add_to_sums(sums, found.rows, found.standardised.clip(-most, most))

@@ -267,8 +267,10 @@ def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
     std = float(np.sqrt(predicted.cov[0, 0, 0]))
     moved, weight = [], []
     for size in (0.0, 0.05, 0.2):
-        model.values[5, 0] = predicted.mean[0] @ model.space.matrix(5)[0] + size
-        after, innovation = update(model, predicted, 5)
+        ln_f = history.ln_frequency.copy()
+        ln_f[5, 0] = predicted.mean[0] @ model.space.matrix(5)[0] + size
+        off = FilterModel(StateSpace(replace(history, ln_frequency=ln_f), stage))
+        after, innovation = update(off, predicted, 5)
         moved.append(abs(after.mean[0] - predicted.mean[0])[level][0] / std)
         weight.append(after.log_weight[0])
         assert innovation.rows.tolist() == [0, 1, 2, 3]
