@@ -76,7 +76,8 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
 
     The random walk of ln f and scales are geometric means over the posterior, because those of few
     improbable filters are larger by orders of magnitude; other variances are means, that of the
-    random walk of rates over the changing filters. Running-in, by which rates of the bank decay, enters as noise of its size.
+    random walk of rates over the changing filters. Running-in, by which rates of the bank decay,
+    enters as noise of its size.
     """
     own, share, space = bank.hyperparameters, bank.weight, model.space
     spread = share * own.wander_variance
