@@ -63,6 +63,18 @@ class Hyperparameters(Rows):
         return np.asarray((self.wander * np.exp(np.log(self.scales).mean(axis=1))) ** 2)
 
     @cached_property
+    def log_walks(self) -> FloatArray:
+        """Logs of the variance of the walk of ln f, then of the scales, ``(n, 1 + n_sources)``."""
+        with np.errstate(divide="ignore"):
+            return np.log(np.column_stack([self.level_walk**2, self.scales]))
+
+    @cached_property
+    def variances(self) -> FloatArray:
+        """Variances of settling, of wander, and of the part of it that stays, shape ``(n, 3)``."""
+        wander = self.wander_variance
+        return np.column_stack([self.settling**2, wander, wander * self.wander_keep])
+
+    @cached_property
     def process_noise(self) -> FloatArray:
         """Variances of the parts of process noise, in the order of `_process_noise`, ``(n, 7)``."""
         drive, wander = self.rate_walk**2, (1 - self.wander_keep**2) * self.wander_variance

@@ -26,8 +26,8 @@ from lmshealth.tracking.filter_bank import (
 _LEAST_WEIGHT = 1e-10
 # Least value of a nuisance that matters, and the factor by which it may differ; that of scales.
 _TOLERANCES = (
-    ("level_walk", 1e-9, 1.5), ("rate_walk", 1e-5, 1.5), ("settling", 1e-8, 1.5),
-    ("running_in", 1e-4, 1.5), ("wander", 0.03, 1.3),
+    ("settling", 1e-8, 1.5), ("running_in", 1e-4, 1.5),
+    ("level_walk", 1e-9, 1.5), ("rate_walk", 1e-5, 1.5), ("wander", 0.03, 1.3),
 )  # fmt: skip
 _MOST_RESCALING = 1.05
 # Eigenvalues of correlations below this are rounding.
@@ -61,9 +61,12 @@ class Nuisances(Rows):
         """Return these nuisances of the machine with those of a log alone."""
         return replace(self, weight=log.weight, moved=log.moved, reopened=log.reopened)
 
-    def differ(self, other: Self) -> bool:
-        """Return whether nuisances of the machine differ by more than states depend on them."""
-        for name, least, factor in _TOLERANCES:
+    def differ(self, other: Self, *, has_run_in: bool) -> bool:
+        """Return whether nuisances of the machine differ by more than states depend on them.
+
+        Those of a machine that `has_run_in` differ neither in settling nor in running-in.
+        """
+        for name, least, factor in _TOLERANCES[2 * has_run_in :]:
             ratio = (getattr(self, name) + least) / (getattr(other, name) + least)
             if not 1 / factor <= ratio <= factor:
                 return True
@@ -79,38 +82,32 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
     random walk of rates over the changing filters. Running-in, by which rates of the bank decay,
     enters as noise of its size.
     """
-    own, share, space = bank.hyperparameters, bank.weight, model.space
-    spread = share * own.wander_variance
-    wander = spread.sum()
-    changing = own.groups[1]
+    own, share, changing = bank.hyperparameters, bank.weight, bank.hyperparameters.groups[1]
+    walk, *scales = np.exp(share @ own.log_walks)
+    settling, wander, kept = share @ own.variances
     # Their weights among themselves: against those of healthy filters they may be 0.
     odds = np.exp(bank.log_weight[changing] - bank.log_weight[changing].max(initial=-np.inf))
     running_in, moved = np.zeros(()), np.zeros(())
     if own.decays:
-        decays = np.where(own.rate_decay > 0, share, 0.0)
+        decays, rate = np.where(own.rate_decay > 0, share, 0.0), model.space.rate
         running_in = decays.sum()
-        rates = bank.mean[:, space.rate] ** 2
-        rates += np.einsum("gii->gi", bank.cov[:, space.rate, space.rate])
-        moved = decays @ rates.mean(axis=1) / max(running_in, 1e-300) * space.ticks[k] ** 2
+        rates = bank.mean[:, rate] ** 2 + np.einsum("gii->gi", bank.cov[:, rate, rate])
+        tick = model.space.ticks[k]
+        moved = decays @ rates.mean(axis=1) / max(running_in, 1e-300) * tick**2
     weight = np.ones(model.mode_of.size)
     weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
     return Nuisances(
-        level_walk=_geometric(share, own.level_walk**2),
+        level_walk=walk,
         rate_walk=odds @ own.rate_walk[changing] ** 2 / (odds.sum() or 1.0),
-        settling=share @ own.settling**2,
+        settling=settling,
         running_in=running_in,
         wander=wander,
-        wander_keep=spread @ own.wander_keep / (wander or 1.0),
-        scales=_geometric(share, own.scales),
+        wander_keep=kept / (wander or 1.0),
+        scales=np.array(scales),
         moved=moved,
         weight=weight,
         reopened=np.array(False),
     )
-
-
-def _geometric(share: FloatArray, values: FloatArray) -> FloatArray:
-    """Return the geometric mean of values, where all are positive or none is."""
-    return np.asarray(np.exp(share @ np.log(values)) if values.all() else share @ values)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

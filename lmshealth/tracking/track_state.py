@@ -194,12 +194,12 @@ def _with_nuisances(
     since = max(state.start, state.checkpoints[0].index if state.checkpoints else 0)
     if since == k:
         return state, nuisances
-    last = state.checkpoints[-1].epoch.nuisances
-    if k - state.start >= _RUN_IN:
-        nuisances = replace(nuisances, settling=last.settling, running_in=last.running_in)
+    last, has_run_in = state.checkpoints[-1].epoch.nuisances, k - state.start >= _RUN_IN
     credit = min(state.credit + _REPEATS, N_CHECKPOINTS)
-    if k > since + credit or not nuisances.differ(last):
+    if k > since + credit or not nuisances.differ(last, has_run_in=has_run_in):
         return replace(state, credit=credit), last.at(nuisances)
+    if has_run_in:
+        nuisances = replace(nuisances, settling=last.settling, running_in=last.running_in)
     state = _filtered_again(state, since, lambda _, own: nuisances.at(own))
     return replace(state, credit=credit - (k - since)), nuisances
 
