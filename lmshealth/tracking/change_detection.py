@@ -16,8 +16,9 @@ from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import FilterBank, FilterModel, advance, restart
+from lmshealth.tracking.filter_bank import FilterBank, advance, restart
 from lmshealth.tracking.history import Step, StepKind
+from lmshealth.tracking.state_space import StateSpace
 
 ChangeKind = StepKind | Literal["drift"]
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
@@ -124,7 +125,7 @@ def threshold(routes: int = constants.ALARM_ROUTES) -> float:
 
 
 def weigh_changes(
-    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
 ) -> ChangeHypothesis | None:
     """Weigh all kinds of change about a suspected log by their evidence.
 
@@ -137,7 +138,7 @@ def weigh_changes(
     for j in about:
         if j - 1 not in checkpoints or not 0 < j < now:
             continue
-        gains |= _gains(model, checkpoints, now, j)
+        gains |= _gains(space, checkpoints, now, j)
         if max(gains.values()) < 0:
             break
     if not gains:
@@ -151,32 +152,32 @@ def weigh_changes(
 
 
 def _gains(
-    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, j: int
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, j: int
 ) -> dict[tuple[ChangeKind, str, int], float]:
     """Return the log Bayes factors of all kinds of change at log j."""
     kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
-    if len(model.sources) > 1:
-        kinds += [("sensor", source) for source in model.sources]
-    history, before = model.space.history, checkpoints[j - 1]
+    if len(space.sources) > 1:
+        kinds += [("sensor", source) for source in space.sources]
+    history, before = space.history, checkpoints[j - 1]
     place = -float(np.log(j * (j + 1)))
     gains: dict[tuple[ChangeKind, str, int], float] = {}
     # A step that is in the model already explains the following error there.
-    known = _is_explained(model.space.steps, j)
+    known = _is_explained(space.steps, j)
     for kind, source in kinds:
         loop = None if known else loop_evidence(history.loop_error, j, now, kind)
         # Without a change of the following error, or without data of it, there is no retuning.
         if kind == "servo" and (loop is None or loop < 0):
             continue
-        stepped = model.with_step(Step.found(kind, j, len(history.logs), source))
-        after = advance(stepped, before.padded(stepped.space.size), j, now)
+        stepped = space.with_step(Step.found(kind, j, len(history.logs), source))
+        after = advance(stepped, before.padded(stepped.size), j, now)
         gain = after.log_evidence - checkpoints[now].log_evidence + (loop or 0.0)
         gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
     gains["drift", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
-        anew = restart(model, before[before.hyperparameters.healthy])
+        anew = restart(space, before[before.hyperparameters.healthy])
         anew = anew[~anew.hyperparameters.healthy]
-        gain = advance(model, anew, j, now).log_evidence - anew.log_evidence
+        gain = advance(space, anew, j, now).log_evidence - anew.log_evidence
         unchanged = checkpoints[now].log_evidence - before.log_evidence
         gains["drift", "", j] = gain - unchanged + place
     return gains

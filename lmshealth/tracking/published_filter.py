@@ -16,11 +16,9 @@ from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import (
     FilterBank,
-    FilterModel,
     Innovation,
-    Observation,
-    begin_step,
 )
+from lmshealth.tracking.state_space import Observation, StateSpace
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10
@@ -74,7 +72,7 @@ class Nuisances(Rows):
         return bool(ratio.max() > _MOST_RESCALING or ratio.min() < 1 / _MOST_RESCALING)
 
 
-def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k: int) -> Nuisances:
+def select_nuisances(space: StateSpace, bank: FilterBank, found: Innovation, k: int) -> Nuisances:
     """Select the nuisances of log k from the posterior of the bank after it.
 
     The random walk of ln f and scales are geometric means over the posterior, because those of few
@@ -89,12 +87,12 @@ def select_nuisances(model: FilterModel, bank: FilterBank, found: Innovation, k:
     odds = np.exp(bank.log_weight[changing] - bank.log_weight[changing].max(initial=-np.inf))
     running_in, moved = np.zeros(()), np.zeros(())
     if own.decays:
-        decays, rate = np.where(own.rate_decay > 0, share, 0.0), model.space.rate
+        decays, rate = np.where(own.rate_decay > 0, share, 0.0), space.rate
         running_in = decays.sum()
         rates = bank.mean[:, rate] ** 2 + np.einsum("gii->gi", bank.cov[:, rate, rate])
-        tick = model.space.ticks[k]
+        tick = space.ticks[k]
         moved = decays @ rates.mean(axis=1) / max(running_in, 1e-300) * tick**2
-    weight = np.ones(model.mode_of.size)
+    weight = np.ones(space.mode_of.size)
     weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
     return Nuisances(
         level_walk=walk,
@@ -125,53 +123,53 @@ class Gaussian:
         return type(self)(np.pad(self.mean, (0, more)), np.pad(self.cov, (0, more)))
 
 
-def prior(model: FilterModel) -> Gaussian:
+def prior(space: StateSpace) -> Gaussian:
     """Return the state before the first log."""
-    mean, cov = model.space.prior()
-    rate = model.space.rate
-    cov[rate, rate] += constants.PUBLISHED_RATE_STD**2 * model.together
+    mean, cov = space.prior()
+    rate = space.rate
+    cov[rate, rate] += constants.PUBLISHED_RATE_STD**2 * space.together
     return Gaussian(mean, cov)
 
 
-def filter_log(model: FilterModel, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
+def filter_log(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
     """Predict to log k from the state before it, and update with its estimates."""
-    move, noise = _transition(model, own, k)
+    move, noise = _transition(space, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    given = model.observations[k]
+    given = space.observations[k]
     if given.rows.size:
-        mean, cov = update(mean, cov, given.values, _errors(given, own), model.matrix(k))
+        mean, cov = update(mean, cov, given.values, _errors(given, own), space.observed_matrix(k))
     return Gaussian(mean, cov)
 
 
-def undecided(model: FilterModel, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
+def undecided(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
     """Return the state after log k if it has outliers, any of which may be a step.
 
     Half of the squared innovation is added to the variance of the error and of the quantity:
     both explanations are within two standard deviations.
     """
-    space, given, rows = model.space, model.observations[k], model.observations[k].rows
-    move, noise = _transition(model, own, k)
+    given, rows = space.observations[k], space.observations[k].rows
+    move, noise = _transition(space, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    matrix = model.matrix(k)
+    matrix = space.observed_matrix(k)
     half = (given.values - matrix @ mean) ** 2 / 2
     half[own.weight[rows] >= 0.5] = 0.0
     first = np.where(rows < len(space.history.series), space.level.start, space.damping.start)
     jump = np.zeros(space.size)
-    np.maximum.at(jump, first + model.mode_of[rows], half)
+    np.maximum.at(jump, first + space.mode_of[rows], half)
     errors = _errors(given, replace(own, weight=np.ones_like(own.weight))) + np.diag(half)
     return Gaussian(*update(mean, cov + np.diag(jump), given.values, errors, matrix))
 
 
-def smooth_states(model: FilterModel, nuisances: Nuisances) -> tuple[FloatArray, FloatArray]:
+def smooth_states(space: StateSpace, nuisances: Nuisances) -> tuple[FloatArray, FloatArray]:
     """Filter and smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965]."""
-    n, size = len(model.observations), model.space.size
+    n, size = len(space.observations), space.size
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))
-    state = prior(model)
+    state = prior(space)
     for k in range(n):
-        state = filter_log(model, state, nuisances[k], k)
+        state = filter_log(space, state, nuisances[k], k)
         means[k], covs[k] = state.mean, state.cov
-        moves[k], noises[k] = _transition(model, nuisances[k], k)
+        moves[k], noises[k] = _transition(space, nuisances[k], k)
     smoother = KalmanFilter(dim_x=size, dim_z=1)
     smoothed = smoother.rts_smoother(means, covs, moves, noises, inv=_inverse)
     return smoothed[0], smoothed[1]
@@ -184,27 +182,28 @@ def _errors(given: Observation, own: Nuisances) -> FloatArray:
     return errors if given.extra is None else errors + np.diag(given.extra)
 
 
-def _transition(model: FilterModel, own: Nuisances, k: int) -> tuple[FloatArray, FloatArray]:
+def _transition(space: StateSpace, own: Nuisances, k: int) -> tuple[FloatArray, FloatArray]:
     """Return transition matrix and covariance of the process noise into log k."""
-    space, size = model.space, model.space.wander.stop
+    size = space.wander.stop
     move, noise = np.eye(space.size), np.zeros((space.size, space.size))
     if k == 0:
-        noise[space.wander, space.wander] = own.wander * model.wander_cov
+        noise[space.wander, space.wander] = own.wander * space.wander_cov
     elif space.seen[k]:
-        move[space.level, space.rate] = space.ticks[k] * model.single
+        move[space.level, space.rate] = space.ticks[k] * space.single
         move[space.wander, space.wander] *= own.wander_keep
         walk, fresh = own.rate_walk, (1 - own.wander_keep**2) * own.wander
         parts = (own.level_walk, own.settling, walk, walk, walk, fresh, constants.DAMPING_WALK**2)
-        variances = parts * model.noise_shares[k]
+        variances = parts * space.noise_shares[k]
         variances[1] += own.running_in * own.moved
-        noise[:size, :size] = (variances @ model.noise).reshape(size, size)
-    begun = [(j, step) for j, step in enumerate(space.steps) if step.first == k]
-    if k and (own.reopened or any(s.kind == "reset" or not s.declared for _, s in begun)):
+        noise[:size, :size] = (variances @ space.noise).reshape(size, size)
+    begun = (step for step in space.steps if step.first == k)
+    if k and (own.reopened or any(step.kind == "reset" or not step.declared for step in begun)):
         # Since the log before, the rates have their prior again.
         moved = move[:, space.rate]
-        noise += constants.PUBLISHED_RATE_STD**2 * moved @ model.together @ moved.T
-    for j, step in begun:
-        begin_step(space, noise[None], step, j)
+        noise += constants.PUBLISHED_RATE_STD**2 * moved @ space.together @ moved.T
+    jumps = space.jump_noise(k)
+    if jumps is not None:
+        noise += jumps
     if k in space.history.baselines:
         for part in (move, noise, noise.T):
             part[space.base] = part[space.level]

@@ -21,7 +21,6 @@ from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.change_detection import Event
-from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.published_filter import Nuisances
 from lmshealth.tracking.state_space import StateSpace
@@ -246,13 +245,13 @@ def track(history: History, stage: Stage | None = None) -> Track:
             f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
             "a mode without a name is known once three logs show it"
         )
-    model = FilterModel(StateSpace(history, stage, history.steps))
-    return _published(reduce(step, range(len(history.logs)), initial_state(model)))
+    space = StateSpace(history, stage, history.steps)
+    return _published(reduce(step, range(len(history.logs)), initial_state(space)))
 
 
 def _published(state: TrackState) -> Track:
     """Return the track of the logs up to a state."""
-    space, sources = state.model.space, state.model.sources
+    space, sources = state.space, state.space.sources
     history, epochs, rows = space.history, state.epochs(), unrolled(state.rows)
     mean = np.array([row.mean for row in rows])
     drift, drift_cov = _drifts(space, mean, np.array([row.drift_cov for row in rows]))
@@ -285,7 +284,7 @@ def _published(state: TrackState) -> Track:
             if not set(epoch.outlying).isdisjoint(history.columns(mode))
         ),
         nis=np.array([epoch.nis for epoch in epochs]),
-        nis_dof=degrees_of_freedom(state.model, innovations),
+        nis_dof=degrees_of_freedom(state.space, innovations),
         innovations=innovations,
         noise_scale=np.array([row.noise_scale for row in rows]),
         widening=factor,
@@ -304,7 +303,7 @@ def _undetected(history: History) -> BoolArray:
 
 def _step_events(state: TrackState) -> list[Event]:
     """List the steps, detected and declared, mode by mode."""
-    space, (mean, cov) = state.model.space, (state.published.mean, state.published.cov)
+    space, (mean, cov) = state.space, (state.published.mean, state.published.cov)
     n_declared, m = len(space.history.steps), space.n_modes
     events: list[Event] = []
     for j, one in enumerate(space.steps):
@@ -364,7 +363,7 @@ def _evidence(step: Step, size: FloatArray, cov: FloatArray) -> float:
 
 def _effects(state: TrackState) -> tuple[Effect, ...]:
     """List the effects that are no wear, after the last log."""
-    space, bank, modes = state.model.space, state.bank, state.model.space.history.modes
+    space, bank, modes = state.space, state.bank, state.space.history.modes
     mean, std = state.published.mean, np.sqrt(np.maximum(np.diag(state.published.cov), 0.0))
     places = [(one.name, space.regressor(j).start) for j, one in enumerate(space.regressed)]
     places += [
@@ -380,7 +379,7 @@ def _effects(state: TrackState) -> tuple[Effect, ...]:
     for j, i in enumerate(space.biased):
         at, one = space.first_bias + 2 * j, space.history.series[i]
         effects.append(Effect(one.mode, f"bias:{one.source}", float(mean[at]), float(std[at])))
-    for s, source in enumerate(state.model.sources):
+    for s, source in enumerate(state.space.sources):
         values = bank.hyperparameters.scales[:, s]
         scale = float(bank.weight @ values)
         std_of_scale = float(np.sqrt(bank.weight @ (values - scale) ** 2))

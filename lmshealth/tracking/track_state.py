@@ -1,6 +1,6 @@
 """State of a track: what is known after each log, and the pure step from one log to the next.
 
-A track is a fold: ``reduce(step, range(n_logs), initial_state(model))``. A state is never changed;
+A track is a fold: ``reduce(step, range(n_logs), initial_state(space))``. A state is never changed;
 a detected step makes one whose last logs are filtered again from the checkpoint before the step.
 """
 
@@ -27,7 +27,6 @@ from lmshealth.tracking.change_detection import (
 )
 from lmshealth.tracking.filter_bank import (
     FilterBank,
-    FilterModel,
     initial,
     predict,
     restart,
@@ -42,6 +41,7 @@ from lmshealth.tracking.published_filter import (
     select_nuisances,
     undecided,
 )
+from lmshealth.tracking.state_space import StateSpace
 
 Item = TypeVar("Item")
 Chain = Union[tuple[Item, "Chain[Item]"], None]  # noqa: UP007, it names itself
@@ -94,7 +94,7 @@ class TrackState:
     its prior again, and changes before the regime are not weighed again.
     """
 
-    model: FilterModel  # with the steps so far
+    space: StateSpace  # with the steps so far
     bank: FilterBank  # from which the next log is predicted
     published: Gaussian  # state of the published filter
     checkpoints: tuple[Checkpoint, ...] = ()  # the last logs
@@ -125,18 +125,17 @@ def unrolled(chain: "Chain[Item]") -> list[Item]:
     return items[::-1]
 
 
-def initial_state(model: FilterModel) -> TrackState:
+def initial_state(space: StateSpace) -> TrackState:
     """Return the state before the first log."""
-    space = model.space
     loop_changes = unexplained_loop_changes(space.history.loop_error, space.steps)
-    return TrackState(model, initial(model), prior(model), loop_changes=loop_changes)
+    return TrackState(space, initial(space), prior(space), loop_changes=loop_changes)
 
 
 def step(state: TrackState, k: int) -> TrackState:
     """Return the state after log k from that after the log before."""
-    steps = state.model.space.history.steps
+    steps = state.space.history.steps
     if k and any(one.kind == "reset" and one.first == k for one in steps):
-        bank = restart(state.model, state.bank, anew=True)
+        bank = restart(state.space, state.bank, anew=True)
         state = replace(state, bank=bank, start=k, first=k, alarmed=False)
     state = _filter(state, k)
     window, size = _worst_window(state)
@@ -154,15 +153,15 @@ def _filter(state: TrackState, k: int) -> TrackState:
 
     What is outlying in three logs in a row has changed, by more than any prior allows for.
     """
-    model = state.model
+    space = state.space
     recent = [set(one.epoch.outlying) for one in state.checkpoints[-3:]]
     stays = len(recent) == 3 and bool(set.intersection(*recent))
-    bank, found = update(model, predict(model, state.bank, k), k, outliers=not stays)
+    bank, found = update(space, predict(space, state.bank, k), k, outliers=not stays)
     bank = bank.pruned()
-    state, nuisances = _with_nuisances(state, select_nuisances(model, bank, found, k), k)
-    before = state.published.padded(model.space.size)
+    state, nuisances = _with_nuisances(state, select_nuisances(space, bank, found, k), k)
+    before = state.published.padded(space.size)
     kept = found.kept
-    innovations = np.full(model.mode_of.size, np.nan)
+    innovations = np.full(space.mode_of.size, np.nan)
     innovations[found.rows[kept]] = found.standardised[kept]
     outlying = () if kept.size == found.rows.size else tuple(np.delete(found.rows, kept).tolist())
     epoch = Epoch(nuisances, found.nis, innovations, outlying)
@@ -175,7 +174,7 @@ def _filter(state: TrackState, k: int) -> TrackState:
     return replace(
         state,
         bank=bank,
-        published=filter_log(model, before, nuisances, k),
+        published=filter_log(space, before, nuisances, k),
         checkpoints=(*checkpoints, Checkpoint(k, epoch, before, bank, sums)),
         settled=settled,
     )
@@ -214,7 +213,7 @@ def _filtered_again(
         own = change(one.index, one.epoch.nuisances)
         epoch = replace(one.epoch, nuisances=own)
         checkpoints.append(replace(one, epoch=epoch, before=published))
-        published = filter_log(state.model, published, own, one.index)
+        published = filter_log(state.space, published, own, one.index)
     return replace(state, checkpoints=tuple(checkpoints), published=published)
 
 
@@ -252,7 +251,7 @@ def _detect(state: TrackState, k: int, window: int, size: float) -> TrackState:
     if suspected is not None and (abs(before - suspected) > 2 or k - when >= (k - suspected) / 4):
         banks = {one.index: one.bank for one in state.checkpoints if one.index >= state.start}
         state = replace(state, weighed=(suspected, k), open=None)
-        change = weigh_changes(state.model, banks, k, suspected)
+        change = weigh_changes(state.space, banks, k, suspected)
         if change is not None and change.significant:
             if not change.settled(k):
                 state = replace(state, open=change)
@@ -271,24 +270,24 @@ def _detect(state: TrackState, k: int, window: int, size: float) -> TrackState:
 
 def _adopted(state: TrackState, change: ChangeHypothesis, k: int) -> TrackState:
     """Add a change to the model and filter again from the checkpoint before it."""
-    j, model = change.first, state.model
+    j, space = change.first, state.space
     at = j - state.checkpoints[0].index
     bank = state.checkpoints[at - 1].bank
     # What is published of earlier logs does not change any more.
     state = replace(state, widening=widening(state)[:k])
     if change.kind != "drift":
-        history = model.space.history
-        model = model.with_step(Step.found(change.kind, j, len(history.logs), change.source))
-        bank = bank.padded(model.space.size)
+        history = space.history
+        space = space.with_step(Step.found(change.kind, j, len(history.logs), change.source))
+        bank = bank.padded(space.size)
         state = replace(
             state,
-            model=model,
+            space=space,
             changes=(*state.changes, (change, k)),
-            loop_changes=unexplained_loop_changes(history.loop_error, model.space.steps),
+            loop_changes=unexplained_loop_changes(history.loop_error, space.steps),
         )
     state = replace(
         state,
-        bank=restart(model, bank),
+        bank=restart(space, bank),
         published=state.checkpoints[at].before,
         checkpoints=state.checkpoints[:at],
         start=j,
@@ -308,7 +307,7 @@ def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
     drift = row.mean[:m] - row.mean[3 * m :]
     std = np.sqrt(np.maximum(row.drift_cov.diagonal(), 0.0))
     i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
-    mode = state.model.space.history.modes[i]
+    mode = state.space.history.modes[i]
     alarm = Event("alarm", k, mode, "", float(drift[i]), float(std[i]), evidence, False, k)
     return replace(state, alarms=(*state.alarms, alarm), alarmed=True)
 
@@ -317,13 +316,13 @@ def _publish(state: TrackState, k: int) -> TrackState:
     """Publish the state after log k."""
     last, own = state.checkpoints[-1], state.published
     if last.epoch.outlying:
-        own = undecided(state.model, last.before, last.epoch.nuisances, k)
+        own = undecided(state.space, last.before, last.epoch.nuisances, k)
     return replace(state, rows=(_row(state, own), state.rows))
 
 
 def _row(state: TrackState, own: Gaussian) -> Published:
     """Return what is published of a state."""
-    space, size = state.model.space, 4 * state.model.space.n_modes
+    space, size = state.space, 4 * state.space.n_modes
     cov = own.cov[:size, :size]
     return Published(
         own.mean[:size],
@@ -333,9 +332,9 @@ def _row(state: TrackState, own: Gaussian) -> Published:
     )
 
 
-def degrees_of_freedom(model: FilterModel, innovations: FloatArray) -> FloatArray:
+def degrees_of_freedom(space: StateSpace, innovations: FloatArray) -> FloatArray:
     """Count the innovations of each log; the first estimate of a mode has none."""
-    history = model.space.history
+    history = space.history
     there: BoolArray = np.isfinite(innovations)
     for mode in history.modes:
         own = np.array(history.columns(mode), dtype=int)
@@ -364,7 +363,7 @@ def widening(state: TrackState) -> FloatArray:
     """
     epochs = state.epochs()
     innovations = np.array([one.innovations for one in epochs])
-    dof = degrees_of_freedom(state.model, innovations)
+    dof = degrees_of_freedom(state.space, innovations)
     nis = np.array([one.nis for one in epochs])
     total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
     bound = stats.chi2.isf(constants.WIDENING_P_VALUE, np.maximum(degrees, 1.0))

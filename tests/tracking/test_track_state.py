@@ -8,7 +8,6 @@ from itertools import accumulate
 
 import numpy as np
 
-from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import track
@@ -33,9 +32,9 @@ def stepping() -> History:
 
 def states_of(history: History) -> list[TrackState]:
     """Return the states before the first log and after every log."""
-    model = FilterModel(StateSpace(history, None, history.steps))
+    space = StateSpace(history, None, history.steps)
     logs = range(len(history.logs))
-    return list(accumulate(logs, step, initial=initial_state(model)))
+    return list(accumulate(logs, step, initial=initial_state(space)))
 
 
 def values_of(row: Published) -> list[np.ndarray]:
@@ -74,7 +73,7 @@ def test_a_fold_may_stop_and_go_on() -> None:
         level = np.array([row.mean[:2] for row in unrolled(state.rows)])
         np.testing.assert_array_equal(level, whole.ln_frequency)
         np.testing.assert_array_equal(widening(state), whole.widening)
-        found = [(one.kind, one.first) for one in state.model.space.steps]
+        found = [(one.kind, one.first) for one in state.space.steps]
         assert found == [(one.kind, one.first) for one in whole.steps]
         assert len(found) > 1
 
