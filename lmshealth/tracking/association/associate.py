@@ -16,7 +16,15 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
-from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
+from lmshealth.tracking.association.hypotheses import (
+    Candidates,
+    Hypotheses,
+    Scan,
+    extend,
+    follow,
+    prune,
+    reduce_hypotheses,
+)
 from lmshealth.tracking.association.mode_filters import (
     IntArray,
     Measurements,
@@ -25,7 +33,6 @@ from lmshealth.tracking.association.mode_filters import (
     update,
 )
 from lmshealth.tracking.association.noise_scale import learn_scales, scaled
-from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
 
