@@ -76,10 +76,9 @@ class FilterBank(Rows):
             keep[group] = odds > odds.max(initial=-np.inf) + _NEGLIGIBLE
         return self if keep.all() else self[keep]
 
-    def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the mixture, of the first `size` entries of the state."""
-        part = slice(size)
-        return mixture(self.weight, self.mean[:, part], self.cov[:, part, part])
+    def collapse(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the mixture."""
+        return mixture(self.weight, self.mean, self.cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
