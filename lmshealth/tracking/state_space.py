@@ -135,12 +135,15 @@ class Observation:
 
 
 class StateSpace:
-    """Layout of the state, and the measurement matrices of a history.
+    """State space of a history: layout of the state, observations and process noise.
 
     Rates and random walks are per life of `constants.LOGS_PER_LIFE` logs at their mean distance so
     far. `ticks` are the parts of it between each log that has estimates (`seen`) and the one
     before, and `settling` the parts of the variance of settling, ``(n_logs,)`` each; `size` is the
-    length of the state; `fixed` has the measurement matrices without steps.
+    length of the state. `fixed` has the measurement matrices without steps, `observations` the
+    estimates of each log; `sources` are those of the series, `mode_of` is the index of the mode of
+    each row of ``[ln f, ln ζ]``, ``(2 n_series,)``, and `grid` has the hyperparameters that a
+    filter bank starts with.
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
