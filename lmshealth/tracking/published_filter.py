@@ -22,8 +22,8 @@ from lmshealth.tracking.state_space import Observation, StateSpace
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10
-# Least value of a nuisance that matters, and the factor by which it may differ, first of the two that
-# do not change once a machine has run in; and the factor of scales.
+# Least value of a nuisance that matters, and the factor by which it may differ; the first two do
+# not change once a machine has run in. The last is the factor of scales.
 _TOLERANCES = (
     ("settling", 1e-8, 1.5), ("running_in", 1e-4, 1.5),
     ("level_walk", 1e-9, 1.5), ("rate_walk", 1e-5, 1.5), ("wander", 0.03, 1.3),

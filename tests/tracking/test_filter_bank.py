@@ -164,7 +164,7 @@ def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     kept = run(history, stage)
     between = 0.0
     for k, (at, _) in enumerate(kept):
-        mean, cov = at.collapse(4 * space.n_modes)
+        mean, cov = at.collapse()
         weight = softmax(log_weight[:, k])
         own = np.array([book.mean[k, 0] for book in books])
         off = own - weight @ own
