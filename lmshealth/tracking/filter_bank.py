@@ -209,7 +209,7 @@ def _condition(bank: FilterBank, crossed: FloatArray, total: FloatArray) -> Filt
     white = np.linalg.inv(root) @ crossed.swapaxes(1, 2)
     # Reductions of covariances, and changes of states with the opposite sign.
     change = white.swapaxes(1, 2) @ white[:, :, :-1]
-    nis = np.square(white[:, :, -1]).sum(axis=1)
+    nis = np.einsum("gi,gi->g", white[:, :, -1], white[:, :, -1])
     log_det = np.log(root.diagonal(axis1=1, axis2=2)).sum(axis=1)
     log_likelihood = -0.5 * (nis + total.shape[1] * np.log(2 * np.pi)) - log_det
     state = np.subtract(bank.state, change, out=change)

@@ -158,7 +158,7 @@ def _filter(state: TrackState, k: int) -> TrackState:
     stays = len(recent) == 3 and bool(set.intersection(*recent))
     bank, found = update(space, predict(space, state.bank, k), k, outliers=not stays)
     bank = bank.pruned()
-    state, nuisances = _with_nuisances(state, select_nuisances(space, bank, found, k), k)
+    state, nuisances, credit = _with_nuisances(state, select_nuisances(space, bank, found, k), k)
     before = state.published.padded(space.size)
     kept = found.kept
     innovations = np.full(space.mode_of.size, np.nan)
@@ -167,7 +167,8 @@ def _filter(state: TrackState, k: int) -> TrackState:
     epoch = Epoch(nuisances, found.nis, innovations, outlying)
     most, last = constants.MOST_INNOVATION, state.checkpoints[-1:]
     sums = last[0].sums if last else np.zeros((2, innovations.size + 2))
-    sums = add_to_sums(sums, found.rows, found.standardised.clip(-most, most))
+    innovation = np.minimum(np.maximum(found.standardised, -most), most)
+    sums = add_to_sums(sums, found.rows, innovation)
     checkpoints, settled = state.checkpoints, state.settled
     if len(checkpoints) == N_CHECKPOINTS:
         settled, checkpoints = (checkpoints[0].epoch, settled), checkpoints[1:]
@@ -177,30 +178,31 @@ def _filter(state: TrackState, k: int) -> TrackState:
         published=filter_log(space, before, nuisances, k),
         checkpoints=(*checkpoints, Checkpoint(k, epoch, before, bank, sums)),
         settled=settled,
+        credit=credit,
     )
 
 
 def _with_nuisances(
     state: TrackState, nuisances: Nuisances, k: int
-) -> tuple[TrackState, Nuisances]:
+) -> tuple[TrackState, Nuisances, int]:
     """Filter the regime before log k again if the machine's nuisances have changed.
 
     They are unknown at first: early logs are filtered again once it is known how much they
     scatter and wander. Checkpoints and a credit bound how far back that reaches. Wear that
     begins later does not revise whether the machine has run in. Returned are the nuisances that
-    log k has.
+    log k has, and the credit that is left.
     """
     since = max(state.start, state.checkpoints[0].index if state.checkpoints else 0)
     if since == k:
-        return state, nuisances
+        return state, nuisances, state.credit
     last, has_run_in = state.checkpoints[-1].epoch.nuisances, k - state.start >= _RUN_IN
     credit = min(state.credit + _REPEATS, N_CHECKPOINTS)
     if k > since + credit or not nuisances.differ(last, has_run_in=has_run_in):
-        return replace(state, credit=credit), last.at(nuisances)
+        return state, last.at(nuisances), credit
     if has_run_in:
         nuisances = replace(nuisances, settling=last.settling, running_in=last.running_in)
     state = _filtered_again(state, since, lambda _, own: nuisances.at(own))
-    return replace(state, credit=credit - (k - since)), nuisances
+    return state, nuisances, credit - (k - since)
 
 
 def _filtered_again(
