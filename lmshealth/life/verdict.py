@@ -19,8 +19,9 @@ from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.naming import off_description
 from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.tracking.change_detection import Event
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Event, Track
+from lmshealth.tracking.track import Track
 
 # Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.
 NO_HEALTH = ("alarm", "no-alarm", "not-enough-data")

@@ -5,7 +5,6 @@ Their values are in the descriptions: ``descriptions/*.toml``.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated
 
@@ -211,23 +210,3 @@ class JointPrior:
         """Return one whose priors are wider by a factor, in the same box."""
         priors = tuple(prior.widened(factor) for prior in self.priors)
         return JointPrior(self.names, priors, self.low, self.high)
-
-
-def combine_priors(parts: Sequence[JointPrior], columns: Sequence[Sequence[int]]) -> JointPrior:
-    """Combine priors of several machines; those of a shared parameter must be equal.
-
-    `columns` are the indices of the parameters of each machine among all.
-    """
-    n = 1 + max(place for places in columns for place in places)
-    names, priors = [""] * n, [parts[0].priors[0]] * n
-    low, high = np.full(n, -np.inf), np.full(n, np.inf)
-    for part, places in zip(parts, columns, strict=True):
-        for j, place in enumerate(places):
-            if names[place] and priors[place] != part.priors[j]:
-                raise BadStage(
-                    f"{part.names[j]} is shared, but has the priors {priors[place]} and "
-                    f"{part.priors[j]}; state the same prior in both descriptions"
-                )
-            names[place], priors[place] = part.names[j], part.priors[j]
-            low[place], high[place] = max(low[place], part.low[j]), min(high[place], part.high[j])
-    return JointPrior(tuple(names), tuple(priors), low, high)

@@ -16,16 +16,37 @@ from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import FilterBank, FilterModel, advance, restart
+from lmshealth.tracking.filter_bank import FilterBank, advance, restart
 from lmshealth.tracking.history import Step, StepKind
+from lmshealth.tracking.state_space import StateSpace
 
 ChangeKind = StepKind | Literal["drift"]
+EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
 # Lengths of the windows, in logs, and the number of checkpoints that they need.
-_WINDOWS = np.array([2, 4, 8, 16, 32, 64])
-N_CHECKPOINTS = int(_WINDOWS.max()) + 4
+_WINDOWS = (2, 4, 8, 16, 32, 64)
+N_CHECKPOINTS = _WINDOWS[-1] + 4
 # Logs about the suspected one that are tried as the first of a change.
 _ABOUT = np.array([-2, -1, 0, 1, 2])
+
+
+@dataclass(frozen=True, slots=True)
+class Event:
+    """Step or alarm, as one mode shows it: one row of ``events.csv``.
+
+    An alarm is an unexplained change of the modes since the baseline, at the declared false-alarm
+    probability.
+    """
+
+    kind: EventKind
+    epoch: int  # first log after a step; of an alarm, the log at which it is raised
+    mode: str
+    source: str  # the sensor's; else empty
+    size: float  # change of ln f, of a regreasing change of ln ζ, of an alarm the drift
+    std: float
+    evidence: float  # log Bayes factor against no event, with the prior of an unknown place
+    declared: bool  # whether maintenance or the log's ``servo_id`` declared it
+    found_at: int  # the log after which it was detected
 
 
 @lru_cache(maxsize=16)
@@ -44,20 +65,20 @@ def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> F
     return np.asarray(sums + both @ _columns(sums.shape[1] - 2)[rows])
 
 
-def worst_window(sums: FloatArray, first: int) -> tuple[int, float]:
+def worst_window(sums: Sequence[FloatArray], first: int) -> tuple[int, float]:
     """Return the first log of the window with the largest mean innovation, and its size.
 
     `sums` are the running sums before the first log and after every log so far, `first` is the
     first log of the regime. The size is in standard deviations; 0 where there is no window.
     """
-    start = len(sums) - 1 - _WINDOWS
-    start = start[start >= first]
-    if not start.size:
+    now = len(sums) - 1
+    starts = [now - length for length in _WINDOWS if now - length >= first]
+    if not starts:
         return first, 0.0
-    windows = sums[-1] - sums[start]
+    windows = sums[-1] - np.array([sums[start] for start in starts])
     mean = np.abs(windows[:, 0]) / np.sqrt(np.maximum(windows[:, 1], 1))
     at = int(mean.argmax())
-    return int(start[at // mean.shape[1]]), float(mean.flat[at])
+    return starts[at // mean.shape[1]], float(mean.flat[at])
 
 
 def recent_loop_change(loop_changes: Sequence[int], first: int, now: int) -> int | None:
@@ -104,7 +125,7 @@ def threshold(routes: int = constants.ALARM_ROUTES) -> float:
 
 
 def weigh_changes(
-    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
 ) -> ChangeHypothesis | None:
     """Weigh all kinds of change about a suspected log by their evidence.
 
@@ -117,7 +138,7 @@ def weigh_changes(
     for j in about:
         if j - 1 not in checkpoints or not 0 < j < now:
             continue
-        gains |= _gains(model, checkpoints, now, j)
+        gains |= _gains(space, checkpoints, now, j)
         if max(gains.values()) < 0:
             break
     if not gains:
@@ -131,45 +152,45 @@ def weigh_changes(
 
 
 def _gains(
-    model: FilterModel, checkpoints: Mapping[int, FilterBank], now: int, j: int
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, j: int
 ) -> dict[tuple[ChangeKind, str, int], float]:
     """Return the log Bayes factors of all kinds of change at log j."""
     kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
-    if len(model.sources) > 1:
-        kinds += [("sensor", source) for source in model.sources]
-    history, before = model.space.history, checkpoints[j - 1]
+    if len(space.sources) > 1:
+        kinds += [("sensor", source) for source in space.sources]
+    history, before = space.history, checkpoints[j - 1]
     place = -float(np.log(j * (j + 1)))
     gains: dict[tuple[ChangeKind, str, int], float] = {}
     # A step that is in the model already explains the following error there.
-    known = _is_explained(model.space.steps, j)
+    known = _is_explained(space.steps, j)
     for kind, source in kinds:
         loop = None if known else loop_evidence(history.loop_error, j, now, kind)
         # Without a change of the following error, or without data of it, there is no retuning.
         if kind == "servo" and (loop is None or loop < 0):
             continue
-        stepped = model.with_step(Step.found(kind, j, len(history.logs), source))
-        after = advance(stepped, before.padded(stepped.space.size), j, now)
+        stepped = space.with_step(Step.found(kind, j, len(history.logs), source))
+        after = advance(stepped, before.padded(stepped.size), j, now)
         gain = after.log_evidence - checkpoints[now].log_evidence + (loop or 0.0)
         gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
     gains["drift", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
-        anew = restart(model, before[before.hyperparameters.healthy])
+        anew = restart(space, before[before.hyperparameters.healthy])
         anew = anew[~anew.hyperparameters.healthy]
-        gain = advance(model, anew, j, now).log_evidence - anew.log_evidence
+        gain = advance(space, anew, j, now).log_evidence - anew.log_evidence
         unchanged = checkpoints[now].log_evidence - before.log_evidence
         gains["drift", "", j] = gain - unchanged + place
     return gains
 
 
-def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) -> list[int]:
+def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) -> tuple[int, ...]:
     """List logs since which two following errors in a row differ from the dozen before.
 
     Logs about a step that is in the model are left out.
     """
     values = _logarithms(loop_error)
     if values.size < constants.LOOP_FEWEST + 2:
-        return []
+        return ()
     padded = np.concatenate([np.full(constants.LOOP_LOGS, np.nan), values])
     before = sliding_window_view(padded, constants.LOOP_LOGS)[: values.size - 1]
     there = np.isfinite(before)
@@ -181,7 +202,7 @@ def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) ->
     reach = std * stats.t.isf(constants.LOOP_P_VALUE / 2, n - 1)
     off = np.stack([values[:-1], values[1:]]) - mean
     loop_changes = (np.abs(off) > reach).all(axis=0) & (off[0] * off[1] > 0) & enough
-    return [j for j in np.flatnonzero(loop_changes).tolist() if not _is_explained(steps, j)]
+    return tuple(j for j in np.flatnonzero(loop_changes).tolist() if not _is_explained(steps, j))
 
 
 def _is_explained(steps: tuple[Step, ...], j: int) -> bool:

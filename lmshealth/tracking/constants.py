@@ -128,9 +128,6 @@ LABEL_PROBABILITY = 0.95
 # outer gate of all others (standard deviations), with at least this MAC.
 INNER_GATE, OUTER_GATE = 4.0, 12.0
 LEAST_MAC = 0.8
-# A log repeats the one before if ln f changes by at most this, plus covariates and REPEAT_GATE
-# standard deviations, and modes are farther apart than that by REPEAT_SEPARATION.
-REPEAT_LN_F, REPEAT_SEPARATION, REPEAT_GATE = 0.005, 0.03, 4.0
 # A crash moves all modes: two named modes or more that are all outside this gate about every mode
 # seen before, while their names agree, open the log for steps.
 JUMP_LN_F, JUMP_GATE, JUMP_COVARIATE_GATE = 0.003, 6.0, 2.0

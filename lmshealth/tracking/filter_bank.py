@@ -5,107 +5,25 @@ weighted by its evidence. The sets form two groups: a healthy machine has no rat
 walk, a changing one has a rate. States are immutable: `predict` and `update` return a new bank.
 """
 
-from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from math import prod
+from math import log, log1p
 from typing import Self
 
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, diagonal
 from lmshealth.tracking import constants
-from lmshealth.tracking.history import Step
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.state_space import Hyperparameters, StateSpace
 
 # Sets with less than this share of their group's best are pruned (a test bounds the error).
 _NEGLIGIBLE = float(np.log(1e-7))
 
 
 @dataclass(frozen=True, eq=False)
-class Hyperparameters(Rows):
-    """Process noise and noise scales, one set per filter: standard deviations of ln f and lives.
-
-    There are no slots: what follows from them is kept, because it is needed at every log.
-    """
-
-    level_walk: FloatArray  # of the random walk of ln f over a life, ``(n,)``
-    rate_std: FloatArray  # of the initial rate per life, 0 for a healthy machine, ``(n,)``
-    rate_walk: FloatArray  # of the random walk of the rate over a life, ``(n,)``
-    scales: FloatArray  # factor on the reported errors of each source, ``(n, n_sources)``
-    log_prior: FloatArray  # log of the prior probability, ``(n,)``
-    rate_decay: FloatArray  # by which a rate decays exponentially, per life, ``(n,)``
-    wander: FloatArray  # size of the wander in scaled errors of the first estimates, ``(n,)``
-    wander_keep: FloatArray  # its correlation from one log to the next, ``(n,)``
-    settling: FloatArray  # of the random walk of ln f that ends after a few logs, ``(n,)``
-    # Index of the combination of scales and wander: of a machine, whatever its regime, ``(n,)``.
-    disturbance: np.ndarray
-
-    @cached_property
-    def healthy(self) -> BoolArray:
-        """Whether each set has no rate, or one that decays (running-in), shape ``(n,)``."""
-        return np.asarray((self.rate_std == 0) | (self.rate_decay > 0))
-
-    @cached_property
-    def wander_variance(self) -> FloatArray:
-        """Stationary variance of the wander in errors of the first estimates, shape ``(n,)``."""
-        return np.asarray((self.wander * np.exp(np.log(self.scales).mean(axis=1))) ** 2)
-
-    @cached_property
-    def process_noise(self) -> FloatArray:
-        """Variances of the parts of process noise, in the order of `_process_noise`, ``(n, 7)``."""
-        drive, wander = self.rate_walk**2, (1 - self.wander_keep**2) * self.wander_variance
-        damping = np.full(drive.size, constants.DAMPING_WALK**2)
-        parts = (self.level_walk**2, self.settling**2, drive, drive, drive, wander, damping)
-        return np.column_stack(parts)
-
-
-def hyperparameter_grid(n_sources: int) -> Hyperparameters:
-    """Return the grid of hyperparameters that is averaged over."""
-    walks, rates = constants.CHANGING_WALKS, constants.CHANGING_RATES
-    chance = constants.HEALTHY_PROBABILITY
-    courses = [(w, 0.0, 0.0, 0.0, 0.0, chance * p) for w, p in constants.HEALTHY_WALKS]
-    for logs, p in constants.RUNNING_IN_LOGS:
-        decay = constants.LOGS_PER_LIFE / logs
-        size = constants.RUNNING_IN_STD * decay
-        courses.append((constants.HEALTHY_WALKS[0][0], size, 0.0, decay, 0.0, chance * p))
-    for w, (r, d, share) in product(walks, rates):
-        share *= (1 - chance) / len(walks)
-        sizes = constants.SETTLING if r <= constants.SLOW_RATE else ((0.0, 1.0),)
-        courses += [(w, r, d, 0.0, size, p * share) for size, p in sizes]
-    disturbances = np.array(
-        [
-            (size, np.exp(-1 / logs) if logs else 0.0, p * prod(q for _, q in scales),
-             *(scale for scale, _ in scales))
-            for scales, (size, logs, p) in product(_scales(n_sources), constants.WANDERS)
-        ]
-    )  # fmt: skip
-    n, m = len(courses), len(disturbances)
-    walk, rate, drive, decay, settling, chances = np.repeat(np.array(courses), m, axis=0).T
-    size, keep, weight, *scales = np.tile(disturbances, (n, 1)).T
-    prior = chances * weight
-    log_prior, index = np.log(prior / prior.sum()), np.tile(np.arange(m), n)
-    noise = np.stack(scales, axis=1)
-    return Hyperparameters(walk, rate, drive, noise, log_prior, decay, size, keep, settling, index)
-
-
-def _scales(n_sources: int) -> list[tuple[tuple[float, float], ...]]:
-    """List the noise scales of all sources, without the most improbable combinations."""
-    scaled = min(n_sources, constants.MOST_SCALED_SOURCES)
-    choices = list(product(constants.SOURCE_NOISE_SCALES, repeat=scaled))
-    least = constants.LEAST_SCALES_PROBABILITY
-    rest = n_sources - scaled
-    return [
-        (*one, *(((one[-1][0], 1.0),) * rest))
-        for one in choices
-        if scaled == 1 or prod(p for _, p in one) >= least
-    ]
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class FilterBank(Rows):
-    """Filters of all hyperparameters that are left, at one log."""
+    """Filters of all hyperparameters that are left, at one log; their weights are kept."""
 
     hyperparameters: Hyperparameters
     log_weight: FloatArray  # log of prior times evidence so far, ``(n,)``
@@ -130,7 +48,7 @@ class FilterBank(Rows):
         state[:, :own, :own], state[:, -1, :own] = self.cov, self.mean
         return replace(self, state=state)
 
-    @property
+    @cached_property
     def weight(self) -> FloatArray:
         """Posterior probability of each filter, shape ``(n,)``."""
         return np.asarray(np.exp(self.log_weight - self.log_evidence))
@@ -142,25 +60,25 @@ class FilterBank(Rows):
 
     def log_bayes_factor(self) -> float:
         """Return the log evidence of the changing filters over the healthy ones."""
-        healthy = self.hyperparameters.healthy
-        if healthy.all() or not healthy.any():
+        healthy, changing = self.hyperparameters.groups
+        if not healthy.size or not changing.size:
             return 0.0
         chance = constants.HEALTHY_PROBABILITY
-        changing = np.logaddexp.reduce(self.log_weight[~healthy])
-        odds = changing - np.logaddexp.reduce(self.log_weight[healthy])
-        return float(odds + (np.log(chance) - np.log1p(-chance)))
+        odds = np.logaddexp.reduce(self.log_weight[changing])
+        odds -= np.logaddexp.reduce(self.log_weight[healthy])
+        return float(odds) + log(chance) - log1p(-chance)
 
     def pruned(self) -> Self:
         """Remove filters with a negligible share of their group; both groups stay."""
-        healthy, odds = self.hyperparameters.healthy, self.log_weight
-        best = (odds[group].max(initial=-np.inf) for group in (healthy, ~healthy))
-        keep = odds > np.where(healthy, *best) + _NEGLIGIBLE
+        keep = np.empty(self.log_weight.size, dtype=bool)
+        for group in self.hyperparameters.groups:
+            odds = self.log_weight[group]
+            keep[group] = odds > odds.max(initial=-np.inf) + _NEGLIGIBLE
         return self if keep.all() else self[keep]
 
-    def collapse(self, size: int | None = None) -> tuple[FloatArray, FloatArray]:
-        """Return mean and covariance of the mixture, of the first `size` entries of the state."""
-        part = slice(size)
-        return mixture(self.weight, self.mean[:, part], self.cov[:, part, part])
+    def collapse(self) -> tuple[FloatArray, FloatArray]:
+        """Return mean and covariance of the mixture."""
+        return mixture(self.weight, self.mean, self.cov)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -174,158 +92,88 @@ class Innovation:
     outlying: FloatArray  # probability that they are outliers, ``(n_rows,)``
 
     @property
+    def kept(self) -> np.ndarray:
+        """Indices of those that are more probably no outliers."""
+        return np.flatnonzero(self.outlying <= 0.5)
+
+    @property
     def nis(self) -> float:
         """Normalised innovation squared of those that are more probably no outliers."""
-        kept = np.flatnonzero(self.outlying <= 0.5)
-        mean, cov = self.mean[kept], self.cov[kept[:, None], kept]
+        mean, cov, kept = self.mean, self.cov, self.kept
+        if kept.size < mean.size:
+            mean, cov = mean[kept], cov[kept[:, None], kept]
         return float(mean @ np.linalg.solve(cov, mean))
 
 
-class FilterModel:
-    """State space and measurements of a history, as the filters use them.
-
-    `values` are the estimates ``[ln f, ln ζ]``, ``(n_logs, 2 n_series)``, `scale_of` the index of
-    the source of each row, and `grid` the hyperparameters that a bank starts with.
-    """
-
-    def __init__(self, space: StateSpace) -> None:
-        self.space = space
-        history, r = space.history, len(space.history.series)
-        self.values = np.hstack([history.ln_frequency, history.ln_damping])
-        self.there = np.isfinite(self.values)
-        self.sources = tuple(dict.fromkeys(one.source for one in history.series))
-        self.scale_of = np.array([self.sources.index(one.source) for one in history.series] * 2)
-        self.grid = hyperparameter_grid(len(self.sources))
-        self.mode_of = np.tile(history.mode_of(), 2)
-        # Variance of ln f due to unknown covariates.
-        self.extra = np.zeros((len(history.logs), 2 * r))
-        for regressor in space.regressed:
-            self.extra[:, :r] += regressor.unknown[:, None]
-        self.unknown: BoolArray = np.any(self.extra != 0, axis=1)
-        self.rows = [np.flatnonzero(own) for own in self.there]
-        # Covariance of a wander as large as the errors of each mode's first estimate.
-        std = np.zeros(space.n_modes)
-        for i, mode in enumerate(history.modes):
-            variance = np.einsum("kii->ki", history.cov)[:, history.columns(mode)]
-            first = variance[np.isfinite(variance)][:1]
-            std[i] = np.sqrt(first[0]) if first.size else 0.0
-        self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
-        self.together = _correlation(constants.RATE_COMMON, std.size)
-        self.noise, self.noise_shares = self._process_noise()
-
-    def _process_noise(self) -> tuple[FloatArray, FloatArray]:
-        """Return covariances of the parts of process noise, and their shares in every log.
-
-        They are the random walk of levels, settling, the rates' random walk in levels, between
-        levels and rates, and in rates, wander, and the random walk of damping, of unit variance,
-        ``(7, (5 n_modes)²)``. The shares, ``(n_logs, 7)``, are of variances per life.
-        """
-        space, size = self.space, 5 * self.space.n_modes
-        level, rate, single = space.level, space.rate, np.eye(space.n_modes)
-        parts = np.zeros((7, size, size))
-        parts[0, level, level], parts[6, space.damping, space.damping] = single, single
-        parts[5, space.wander, space.wander] = self.wander_cov
-        for part, row, column in (
-            *((1, level, level), (2, level, level), (4, rate, rate)),
-            *((3, level, rate), (3, rate, level)),
-        ):
-            parts[part, row, column] = self.together
-        tick, one = space.ticks, np.ones(space.ticks.size)
-        shares = [tick, space.settling, tick**3 / 3, tick**2 / 2, tick, one, tick]
-        return parts.reshape(7, -1), np.stack(shares, axis=1)
-
-    def with_step(self, step: Step) -> Self:
-        """Return the model with one more step."""
-        changed = copy(self)
-        changed.space = self.space.with_step(step)
-        return changed
-
-
-def initial(model: FilterModel, grid: Hyperparameters | None = None) -> FilterBank:
-    """Return the bank before the first log, with all hyperparameters or with those given."""
-    grid = model.grid if grid is None else grid
-    mean, cov = model.space.prior()
+def initial(space: StateSpace) -> FilterBank:
+    """Return the bank before the first log, with all hyperparameters."""
+    grid, (mean, cov) = space.grid, space.prior()
     state = np.tile(np.vstack([cov, mean]), (grid.rate_std.size, 1, 1))
-    _add(state, model.space.rate, grid.rate_std**2, model.together)
-    _add(state, model.space.wander, grid.wander_variance, model.wander_cov)
+    _add(state, space.rate, grid.rate_std**2, space.together)
+    _add(state, space.wander, grid.wander_variance, space.wander_cov)
     return FilterBank(grid, grid.log_prior.copy(), state)
 
 
-def predict(model: FilterModel, bank: FilterBank, k: int) -> FilterBank:
+def predict(space: StateSpace, bank: FilterBank, k: int) -> FilterBank:
     """Predict all filters from the log before to log k, with the steps between."""
-    space, own, state = model.space, bank.hyperparameters, bank.state.copy()
+    own, state = bank.hyperparameters, bank.state.copy()
     level, rate, base, wander = space.level, space.rate, space.base, space.wander
     if k > 0 and space.seen[k]:
         keep = own.wander_keep[:, None, None]
         state[:, wander] *= keep
         state[:, :, wander] *= keep
         # A level moves by this part of a life times its rate.
-        moved = np.full(keep.shape, space.ticks[k])
-        decays = own.rate_decay > 0
-        if decays.any():
+        moved = space.ticks[k]
+        if own.decays:
             decay = own.rate_decay[:, None, None]
             left = np.exp(-decay * moved)
-            moved[decays] = ((1 - left) / np.where(decay > 0, decay, 1.0))[decays]
+            moved = np.where(decay > 0, (1 - left) / np.where(decay > 0, decay, 1.0), moved)
         state[:, level] += moved * state[:, rate]
         state[:, :, level] += moved * state[:, :, rate]
-        if decays.any():
+        if own.decays:
             state[:, rate] *= left
             state[:, :, rate] *= left
-        noise = (own.process_noise * model.noise_shares[k]) @ model.noise
+        noise = (own.process_noise * space.noise_shares[k]) @ space.noise
         size = wander.stop
         state[:, :size, :size] += noise.reshape(-1, size, size)
-    for j, step in enumerate(space.steps):
-        if step.first == k:
-            begin_step(space, state, step, j)
+    jumps = space.jump_noise(k)
+    if jumps is not None:
+        state[:, :-1] += jumps
     if k in space.history.baselines:
         state[:, base] = state[:, level]
         state[:, :, base] = state[:, :, level]
     return FilterBank(own, bank.log_weight, state)
 
 
-def begin_step(space: StateSpace, state: FloatArray, step: Step, j: int) -> None:
-    """Add the variance of the j-th step of a state space to covariances that the caller owns."""
-    jump = space.jump(j)
-    variance = np.repeat(np.square(constants.JUMP_STD[step.kind]), space.n_modes)
-    own = np.arange(jump.start, jump.stop)
-    state[:, own, own] += variance
-    if step.changes_modes:
-        level, damping = space.level, space.damping
-        moved = np.r_[level.start : level.stop, damping.start : damping.stop]
-        state[:, own, moved] += variance
-        state[:, moved, own] += variance
-        state[:, moved, moved] += variance
-
-
 def update(
-    model: FilterModel, bank: FilterBank, k: int, *, outliers: bool = True
+    space: StateSpace, bank: FilterBank, k: int, *, outliers: bool = True
 ) -> tuple[FilterBank, Innovation]:
     """Update filters that are predicted to log k with its estimates; nothing is pruned.
 
     Where innovations are large, the estimates of a mode or of all modes may be outliers: every
     filter is the mixture of these hypotheses, reduced to its mean and covariance.
     """
-    rows, space = model.rows[k], model.space
+    given, rows = space.observations[k], space.observations[k].rows
     if not rows.size:
         return bank, Innovation(rows, np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0))
-    matrix, value = space.matrix(k)[rows], model.values[k, rows]
-    scales = bank.hyperparameters.scales[:, model.scale_of[rows]]
-    errors = space.history.cov[k][rows[:, None], rows] * (scales[:, :, None] * scales[:, None])
+    matrix, scales = space.observed_matrix(k), bank.hyperparameters.scales[:, given.source]
+    errors = given.cov * (scales[:, :, None] * scales[:, None])
     # One product of all states with the matrix instead of one each. Its last row is the innovation
     # with the opposite sign.
     n, rest, size = bank.state.shape
     crossed = (bank.state.reshape(-1, size) @ matrix.T).reshape(n, rest, -1)
-    crossed[:, -1] -= value
+    crossed[:, -1] -= given.values
     total = matrix @ crossed[:, :-1] + errors
-    if model.unknown[k]:
-        diagonal(total)[:] += model.extra[k, rows]
+    if given.extra is not None:
+        diagonal(total)[:] += given.extra
     centre, cov = mixture(bank.weight, -crossed[:, -1], total)
     standardised = centre / np.sqrt(cov.diagonal())
     updated, outlying = _condition(bank, crossed, total), np.zeros(rows.size)
     if outliers and np.abs(standardised).max() > constants.OUTLIER_GATE:
-        hypotheses, found = _outliers(model.mode_of[rows], standardised), [updated]
+        hypotheses, found = _outliers(space.mode_of[rows], standardised), [updated]
         own = errors.diagonal(axis1=1, axis2=2)
-        wide = np.where(rows < len(model.there[k]) // 2, constants.LN_F_STD, constants.LN_ZETA_STD)
+        is_ln_f = rows < len(space.mode_of) // 2
+        wide = np.where(is_ln_f, constants.LN_F_STD, constants.LN_ZETA_STD)
         for mask, chance, gross in hypotheses:
             wider = total.copy()
             more = wide**2 if gross else (constants.OUTLIER_SCALE**2 - 1) * own
@@ -361,7 +209,7 @@ def _condition(bank: FilterBank, crossed: FloatArray, total: FloatArray) -> Filt
     white = np.linalg.inv(root) @ crossed.swapaxes(1, 2)
     # Reductions of covariances, and changes of states with the opposite sign.
     change = white.swapaxes(1, 2) @ white[:, :, :-1]
-    nis = np.square(white[:, :, -1]).sum(axis=1)
+    nis = np.einsum("gi,gi->g", white[:, :, -1], white[:, :, -1])
     log_det = np.log(root.diagonal(axis1=1, axis2=2)).sum(axis=1)
     log_likelihood = -0.5 * (nis + total.shape[1] * np.log(2 * np.pi)) - log_det
     state = np.subtract(bank.state, change, out=change)
@@ -383,19 +231,19 @@ def _merged(found: list[FilterBank]) -> tuple[FilterBank, FloatArray]:
     return merged, share
 
 
-def advance(model: FilterModel, bank: FilterBank, first: int, last: int) -> FilterBank:
+def advance(space: StateSpace, bank: FilterBank, first: int, last: int) -> FilterBank:
     """Filter the logs from one to another, both included."""
     for k in range(first, last + 1):
-        bank = update(model, predict(model, bank, k), k)[0].pruned()
+        bank = update(space, predict(space, bank, k), k)[0].pruned()
     return bank
 
 
-def restart(model: FilterModel, bank: FilterBank, *, anew: bool = False) -> FilterBank:
+def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> FilterBank:
     """Start a regime: keep state, noise scales and wander; process noise has its prior again.
 
     Only work on the machine starts it `anew`: parts then run in.
     """
-    grid, own = model.grid, bank.hyperparameters
+    grid, own = space.grid, bank.hyperparameters
     kept, place = np.unique(own.disturbance, return_inverse=True)
     chosen: BoolArray = np.isin(grid.disturbance, kept)
     grid = grid[chosen & (anew | (grid.rate_decay == 0))]
@@ -408,11 +256,11 @@ def restart(model: FilterModel, bank: FilterBank, *, anew: bool = False) -> Filt
         mean, cov = bank[members if members.any() else place == d].collapse()
         state[(at == d) & (grid.healthy == group)] = np.vstack([cov, mean])
     # A healthy machine has no rate, whatever its rate was before.
-    rates = np.arange(model.space.rate.start, model.space.rate.stop)
+    rates = np.arange(space.rate.start, space.rate.stop)
     still = np.flatnonzero(grid.rate_std == 0)[:, None]
     state[still, rates] = 0.0
     state[still, :, rates] = 0.0
-    _add(state, model.space.rate, grid.rate_std**2, model.together)
+    _add(state, space.rate, grid.rate_std**2, space.together)
     log_weight = grid.log_prior - np.log(of_kept) + np.log(np.maximum(share, 1e-12))
     return FilterBank(grid, log_weight, state)
 
@@ -424,11 +272,6 @@ def mixture(weight: FloatArray, mean: FloatArray, cov: FloatArray) -> tuple[Floa
     n = centre.size
     within = (weight @ cov.reshape(-1, n * n)).reshape(n, n)
     return centre, within + (off * weight[:, None]).T @ off
-
-
-def _correlation(common: float, n: int) -> FloatArray:
-    """Return the correlation of n quantities that share a part of their variance."""
-    return np.asarray(common + (1 - common) * np.eye(n))
 
 
 def _add(state: FloatArray, rows: slice, variance: FloatArray, correlation: FloatArray) -> None:

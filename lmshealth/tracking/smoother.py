@@ -6,9 +6,8 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.history import History
-from lmshealth.tracking.published_filter import PublishedFilter
+from lmshealth.tracking.published_filter import smooth_states
 from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track
 
@@ -34,8 +33,7 @@ def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smo
     if followed.nuisances is None:
         raise ValueError(f"the track of {followed.stage} has no nuisances: filter it by `track`")
     space = StateSpace(history, stage, followed.steps)
-    logs = [followed.nuisances[k] for k in range(len(history.logs))]
-    mean, cov = PublishedFilter(FilterModel(space)).smooth(logs)
+    mean, cov = smooth_states(space, followed.nuisances)
     contrast = space.drift
     size = contrast.shape[1]
     drift = mean[:, :size] @ contrast.T

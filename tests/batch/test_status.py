@@ -23,7 +23,7 @@ from lmshealth.batch.status import (
 )
 from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
-from lmshealth.tracking.track import Event
+from lmshealth.tracking.change_detection import Event
 from tests.assessments import Maker, blind, make, nothing
 
 __all__ = ["make"]

@@ -10,7 +10,7 @@ from msgspec import structs
 
 from lmshealth.report.assessment import Summary, first_limit, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
-from lmshealth.tracking.track import Event
+from lmshealth.tracking.change_detection import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
 
 __all__ = ["make"]

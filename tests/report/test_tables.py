@@ -32,9 +32,10 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
+from lmshealth.tracking.change_detection import Event
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.smoother import Smoothed
-from lmshealth.tracking.track import Effect, Event, Track
+from lmshealth.tracking.track import Effect, Track
 from tests.lives import health_of
 from tests.signals import write_archive_stage
 

@@ -9,8 +9,7 @@ import pytest
 from scipy import stats
 from scipy.integrate import trapezoid
 
-from lmshealth.errors import BadStage
-from lmshealth.stage.priors import JointPrior, Lognormal, Normal, Prior, Uniform, combine_priors
+from lmshealth.stage.priors import JointPrior, Lognormal, Normal, Prior, Uniform
 
 PAIRS: list[tuple[Prior, Any]] = [
     (Lognormal(2.0, 0.4), stats.lognorm(0.4, scale=2.0)),
@@ -136,25 +135,6 @@ def test_a_joint_density_is_that_of_the_logarithms(joint: JointPrior) -> None:
     known = sum(b.logpdf(np.exp(x[:2, j])) + x[:2, j] for j, (_, b) in enumerate(PAIRS))
     np.testing.assert_allclose(np.diff(found[:2]), np.diff(known))
     assert np.isneginf(found[2:]).all()
-
-
-def test_shared_parameters_stand_once(joint: JointPrior) -> None:
-    """What two machines share has the box that both allow; their own parameters stay apart."""
-    other = JointPrior(
-        ("b", "d"), (PAIRS[1][0], Lognormal(1.0, 0.2)), np.log([1, 0.5]), np.log([9, 2])
-    )
-    both = combine_priors([joint, other], [(0, 1, 2), (1, 3)])
-    assert both.names == ("a", "b", "c", "d")
-    np.testing.assert_allclose(np.exp(both.low), [1.0, 1.0, 0.4, 0.5])
-    np.testing.assert_allclose(np.exp(both.high), [3.0, 4.0, 3.0, 2.0])
-    assert both.priors[3] == Lognormal(1.0, 0.2)
-
-
-def test_shared_parameters_need_one_prior(joint: JointPrior) -> None:
-    """One parameter with two priors is refused with both."""
-    other = JointPrior(("b",), (Lognormal(1.0, 0.2),), *np.log([[0.5], [2.0]]))
-    with pytest.raises(BadStage, match=r"b is shared, but has.*std=3.*sigma=0\.2"):
-        combine_priors([joint, other], [(0, 1, 2), (1,)])
 
 
 @pytest.mark.parametrize("prior", [Lognormal(2.0, 0.4), Normal(-1.0, 3.0)])

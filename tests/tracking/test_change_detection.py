@@ -13,8 +13,7 @@ from scipy import integrate, stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import constants
-from lmshealth.tracking import filter_bank as bank
+from lmshealth.tracking import constants, state_space
 from lmshealth.tracking.change_detection import (
     ChangeHypothesis,
     add_to_sums,
@@ -24,9 +23,9 @@ from lmshealth.tracking.change_detection import (
     unexplained_loop_changes,
     worst_window,
 )
-from lmshealth.tracking.filter_bank import FilterModel, hyperparameter_grid, restart
+from lmshealth.tracking.filter_bank import restart
 from lmshealth.tracking.history import History, Step
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.state_space import StateSpace, hyperparameter_grid
 from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
 from tests.tracking.test_filter_bank import SETTINGS, one, run
@@ -179,7 +178,7 @@ def test_a_drift_that_begins_is_an_alarm(stage: Stage) -> None:
 
 def suspect(sums: FloatArray, first: int, loop_changes: Sequence[int] = ()) -> int | None:
     """Return the log since which the following error, or else innovations, differ."""
-    start, size = worst_window(sums, first)
+    start, size = worst_window([*sums], first)
     by_loop = recent_loop_change(loop_changes, first, len(sums) - 2)
     return (start if size > constants.SUSPICION_GATE else None) if by_loop is None else by_loop
 
@@ -279,9 +278,9 @@ def test_a_segment_keeps_the_state_and_restarts_the_process_noise(stage: Stage) 
     """Means, noise scales and wander are kept; rates and weights have their priors again."""
     kept = run(rough_history(np.random.default_rng(32), n=30), stage)
     old = kept[-1][0].pruned()
-    model = FilterModel(StateSpace(rough_history(np.random.default_rng(32), n=30), stage))
-    new = restart(model, old)
-    space, healthy = model.space, new.hyperparameters.healthy
+    space = StateSpace(rough_history(np.random.default_rng(32), n=30), stage)
+    new = restart(space, old)
+    healthy = new.hyperparameters.healthy
     assert new.weight.sum() == pytest.approx(1.0)
     # No part runs in but those of a new machine or after work on it: their share is left out.
     grid = hyperparameter_grid(1)
@@ -314,13 +313,13 @@ def test_one_setting_restarts_as_it_was(stage: Stage, monkeypatch: pytest.Monkey
     """With a grid of one setting only the rate has its prior again."""
     grid = one(SETTINGS[0], ("acc",))
     history = rough_history(np.random.default_rng(33))
-    monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: grid)
-    model = FilterModel(StateSpace(history, stage))
+    monkeypatch.setattr(state_space, "hyperparameter_grid", lambda n: grid)
+    space = StateSpace(history, stage)
     old = run(history, stage, grid)[-1][0]
-    new = restart(model, old)
+    new = restart(space, old)
     np.testing.assert_allclose(new.mean, old.mean, rtol=1e-12, atol=1e-20)
     opened = np.zeros_like(old.cov)
-    rate = np.arange(model.space.rate.start, model.space.rate.stop)
+    rate = np.arange(space.rate.start, space.rate.stop)
     alike = constants.RATE_COMMON + (1 - constants.RATE_COMMON) * np.eye(rate.size)
     opened[np.ix_(np.array([0]), rate, rate)] = SETTINGS[0].rate ** 2 * alike
     np.testing.assert_allclose(new.cov, old.cov + opened, atol=1e-16)

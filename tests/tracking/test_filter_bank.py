@@ -13,15 +13,12 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filter_bank import (
     FilterBank,
-    FilterModel,
-    Hyperparameters,
-    hyperparameter_grid,
     initial,
     predict,
     update,
 )
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
 from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman
 
@@ -77,11 +74,11 @@ def run(
     history: History, stage: Stage, grid: Hyperparameters | None = None
 ) -> list[tuple[FilterBank, float]]:
     """Filter all logs and keep the bank and the NIS after each."""
-    model = FilterModel(StateSpace(history, stage, history.steps))
-    model.grid = grid or model.grid
-    at, kept = initial(model), []
+    space = StateSpace(history, stage, history.steps)
+    space.grid = grid or space.grid
+    at, kept = initial(space), []
     for k in range(len(history.logs)):
-        at, innovation = update(model, predict(model, at, k), k)
+        at, innovation = update(space, predict(space, at, k), k)
         kept.append((at, innovation.nis))
     return kept
 
@@ -89,12 +86,11 @@ def run(
 def followed_by(history: History, stage: Stage, wander: Wander) -> Followed:
     """Filter with the bank under one setting; return what the oracles return."""
     space = StateSpace(history, stage, history.steps)
-    sources = FilterModel(space).sources
     m = space.n_modes
     c = np.zeros((3, m, space.size))
     c[0, :, space.level] = c[1, :, space.damping] = c[2, :, space.level] = np.eye(m)
     c[2, :, space.base] = -np.eye(m)
-    kept = run(history, stage, one(wander, sources))
+    kept = run(history, stage, one(wander, space.sources))
     return Followed(
         np.array([c @ at.mean[0] for at, _ in kept]),
         np.array([np.einsum("pia,ab,qjb->piqj", c, at.cov[0], c) for at, _ in kept]),
@@ -168,7 +164,7 @@ def test_averaging_keeps_the_law_of_total_variance(stage: Stage) -> None:
     kept = run(history, stage)
     between = 0.0
     for k, (at, _) in enumerate(kept):
-        mean, cov = at.collapse(4 * space.n_modes)
+        mean, cov = at.collapse()
         weight = softmax(log_weight[:, k])
         own = np.array([book.mean[k, 0] for book in books])
         off = own - weight @ own
@@ -207,11 +203,11 @@ def test_pruning_changes_next_to_nothing(stage: Stage) -> None:
     Negative control: pruning all but the most probable does.
     """
     history = rough_history(np.random.default_rng(6), n=60)
-    model = FilterModel(StateSpace(history, stage))
-    banks = [initial(model) for _ in range(3)]
+    space = StateSpace(history, stage)
+    banks = [initial(space) for _ in range(3)]
     moved, narrowed, poorest, least = np.zeros(60), np.zeros(60), np.zeros(60), 10**6
     for k in range(60):
-        banks = [update(model, predict(model, at, k), k)[0] for at in banks]
+        banks = [update(space, predict(space, at, k), k)[0] for at in banks]
         banks[1] = banks[1].pruned()
         banks[2] = banks[2][banks[2].log_weight == banks[2].log_weight.max()]
         (mean, cov), (pruned, own), (poor, _) = (at.collapse() for at in banks)
@@ -243,11 +239,11 @@ def test_the_prior_of_the_settings_adds_up() -> None:
 def test_banks_are_immutable(stage: Stage) -> None:
     """Predicting and updating, or padding, leaves the given bank unchanged."""
     history = rough_history(np.random.default_rng(7))
-    model = FilterModel(StateSpace(history, stage))
-    at = initial(model)
+    space = StateSpace(history, stage)
+    at = initial(space)
     before = at.mean.copy(), at.cov.copy(), at.log_weight.copy()
     for other in (at, at.padded(at.mean.shape[1])):
-        update(model, predict(model, other, 0), 0)
+        update(space, predict(space, other, 0), 0)
     for was, now in zip(before, (at.mean, at.cov, at.log_weight), strict=True):
         np.testing.assert_array_equal(was, now)
     longer = at.padded(at.mean.shape[1] + 2)
@@ -258,17 +254,19 @@ def test_banks_are_immutable(stage: Stage) -> None:
 def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
     """An outlier of any size moves ln f by less than a third of its std, and costs evidence."""
     history = rough_history(np.random.default_rng(8))
-    model = FilterModel(StateSpace(history, stage))
-    model.grid = one(SETTINGS[0], ("acc",))
-    at = initial(model)
+    space = StateSpace(history, stage)
+    space.grid = one(SETTINGS[0], ("acc",))
+    at = initial(space)
     for k in range(3):
-        at, _ = update(model, predict(model, at, k), k)
-    predicted, level = predict(model, at, 5), model.space.level
+        at, _ = update(space, predict(space, at, k), k)
+    predicted, level = predict(space, at, 5), space.level
     std = float(np.sqrt(predicted.cov[0, 0, 0]))
     moved, weight = [], []
     for size in (0.0, 0.05, 0.2):
-        model.values[5, 0] = predicted.mean[0] @ model.space.matrix(5)[0] + size
-        after, innovation = update(model, predicted, 5)
+        ln_f = history.ln_frequency.copy()
+        ln_f[5, 0] = predicted.mean[0] @ space.matrix(5)[0] + size
+        off = StateSpace(replace(history, ln_frequency=ln_f), stage)
+        after, innovation = update(off, predicted, 5)
         moved.append(abs(after.mean[0] - predicted.mean[0])[level][0] / std)
         weight.append(after.log_weight[0])
         assert innovation.rows.tolist() == [0, 1, 2, 3]
@@ -281,9 +279,9 @@ def test_outliers_have_next_to_no_weight(stage: Stage) -> None:
 def test_a_log_without_estimates_changes_nothing(stage: Stage) -> None:
     """A log without estimates leaves the bank unchanged and has no innovation."""
     history = rough_history(np.random.default_rng(9))
-    model = FilterModel(StateSpace(history, stage))
-    before = initial(model)
-    at, innovation = update(model, before, 4)
+    space = StateSpace(history, stage)
+    before = initial(space)
+    at, innovation = update(space, before, 4)
     assert innovation.rows.size == 0 and innovation.nis == 0
     np.testing.assert_array_equal(at.mean, before.mean)
     np.testing.assert_array_equal(at.log_weight, before.log_weight)

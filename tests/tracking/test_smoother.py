@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import constants
-from lmshealth.tracking import filter_bank as bank
+from lmshealth.tracking import constants, state_space
 from lmshealth.tracking.smoother import smooth
 from lmshealth.tracking.track import track
 from tests.lives import (
@@ -44,7 +43,9 @@ def test_the_published_filter_is_the_joint_gaussian_given_all_logs(
 
     The rates have a weak prior, again after the reset before log 9: it costs a digit.
     """
-    monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, ("acc", "delta_e")[:n]))
+    monkeypatch.setattr(
+        state_space, "hyperparameter_grid", lambda n: one(wander, ("acc", "delta_e")[:n])
+    )
     for gate in ("SUSPICION_GATE", "BEGUN_GATE"):
         monkeypatch.setattr(constants, gate, np.inf)
     history = awkward_history(np.random.default_rng(1))

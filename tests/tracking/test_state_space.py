@@ -9,7 +9,6 @@ import pytest
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import COVARIATE_STD, LN_F_STD, LN_ZETA_STD
-from lmshealth.tracking.filter_bank import FilterModel
 from lmshealth.tracking.history import History
 from lmshealth.tracking.state_space import StateSpace
 from tests.lives import (
@@ -118,7 +117,8 @@ def test_covariates_are_about_their_reference_and_0_where_unknown(
 
 def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
     """An unknown value adds the variance of earlier values, and only in its log."""
-    unknown = FilterModel(StateSpace(history, stage)).extra[:, 0]
+    observations = StateSpace(history, stage).observations
+    unknown = np.array([0.0 if one.extra is None else one.extra[0] for one in observations])
     temperature, payload = history.covariates["temperature_c"], history.covariates["payload_kg"]
     spread = 0.001 * np.std(temperature[:3]), 0.0005 * np.std(payload[:3])
     assert unknown[3] == pytest.approx(spread[0] ** 2 + spread[1] ** 2)

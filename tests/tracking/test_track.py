@@ -15,12 +15,11 @@ from scipy import stats
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage, Usage
-from lmshealth.tracking import constants
-from lmshealth.tracking import filter_bank as bank
-from lmshealth.tracking.change_detection import loop_evidence
+from lmshealth.tracking import constants, state_space
+from lmshealth.tracking.change_detection import Event, loop_evidence
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.history import History, StepKind
-from lmshealth.tracking.track import Event, Track, consistency, track
+from lmshealth.tracking.track import Track, consistency, track
 from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
@@ -64,7 +63,7 @@ def plain(monkeypatch: pytest.MonkeyPatch) -> Callable[[Wander], None]:
 
     def choose(wander: Wander) -> None:
         sources = tuple(wander.scales)
-        monkeypatch.setattr(bank, "hyperparameter_grid", lambda n: one(wander, sources[:n]))
+        monkeypatch.setattr(state_space, "hyperparameter_grid", lambda n: one(wander, sources[:n]))
         monkeypatch.setattr(constants, "OUTLIER_GATE", inf)
         monkeypatch.setattr(constants, "SUSPICION_GATE", inf)
         monkeypatch.setattr(constants, "BEGUN_GATE", inf)
@@ -559,7 +558,7 @@ def test_one_log_only_is_tracked(stage: Stage) -> None:
         np.testing.assert_allclose(found.ln_frequency, history.ln_frequency, atol=1e-12)
         # By what factor the estimates' own std is wrong, and how far the mode has wandered, is not
         # known after one log.
-        grid = bank.hyperparameter_grid(1)
+        grid = state_space.hyperparameter_grid(1)
         scale, prior = grid.scales[:, 0], constants.LN_F_STD**2
         error = (5e-4 * scale) ** 2 * (1 + grid.wander**2)
         # The first estimates have the density of their prior, which is wider for large scales.

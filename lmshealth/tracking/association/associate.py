@@ -13,10 +13,18 @@ from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
-from lmshealth.tracking.association.hypotheses import Hypotheses, Scan, extend, reduce_hypotheses
+from lmshealth.tracking.association.hypotheses import (
+    Candidates,
+    Hypotheses,
+    Scan,
+    extend,
+    follow,
+    prune,
+    reduce_hypotheses,
+)
 from lmshealth.tracking.association.mode_filters import (
     IntArray,
     Measurements,
@@ -25,12 +33,8 @@ from lmshealth.tracking.association.mode_filters import (
     update,
 )
 from lmshealth.tracking.association.noise_scale import learn_scales, scaled
-from lmshealth.tracking.association.track_initiation import Candidates, follow, prune
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
-
-# Filters that catch up with repeated logs need no more than these: older ones have no influence.
-_MOST_PENDING = 64
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -130,14 +134,7 @@ class State:
     order: IntArray  # modes that the identification names, ascending in first frequency
     names: tuple[str, ...] = ()  # of the modes, in the order in which they were found
     first: tuple[float, ...] = ()  # their first ln f
-    # Last place of each named mode and source, before the last log.
-    places: dict[tuple[str, str], Place] | None = None
-    last: LogMeasurements | None = None
-    labels: tuple[Label, ...] = ()  # of the last log
-    # Whether one hypothesis is left without candidates, and all names of the last log are right.
-    repeatable: bool = False
-    # Logs that repeat the one before and that the filters have not processed yet.
-    pending: tuple[LogMeasurements, ...] = ()
+    places: dict[tuple[str, str], Place] | None = None  # last ones of named modes and sources
     clock: float | None = None  # to which the filters are predicted
 
     @classmethod
@@ -196,20 +193,12 @@ def associate(
 def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Label, ...]]:
     """Associate the estimates of one log: the next state, and a label per estimate.
 
-    A log that repeats the one before has its labels; the filters catch up with it later. Otherwise
-    all filters are predicted to the log and the sources are associated one after the other: by the
+    All filters are predicted to the log, and the sources are associated one after the other: by the
     gates where only one assignment is possible, else by hypotheses.
     """
-    if _repeats(state, log):
-        pending = (*state.pending, log)[-_MOST_PENDING:]
-        return replace(state, last=log, pending=pending), state.labels
-    places = dict(state.places or {}) | ({} if state.last is None else _places(state.last))
+    places = state.places or {}
     if not log.opened and _is_common_jump(places, log, state.prior_std):
         log = replace(log, opened=True)
-    for late in state.pending:
-        state = _predict(state, late)
-        for rows, meant in _groups(state.names, late.names, late.sources):
-            state = _update(state, meant, late.measurements[rows], _row(late))
     state = _predict(state, log)
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
@@ -229,52 +218,8 @@ def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Labe
         for row, label in zip(rows, labels, strict=True):
             found[row] = label
     candidates = prune(state.candidates, log.epoch, confirmed, detected)
-    state = replace(state, candidates=candidates, places=places, last=log, labels=tuple(found))
-    filters = state.hypotheses.filters
-    certain = len(filters.mean) == 1 and not len(candidates)
-    right = all(label.mode == name for label, name in zip(found, log.names, strict=True))
-    # Names by order and by mode must be the same.
-    rising = np.diff(filters.predicted(_row(log))[0][0, state.order]) > 0
-    return replace(state, repeatable=bool(certain and right and rising.all())), state.labels
-
-
-def _repeats(state: State, log: LogMeasurements) -> bool:
-    """Return whether a log repeats the one before: names, places, dampings and shapes.
-
-    The labels are then the names, without any filter: a test holds them equal to those of the full
-    step on random lives.
-    """
-    last = state.last
-    if last is None or not state.repeatable or log.opened or not log.names:
-        return False
-    if log.names != last.names or log.sources != last.sources:
-        return False
-    new, old = log.measurements, last.measurements
-    step, std = np.abs(new.ln_f - old.ln_f), np.sqrt(new.var_f + old.var_f)
-    moved = float(np.abs(log.offsets - last.offsets) @ state.prior_std)
-    reach = constants.REPEAT_LN_F + moved + constants.REPEAT_GATE * std
-    # Where a damping is unknown its variance is infinite.
-    far = constants.REPEAT_GATE * np.sqrt(new.var_zeta + old.var_zeta)
-    if ((step / reach) ** 2 + ((new.ln_zeta - old.ln_zeta) / far) ** 2 > 1).any():
-        return False
-    covariates = constants.JUMP_COVARIATE_GATE * moved
-    jumped = step > constants.JUMP_LN_F + covariates + constants.JUMP_GATE * std
-    if np.count_nonzero(jumped) > 1:
-        return False
-    if new.shapes.shape[1] > 1:
-        product = new.shapes * old.shapes
-        mac = np.where(np.isnan(product), 0.0, product).sum(axis=1) ** 2
-        if (mac < constants.LEAST_MAC).any():
-            return False
-    near = np.abs(new.ln_f[:, None] - new.ln_f) < constants.REPEAT_SEPARATION + reach.max()
-    return not (near & _different(log.names)).any()
-
-
-@lru_cache(maxsize=256)
-def _different(names: tuple[str, ...]) -> BoolArray:
-    """Return which pairs of estimates have different names, ``(n, n)``."""
-    own = np.array(names)
-    return np.asarray(own[:, None] != own)
+    state = replace(state, candidates=candidates, places=places | _places(log))
+    return state, tuple(found)
 
 
 @lru_cache(maxsize=256)
@@ -337,7 +282,7 @@ def _predict(state: State, log: LogMeasurements) -> State:
     if len(candidates):
         filters = predict(candidates.filters, step, log.life, opened=log.opened)
         candidates = replace(candidates, filters=filters)
-    return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock, pending=())
+    return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock)
 
 
 def _update(state: State, modes: IntArray, new: Measurements, row: FloatArray) -> State:

@@ -21,9 +21,8 @@ from lmshealth.tracking.constants import (
     SETTLING_LOGS,
     WANDER_COMMON,
 )
-from lmshealth.tracking.filter_bank import FilterModel, Hyperparameters, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from studies.harness.data.histories import keep_series, make_history
 
 Array = NDArray[np.float64]
@@ -206,12 +205,12 @@ def banks(
 
     The lives have no outliers and the other programs know none: the filter looks for none either.
     """
-    model = FilterModel(StateSpace(history, machine))
-    model.grid = replace(setting, log_prior=np.zeros(1))
-    bank = filter_bank.initial(model)
+    space = StateSpace(history, machine)
+    space.grid = replace(setting, log_prior=np.zeros(1))
+    bank = filter_bank.initial(space)
     for k in range(len(history.logs)):
-        before = filter_bank.predict(model, bank, k)
-        bank, innovation = filter_bank.update(model, before, k, outliers=False)
+        before = filter_bank.predict(space, bank, k)
+        bank, innovation = filter_bank.update(space, before, k, outliers=False)
         yield bank, float(innovation.nis)
 
 
@@ -253,8 +252,7 @@ def filtered(life: Life, machine: Stage) -> Filtered:
 def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
     """Return the probability below the truth in the average over all settings, at one log."""
     space = StateSpace(life.history, machine)
-    model = FilterModel(space)
-    bank = filter_bank.advance(model, filter_bank.initial(model), 0, k)
+    bank = filter_bank.advance(space, filter_bank.initial(space), 0, k)
     level, base, damping = (part.start + i for part in (space.level, space.base, space.damping))
     places = {"ln f": [level], "ln ζ": [damping], "drift": [level, base]}
     below = {}

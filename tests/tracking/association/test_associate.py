@@ -305,7 +305,7 @@ def test_unknown_dampings_do_no_harm(rng: np.random.Generator) -> None:
 
 
 def random_life(seed: int) -> tuple[list[Estimates], dict[str, Any]]:
-    """Simulate a life of mostly repeated logs: jumps, outliers, gaps, modes that meet, shapes."""
+    """Simulate a life of mostly steady logs: jumps, outliers, gaps, modes that meet, shapes."""
     rng = np.random.default_rng(seed)
     n, m = 120, 4
     warm = rng.uniform(-10, 10, n)
@@ -335,21 +335,22 @@ def random_life(seed: int) -> tuple[list[Estimates], dict[str, Any]]:
 @pytest.mark.parametrize(
     "seed", [1, 2, *(pytest.param(seed, marks=pytest.mark.slow) for seed in range(3, 11))]
 )
-def test_repeated_logs_have_the_labels_of_the_full_step(
+def test_unique_assignments_have_the_labels_of_hypotheses(
     monkeypatch: pytest.MonkeyPatch, seed: int
 ) -> None:
-    """The fast path for logs that repeat the one before changes no label and no reason."""
+    """The gates, which take most logs, change no label and no reason."""
     rows, options = random_life(seed)
-    repeats, taken = module._repeats, []
+    unique, taken = module._unique_assignment, []
 
-    def counted(*given: Any) -> bool:
-        taken.append(repeats(*given))
-        return taken[-1]
+    def counted(*given: Any) -> Any:
+        found = unique(*given)
+        taken.append(found is not None)
+        return found
 
-    monkeypatch.setattr(module, "_repeats", counted)
+    monkeypatch.setattr(module, "_unique_assignment", counted)
     fast = run(rows, **options)
-    assert sum(taken) > len(rows) / 8
-    monkeypatch.setattr(module, "_repeats", lambda *given: False)
+    assert sum(taken) > 10
+    monkeypatch.setattr(module, "_unique_assignment", lambda *given: None)
     slow = run(rows, **options)
     assert fast.assigned == slow.assigned
     assert [(k, i, d.reason) for k, i, d in fast.unassigned] == [
@@ -378,46 +379,6 @@ def test_the_step_is_pure(rng: np.random.Generator) -> None:
     assert first[1] == again[1]
     assert np.array_equal(first[0].hypotheses.filters.mean, again[0].hypotheses.filters.mean)
     assert np.array_equal(state.hypotheses.filters.mean, mean)
-
-
-@pytest.mark.parametrize(("n", "atol"), [(40, 0.0), (400, 1e-4)])
-def test_filters_catch_up_with_repeated_logs(
-    monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator, n: int, atol: float
-) -> None:
-    """Filters after repeated logs equal the full step; after very many, within a tenth of σ."""
-    logs = logs_of([say(row, "ab") for row in steady(rng, n)])
-
-    def levels() -> Array:
-        state = State.start(np.zeros(0), 0)
-        for log in logs:
-            state, _ = associate_log(state, log)
-        state, _ = associate_log(state, replace(logs[-1], opened=True, clock=float(n)))
-        return np.asarray(state.hypotheses.filters.mean[0, :, 0])
-
-    late = levels()
-    monkeypatch.setattr(module, "_repeats", lambda *given: False)
-    np.testing.assert_allclose(late, levels(), rtol=1e-12, atol=atol)
-
-
-def test_only_logs_that_repeat_the_one_before_take_the_fast_path(rng: np.random.Generator) -> None:
-    """A log with a changed level, gap, name, damping or shape is no repetition."""
-    still = say([4.6, 4.8], "ab", shapes=np.eye(2))
-    state = State.start(np.array([1e-3]), 2)
-    for k, log in enumerate(logs_of([still] * 10)):
-        state, _ = associate_log(state, replace(log, offsets=np.zeros(1), clock=float(k)))
-
-    def repeated(other: Estimates, warm: float = 0.0, *, opened: bool = False) -> bool:
-        (log,) = logs_of([other])
-        return module._repeats(state, replace(log, offsets=np.array([warm]), opened=opened))
-
-    assert repeated(still)
-    assert not repeated(still, opened=True)
-    assert not repeated(replace(still, ln_frequency=np.array([4.6, 4.82])))
-    assert repeated(replace(still, ln_frequency=np.array([4.6, 4.82])), 20.0)
-    assert not repeated(replace(still, ln_frequency=np.array([4.6, 4.62])), 200.0)
-    assert not repeated(replace(still, names=("a", "")))
-    assert not repeated(replace(still, ln_damping=np.array([-4.0, -3.0])))
-    assert not repeated(replace(still, shapes=np.eye(2)[::-1].copy()))
 
 
 def test_shapes_are_made_of_unit_length() -> None:
