@@ -119,7 +119,23 @@ def frequencies(duration: float) -> np.ndarray:
 def spectrum_of(matrix: np.ndarray, duration: float, count: int = 1) -> CrossSpectrum:
     """Wrap matrices of all frequencies of the band."""
     f = frequencies(duration)
-    return CrossSpectrum(f, matrix, duration, float("nan"), np.ones(f.size, dtype=bool), (), count)
+    free = np.ones(f.size, dtype=bool)
+    return CrossSpectrum(f, with_mean(matrix, count), duration, float("nan"), free)
+
+
+def with_mean(matrix: np.ndarray, count: int = 1) -> np.ndarray:
+    """Return transforms of segments whose mean F F* is a matrix; of one, if that has rank one.
+
+    Their phases are random, as those of a steady force.
+    """
+    n, size = len(matrix), max(count, 1)
+    value, vector = np.linalg.eigh(matrix)
+    columns = np.sqrt(value.clip(0) * size)[:, None, :] * vector
+    shown = columns[:, :, ::-1][:, :, :size]  # the strongest
+    transforms = np.zeros((size, n, matrix.shape[1]), dtype=complex)
+    transforms[: shown.shape[2]] = np.moveaxis(shown, 2, 0)
+    turn = np.random.default_rng(n).uniform(0, 2 * np.pi, (size, n, 1))
+    return transforms * np.exp(1j * turn)
 
 
 def block_of(spectra: Sequence[CrossSpectrum], *, merge: bool = False) -> MeanOrdinates:

@@ -99,8 +99,8 @@ def test_binning_keeps_the_power() -> None:
     rng = np.random.default_rng(2)
     frequency = np.arange(1, 400) / 2.0
     density, free = rng.exponential(size=frequency.size), np.ones(frequency.size, dtype=bool)
-    matrix = density[:, None, None].astype(complex)
-    spectrum = CrossSpectrum(frequency, matrix, 2.0, float("nan"), free)
+    transforms = np.sqrt(density)[None, :, None].astype(complex)
+    spectrum = CrossSpectrum(frequency, transforms, 2.0, float("nan"), free)
     wide, narrow = np.array([50.25, 150.25]), np.geomspace(50.25, 150.25, 1001)
     inside = (frequency > 50.25) & (frequency < 150.25)
     power = density[inside].sum() / spectrum.duration

@@ -301,10 +301,10 @@ def test_a_line_in_one_part_of_a_mean_is_masked_in_the_mean() -> None:
 
 
 def test_cross_spectrum_refuses_arrays_that_differ_in_length() -> None:
-    """Frequencies without matrices are no spectrum."""
+    """Frequencies without transforms are no spectrum."""
     with pytest.raises(ValueError, match="has shape"):
         CrossSpectrum(
-            np.arange(3.0), np.zeros((4, 1, 1), dtype=complex), 1.0, 0.0, np.ones(3, dtype=bool)
+            np.arange(3.0), np.zeros((1, 4, 1), dtype=complex), 1.0, 0.0, np.ones(3, dtype=bool)
         )
 
 

@@ -335,8 +335,9 @@ def prepare(
     basis = _directions(moved, cut) if many else np.eye(unit.size)
     if basis.shape[1] < unit.size:
         names = tuple(f"direction {k}" for k in range(basis.shape[1]))
-        ours = [replace(one.each(partial(CrossSpectrum.project, basis=basis)), channels=names, sources=(whole.source,) * len(names))
-                for one in (cut, whole)]  # fmt: skip
+        project = partial(CrossSpectrum.project, basis=basis)
+        sources = (whole.source,) * len(names)
+        ours = [replace(one.each(project), channels=names, sources=sources) for one in (cut, whole)]
         low, high = float(binned.frequency[0]), float(binned.frequency[-1])
         width = (high - low) / binned.frequency.size
         chosen, levels = ours[0], bin_spectra(ours[1], low, high, width, binned.neighbours)
@@ -568,7 +569,10 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     ratio = likelihood.signal_to_noise(p)
     spectrum = data.spectra.spectra[data.longest]
     duration = spectrum.duration
-    dispersion = _dispersion(*_residual(data, expected), f, zeta)
+    fitted = _fitted(data, expected[data.longest])
+    known = np.isfinite(fitted.residual)
+    residual = spectrum.frequency[known], fitted.residual[known], fitted.count
+    dispersion = _dispersion(*residual, f, zeta)
     channels, shapes = data.whole.channels, likelihood.shapes(p).T
     seen = shapes @ data.basis.T  # in units of the noise, (n_modes, n_channels)
     clear = ratio if data.basis.shape[1] == data.unit.size else seen.T**2
@@ -607,8 +611,6 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     lines = _excluded_lines(data, f[narrow])
-    whole = data.whole.spectra[data.longest]
-    fitted = FittedSpectrum(channels, data.unit, whole, _density(data, expected[data.longest]))
     fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
@@ -667,18 +669,21 @@ def _unit_shapes(shapes: FloatArray) -> FloatArray:
     return np.asarray(shapes * np.sign(largest))
 
 
-def _residual(
-    data: ClusterData, expected: list[ComplexArray]
-) -> tuple[FloatArray, FloatArray, int]:
-    """Divide the ordinates of the longest observation by their expectation: tr E⁻¹ W.
-
-    Returns frequencies in Hz and ratios without lines, and how many exponentials they average.
-    """
+def _fitted(data: ClusterData, expected: ComplexArray) -> FittedSpectrum:
+    """Divide the ordinates of the longest observation by their expectation: tr E⁻¹ W."""
     spectrum, mask = data.spectra.spectra[data.longest], data.masks[data.longest]
-    white = np.linalg.solve(expected[data.longest][mask], spectrum.matrix[mask])
     n = data.basis.shape[1]
-    ratio = np.trace(white, axis1=1, axis2=2).real / n
-    return spectrum.frequency[mask], ratio, spectrum.count * n
+    residual = np.full(mask.size, np.nan)
+    white = np.linalg.solve(expected[mask], spectrum.matrix[mask])
+    residual[mask] = np.trace(white, axis1=1, axis2=2).real / n
+    return FittedSpectrum(
+        channels=data.whole.channels,
+        unit=data.unit,
+        spectrum=data.whole.spectra[data.longest],
+        density=_density(data, expected),
+        residual=residual,
+        count=spectrum.count * n,
+    )
 
 
 def _dispersion(

@@ -34,6 +34,8 @@ class FittedSpectrum:
     unit: FloatArray  # root of the noise of the channels in (m/s²)/Hz^½, (n_channels,)
     spectrum: CrossSpectrum  # in these units
     density: FloatArray  # of the channels by the fit, infinite at lines, (n_ordinates, n_channels)
+    residual: FloatArray  # ordinates over their expectation, NaN at lines, (n_ordinates,)
+    count: int  # exponential variables that it is the mean of
 
 
 @dataclass(frozen=True, slots=True, eq=False)

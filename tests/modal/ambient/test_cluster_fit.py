@@ -25,7 +25,7 @@ from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
-from tests.bands import PITCH, RATE, ROLL, both, fit, fit_spectra, found, spectra_of
+from tests.bands import PITCH, RATE, ROLL, both, fit, fit_spectra, found, spectra_of, with_mean
 from tests.signals import (
     Mode,
     Spectrum,
@@ -155,12 +155,9 @@ def test_too_few_ordinates_are_named_with_their_number() -> None:
 
 def residual_of(found: ClusterModes) -> Spectrum:
     """Return the ordinates over their expectation, tr E⁻¹ W / n of n channels, and 1 at lines."""
-    spectrum, expected = found.fitted.spectrum, found.fitted.expected
-    n, known = expected.shape[1], np.isfinite(expected[:, 0, 0])
-    ratio = np.ones(known.size)
-    white = np.linalg.solve(expected[known], spectrum.matrix[known])
-    ratio[known] = np.trace(white, axis1=1, axis2=2).real / n
-    return Spectrum(spectrum.frequency, ratio, spectrum.duration, spectrum.count * n)
+    fitted = found.fitted
+    ratio = np.nan_to_num(fitted.residual, nan=1.0)
+    return Spectrum(fitted.spectrum.frequency, ratio, fitted.spectrum.duration, fitted.count)
 
 
 @pytest.mark.slow
@@ -260,9 +257,12 @@ def mean_of(values: np.ndarray, count: int) -> CrossSpectrum:
         cross_spectra(made, [Segment(k * n, (k + 1) * n, float("nan"))], RATE, 200.0)[0]
         for k in range(count)
     ]
-    mean = np.mean([part.matrix for part in parts], axis=0)
-    transforms = np.concatenate([part.transforms for part in parts if part.transforms is not None])
-    return replace(parts[0], matrix=mean, count=count, transforms=transforms)
+    return replace(parts[0], transforms=np.concatenate([part.transforms for part in parts]))
+
+
+def of_count(mean: CrossSpectrum, count: int) -> CrossSpectrum:
+    """Return the same mean as that of another number of segments."""
+    return replace(mean, transforms=with_mean(mean.matrix, count))
 
 
 def fit_mean(
@@ -288,9 +288,9 @@ def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
     assert np.abs(off(mean)).max() < 4
     std = np.sqrt(np.diag(mean.modes.cov))
     np.testing.assert_allclose(std, np.sqrt(np.diag(whole.modes.cov)), rtol=0.1)
-    # Negative control: taken for a single record it would be three times less sure.
-    once = fit_mean(replace(mean_of(values, 10), count=1))
-    assert (np.sqrt(np.diag(once.modes.cov)) > 2 * std).all()
+    # Negative control: taken for two records it would be √5 times less sure.
+    few = fit_mean(of_count(mean_of(values, 10), 2))
+    assert (np.sqrt(np.diag(few.modes.cov)) > 1.8 * std).all()
 
 
 @pytest.mark.slow
@@ -303,8 +303,8 @@ def test_the_mean_of_parts_shows_lines_that_none_of_them_shows() -> None:
     (line,) = fit_mean(mean_of(dirty, 10)).lines
     assert line.channel == "acc_0"
     assert line.frequency == pytest.approx(114.0, abs=0.1)
-    # Negative control: by the threshold of a single record it would not be seen.
-    assert fit_mean(replace(mean_of(dirty, 10), count=1)).lines == ()
+    # Negative control: by the threshold of two records it would not be seen.
+    assert fit_mean(of_count(mean_of(dirty, 10), 2)).lines == ()
 
 
 @pytest.mark.slow
@@ -376,20 +376,19 @@ def spectrum(
     """Draw ordinates of a mode in three channels of noise 0.5; lines stand at (k, channel, F)."""
     rng = np.random.default_rng(seed)
     frequency = np.arange(LOW * SECONDS, HIGH * SECONDS) / SECONDS
-    matrix = np.zeros((frequency.size, 3, 3), dtype=complex)
-    for _ in range(count):
+    transforms = np.zeros((count, frequency.size, 3), dtype=complex)
+    for x in transforms:
         force, *noise = (
             (rng.standard_normal(frequency.size) + 1j * rng.standard_normal(frequency.size))
             / np.sqrt(2)
             for _ in range(4)
         )
         moved = np.sqrt(psd) * Mode(105.0, 0.015).response(frequency) * force
-        x = np.outer(moved, SHAPE) + np.sqrt(0.5) * np.array(noise).T
+        x += np.outer(moved, SHAPE) + np.sqrt(0.5) * np.array(noise).T
         for k, channel, size in lines:
             x[k, channel] += size
-        matrix += x[:, :, None] * x[:, None].conj() / count
     free = np.ones(frequency.size, dtype=bool)
-    return CrossSpectrum(frequency, matrix, SECONDS, 0.2, free, (), count)
+    return CrossSpectrum(frequency, transforms, SECONDS, 0.2, free)
 
 
 def band_of(*spectra: CrossSpectrum) -> ClusterData:

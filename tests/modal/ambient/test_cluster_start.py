@@ -17,6 +17,7 @@ from lmshealth.modal.ambient.cluster_fit import (
 from lmshealth.modal.ambient.hints import locate
 from lmshealth.modal.targets import Target
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
+from tests.bands import with_mean
 from tests.signals import (
     Mode,
     Spectrum,
@@ -48,12 +49,10 @@ def binned(parts: Sequence[Spectrum], low: float, high: float, width: float) -> 
     spectra = tuple(
         CrossSpectrum(
             s.frequency,
-            s.periodogram[:, None, None] + 0j,
+            with_mean(s.periodogram[:, None, None] + 0j, s.count),
             s.duration,
             float("nan"),
             np.ones(s.frequency.size, dtype=bool),
-            (),
-            s.count,
         )
         for s in parts
     )

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -68,18 +67,6 @@ def test_the_ratio_is_that_of_the_intensity(n_parts: int) -> None:
     shaken = measured(forced(2, bursts(0.3)), n_parts)
     assert abs(shaken.ratio * 0.3 - 1) < 0.2
     assert shaken.is_clear
-
-
-def test_without_transforms_a_force_counts_as_steady() -> None:
-    """Means of spectra whose transforms were not kept."""
-    log = forced(2, bursts(0.3))
-    spectra = [
-        replace(s, transforms=None)
-        for s in cross_spectra(log.channels, [Segment(0, 24_000, 0.0)], RATE, 150.0)
-    ]
-    expected = [np.tile(np.eye(2, dtype=complex), (s.frequency.size, 1, 1)) for s in spectra]
-    found = unsteadiness(spectra, [s.free for s in spectra], expected, 100.0, 0.02, np.ones(2))
-    assert found == (1.0, 0)
 
 
 def test_bursts_widen_the_intervals_and_are_flagged() -> None:

@@ -69,7 +69,7 @@ def test_averaged_neighbours_say_what_they_say_apart_where_nothing_changes() -> 
     assert merged.data_value(p) != pytest.approx(one.data_value(p), rel=1e-9)
 
 
-@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 1), (300.0, 1), (300.0, 3)])
+@pytest.mark.parametrize(("duration", "n_segments"), [(40.0, 2), (300.0, 2), (300.0, 3)])
 def test_averaging_neighbours_moves_nothing_by_a_thirtieth_of_its_uncertainty(
     duration: float, n_segments: int
 ) -> None:

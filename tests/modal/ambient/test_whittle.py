@@ -69,7 +69,7 @@ def test_channels_follow_a_common_force_as_they_do_in_time() -> None:
     p[target.layout.forces][:] = [1.0, 1.0, 0.0, *[0.0] * 5]  # the second force drives nothing
     p[target.layout.forces.start + 2] = 1e-3
     right = target.data_value(p)
-    mirrored = replace(target, blocks=(block_of([replace(cut, matrix=cut.matrix.conj())]),))
+    mirrored = replace(target, blocks=(block_of([replace(cut, transforms=cut.transforms.conj())]),))
     assert mirrored.data_value(p) - right > 1000
     # Each ordinate of each channel adds one, give or take its scatter.
     (expected,) = target.expected(p)
