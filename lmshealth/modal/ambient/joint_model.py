@@ -115,13 +115,19 @@ class JointModel:
         floor = np.maximum(self.floor * ratio**2, LEAST_FLOOR)
         return replace(self, data=data, floor=floor, phi=self.phi * ratio, rho=self.rho * ratio)
 
-    def with_channels(self, data: BandData) -> JointModel:
-        """Add the last channels of the data, by regression on what the model's channels show."""
+    def with_channels(
+        self, data: BandData, within: Callable[[FloatArray], BoolArray] | None = None
+    ) -> JointModel:
+        """Add the last channels of the data, by regression on what the model's channels show.
+
+        ``within`` selects the frequencies in Hz that are used.
+        """
+        count = data.count if within is None else data.count * within(data.frequency)
         n, more = len(self.phi), data.scale.size - len(self.phi)
         h = response(self.f[:, None], self.zeta[:, None], self.data.frequency)
         # Expected cross spectra of a channel with the others, per unit of its part in each mode.
         unit = h.T[:, :, None] * (self.r @ np.swapaxes(self._b.conj(), 1, 2))
-        weighted = data.count[:, None, None] * (unit @ self._inverse)
+        weighted = count[:, None, None] * (unit @ self._inverse)
         seen = data.matrix[:, n:, :n]
         if data.foreign is not None:
             seen = seen - data.foreign[:, n:, :n]

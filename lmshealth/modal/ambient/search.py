@@ -10,7 +10,7 @@ is proportional to their number.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import comb
 
-from lmshealth._private.arrays import ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.hints import candidates_at
 from lmshealth.modal.ambient.joint_model import (
@@ -43,7 +43,7 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 _BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
 _MOST_HARMONICS = 6
 # Channels that are searched together, and that are added to these at a time.
-_FIRST, _MORE = 6, 6
+_FIRST, _MORE = 8, 8
 # Of these, whose modes are not all refined, a residual shows a further mode from a larger gain on.
 _CLEARLY = 3.0
 # A pole at a line that is narrower than so many of its widths is what masking left of it.
@@ -124,14 +124,9 @@ def search(
         fewer = {first[k] for k in range(len(first)) if k not in kept}
         spectra = spectra.select([c for c in range(len(spectra.channels)) if c not in fewer])
         first = _informative(spectra, low, high)
-    model = _without_splits(model, len(hints)) if hints else model
     if len(first) < len(spectra.channels):
-        harmonics = tuple(one.seen_by(first, spectra.longest) for one in harmonics)
-        for one in harmonics:
-            spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
-        model, used = _of_all_channels(model, spectra, first, low, high)
-        after = spectra.select(used)
-        harmonics = tuple(one.of_channels(used) for one in harmonics)
+        model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
+    model = _without_splits(model, len(hints)) if hints else model
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
@@ -180,19 +175,36 @@ def _informative(spectra: LogSpectra, low: float, high: float) -> list[int]:
 
 
 def _of_all_channels(
-    model: JointModel, spectra: LogSpectra, first: list[int], low: float, high: float
-) -> tuple[JointModel, list[int]]:
+    model: JointModel,
+    harmonics: tuple[Harmonic, ...],
+    spectra: LogSpectra,
+    first: list[int],
+    band: tuple[float, float],
+) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra]:
     """Add the channels to a model of the first ones, with the modes that only they show.
 
-    Returns also which channels the modes explain.
+    Returns also the harmonics in all channels that the modes explain, and the spectra of these
+    without the harmonics.
     """
     poles = zip(model.f.tolist(), model.zeta.tolist(), model.phi.T + 0j, strict=True)
-    whole = _bin(spectra, [Candidate(*pole, 1.0) for pole in poles], low, high)
-    model = model.on(whole.of_channels(first))
+    candidates = [Candidate(*pole, 1.0) for pole in poles]
     n, order = len(first), list(first)
-    others = [c for c in range(whole.scale.size) if c not in first]
-    for start in range(0, len(others), _MORE):
-        added = others[start : start + _MORE]
+    others = [c for c in range(len(spectra.channels)) if c not in first]
+    batches = [others[start : start + _MORE] for start in range(0, len(others), _MORE)]
+    plain = _bin(spectra, candidates, *band)
+    alone = model.on(plain.of_channels(first))
+    columns = [np.zeros(len(spectra.channels), dtype=complex) for _ in harmonics]
+    for one, column in zip(harmonics, columns, strict=True):
+        column[first] = one.vector
+        for added in batches:
+            part = alone.with_channels(plain.of_channels([*first, *added]), _beside(harmonics))
+            column[added] = one.seen_by(part)[n:]
+    harmonics = tuple(one.along(v) for one, v in zip(harmonics, columns, strict=True))
+    for one in harmonics:
+        spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
+    whole = _bin(spectra, candidates, *band)
+    model = model.on(whole.of_channels(first))
+    for added in batches:
         part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
         part = part.refined(6)
         for _ in range(_ROUNDS):
@@ -204,8 +216,14 @@ def _of_all_channels(
         order += [added[k - n] for k in explained]
         part = part.of_channels([*range(n), *explained])
         model = model.joined(part, n, whole.of_channels(order))
-    place = np.argsort(order).tolist()
-    return model.of_channels(place), sorted(order)
+    used = sorted(order)
+    harmonics = tuple(one.along(one.vector[used]) for one in harmonics)
+    return model.of_channels(np.argsort(order).tolist()), harmonics, spectra.select(used)
+
+
+def _beside(harmonics: Sequence[Harmonic]) -> Callable[[FloatArray], BoolArray]:
+    """Return a function of frequency in Hz that is true outside the bands of harmonics."""
+    return lambda f: ~np.any([(f >= one.low) & (f <= one.high) for one in harmonics], axis=0)
 
 
 def _explain(

@@ -43,24 +43,24 @@ class Harmonic:
     amplitude: float  # root mean square times √2 in the channel that shows it best, m/s²
     channel: int
     vector: ComplexArray  # column v of its covariance v v*, in (m/s²)/Hz^½, (n_channels,)
-    first: int  # ordinate of the recording at which its signal begins
-    signal: ComplexArray  # its transform, of which the channels show ``vector`` times
 
     def expected(self, frequency: FloatArray) -> ComplexArray:
         """Return the column in its band and zero elsewhere, ``(n, n_channels, 1)``."""
         within = (frequency >= self.low) & (frequency <= self.high)
         return np.asarray(within[:, None, None] * self.vector[:, None])
 
-    def seen_by(self, channels: Sequence[int], recording: CrossSpectrum) -> Harmonic:
-        """Return it for all channels of a recording, of which it was found in ``channels``."""
-        seen = recording.transforms[0, self.first : self.first + self.signal.size]
-        vector = self.signal.conj() @ seen / np.sum(np.abs(self.signal) ** 2)
-        vector[list(channels)] = self.vector
-        return replace(self, vector=vector, channel=channels[self.channel])
+    def seen_by(self, model: JointModel) -> ComplexArray:
+        """Return its column for the channels of a model, of which it was found in the first ones.
 
-    def of_channels(self, kept: Sequence[int]) -> Harmonic:
-        """Return it for some of its channels."""
-        vector = self.vector[list(kept)]
+        The model has no expectation of it.
+        """
+        f, n = model.data.frequency, self.vector.size
+        phi = _direction(model, model.expected, (f >= self.low) & (f <= self.high))
+        phi = phi * model.data.scale
+        return np.asarray(phi * np.vdot(phi[:n], self.vector) / np.vdot(phi[:n], phi[:n]))
+
+    def along(self, vector: ComplexArray) -> Harmonic:
+        """Return it for other channels, with its column for these."""
         best = int(np.abs(vector).argmax())
         amplitude = self.amplitude * float(abs(vector[best] / self.vector[self.channel]))
         return replace(self, vector=vector, channel=best, amplitude=amplitude)
@@ -105,7 +105,7 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
     rest = model.subset(~own)
     expected = rest.expected
     near = np.abs(model.data.frequency / f0 - 1) < max(0.01, model.zeta[i])
-    phi = _direction(model, expected, near, shape[:, i])
+    phi = _direction(model, expected, near) if near.any() else shape[:, i].astype(complex)
     gain = np.linalg.inv(expected) @ phi
     precision = np.real(gain @ phi.conj())
     weight = gain / precision[:, None]  # passes the direction unchanged, with the least of the rest
@@ -137,17 +137,11 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
         float(np.sqrt(2 * power.sum() / recording.duration) * abs(physical[channel])),
         channel,
         size * physical,
-        int(first) + within.start,
-        z[within] / size,
     )
 
 
-def _direction(
-    model: JointModel, expected: ComplexArray, near: np.ndarray, start: FloatArray
-) -> ComplexArray:
-    """Return the direction that exceeds the rest most, of unit norm."""
-    if not near.any():
-        return start.astype(complex)
+def _direction(model: JointModel, expected: ComplexArray, near: BoolArray) -> ComplexArray:
+    """Return the direction that exceeds the rest most near a frequency, of unit norm."""
     expected, matrix, count = expected[near], model.data.matrix[near], model.data.count[near]
     white = np.linalg.solve(expected, matrix)
     strongest = expected[np.argmax(np.trace(white, axis1=1, axis2=2).real * count)]
