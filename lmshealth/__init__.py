@@ -12,17 +12,17 @@ from lmshealth._private.result import Result as _Result
 
 if TYPE_CHECKING:
     from lmshealth.batch.analysis import analyse as analyse
-    from lmshealth.batch.assess import assess as assess
     from lmshealth.batch.ingest import Settings as Settings
     from lmshealth.batch.run import run as run
     from lmshealth.errors import LmshealthError as LmshealthError
     from lmshealth.io.reading import read_log as read_log
     from lmshealth.life.health import infer as infer
     from lmshealth.life.health import infer_drifts as infer_drifts
-    from lmshealth.life.maintenance_decision import decide as decide
     from lmshealth.life.posterior.fit import fit_life as fit_life
     from lmshealth.life.prognosis import prognose as prognose
     from lmshealth.life.verdict import judge as judge
+    from lmshealth.machine.assessment import assess as assess
+    from lmshealth.machine.service import decide as decide
     from lmshealth.modal.free_decay.identification import identify_decays as identify_decays
     from lmshealth.modal.frf.identification import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
@@ -41,9 +41,9 @@ _HOMES = {
     "LogEstimates": "modal.log_estimates",
     "Settings": "batch.ingest",
     "analyse": "batch.analysis",
-    "assess": "batch.assess",
+    "assess": "machine.assessment",
     "build_history": "tracking.history",
-    "decide": "life.maintenance_decision",
+    "decide": "machine.service",
     "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
     "identify_decays": "modal.free_decay.identification",

@@ -5,15 +5,14 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import find_logs, read_manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
+from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
@@ -83,5 +82,5 @@ def analyse(
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")
-    made = assess(found, stage, work, epochs=epochs, seed=seed)
+    made = assess(found, stage, work=work, epochs=epochs, seed=seed)
     return replace(made, refused=(*refused, *made.refused))

@@ -63,18 +63,6 @@ SHORTEST_SECRET = 4
 """Least length of a value of a URL's options that is masked in messages. Shorter values are
 numbers and switches, which occur everywhere in a message."""
 
-JSON_SCHEMA = 2
-"""Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,
-and what alerts get. It changes when a key or a value changes its meaning or is removed."""
-
-FAILURE_PROBABILITY = 0.5
-"""Probability that a limit is reached now, from which a machine has the state ``FAILURE``: it is
-more probable than not that the machine is outside what its description allows."""
-
-SERVICE_LEAD_DAYS = 30
-"""Days before the service date from which a machine has the state ``MAINTENANCE_REQUIRED``: time to
-plan a service."""
-
 ALERT_TIMEOUT_S = 60
 """Seconds (s) that an alert command may take before it is killed with its children."""
 

@@ -14,10 +14,12 @@ from lmshealth._private.files import replacing, write_text
 from lmshealth._private.serialize import pack, unpack
 from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch.assess import LogRows, reason_if_failed
-from lmshealth.batch.status import Status, coming_states, make_status, points
+from lmshealth.batch.dashboard import points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.batch.workers import Pool
-from lmshealth.report.assessment import Assessment, Summary, summarise
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.status import Status, coming_states, make_status
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT

@@ -18,13 +18,13 @@ from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Progress, Resources, Settings, Work, ingest
 from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
-from lmshealth.batch.status import Change, Status
 from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.io.refusal import visible
-from lmshealth.report.assessment import Summary
+from lmshealth.machine.status import Change, Status
+from lmshealth.machine.summary import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage

@@ -32,11 +32,11 @@ from sqlalchemy.schema import CreateTable
 from lmshealth._private.serialize import VERSION, fingerprint, pack, unpack
 from lmshealth.batch import constants
 from lmshealth.batch.addresses import shown_address, without_secrets
-from lmshealth.batch.status import Change, Status
 from lmshealth.errors import LmshealthError
 from lmshealth.io.log import Refusal
+from lmshealth.machine.status import Change, Status
+from lmshealth.machine.summary import Summary
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Summary
 
 Outcome = LogEstimates | tuple[Refusal, ...]
 """Result of a log: its modal estimates, or why it was refused."""

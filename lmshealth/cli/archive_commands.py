@@ -8,7 +8,6 @@ from typing import Any
 
 import click
 
-from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult
@@ -18,6 +17,7 @@ from lmshealth.batch.store import Store
 from lmshealth.batch.watch import watch as watch_folder
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import LmshealthError
+from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.constants import TERMINAL_ROWS
 from lmshealth.report.rendering import write_pdfs
 from lmshealth.stage.description import Stage
@@ -62,7 +62,7 @@ def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
     counts = ["n_logs", "n_refused", "n_remembered", "n_unlisted", "n_unread"]
     names = [*counts, "failed", "unsent", "notes", "changes"]
-    head = {"schema": constants.JSON_SCHEMA, "report": str(result.index.absolute())}
+    head = {"schema": JSON_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 

@@ -46,7 +46,7 @@ class LawWeight:
 class Prognosis(Result):
     """Remaining useful life of one machine, of which `n` health parameters have a limit.
 
-    `lmshealth.life.maintenance_decision.probability_before` has the probability by a day.
+    `lmshealth.machine.service.probability_before` has the probability by a day.
     """
 
     stage: str  # identity of the machine

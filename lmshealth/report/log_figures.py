@@ -16,6 +16,7 @@ from scipy.stats import gamma
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
+from lmshealth._private.names import spell
 from lmshealth.errors import BadLog
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
@@ -30,7 +31,6 @@ from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summa
 from lmshealth.modal.targets import choose_channels
 from lmshealth.report import figures, tables
 from lmshealth.report.rendering import render
-from lmshealth.report.text import spell
 from lmshealth.signal.segments import select_segments
 from lmshealth.signal.spectra import LogSpectra, ResonanceRange, cross_spectra
 from lmshealth.signal.spectral_lines import expected_orders

@@ -48,9 +48,10 @@ from lmshealth.life.posterior import fit as life_posterior
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.prognosis import prognose
+from lmshealth.machine.assessment import Assessment, LifeState, assess_from
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.identification import AmbientReading, read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
@@ -244,7 +245,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 ) -> None:
     """With truth.csv deleted a second run remembers every log and result: the same bytes."""
     (done.logs / "truth.csv").unlink()
-    monkeypatch.setattr(assessing, "_assess", None)  # nothing may be inferred again
+    monkeypatch.setattr(assessing, "assess_from", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
     # The broken file is identified by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
@@ -367,7 +368,7 @@ def run_twice(
 
     count(ingesting, "content_digest", "hashed", lambda path: path.name)
     count(ingesting, "read_log", "read", lambda path: path.name)
-    count(assessing, "_assess", "assessed", lambda _, machine, __: machine.name)
+    count(assessing, "assess_from", "assessed", lambda _, machine, __: machine.name)
     count(outputs, "make_page", "drawn", lambda found, *_: found.history.stage)
     patch.setattr(constants, "OTHERS_POLL_S", 0.05)
     patch.setattr(constants, "SETTLED_S", -1)
@@ -702,14 +703,14 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     """It is named with the reason, and the others are reported."""
     logs = write_archive(tmp_path / "logs", 2)
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
-    whole = assessing._assess
+    whole = assess_from
 
     def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         if readings[0].metadata.stage == "other-A":
             raise ZeroDivisionError("a mistake of ours")
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "_assess", fail)
+    monkeypatch.setattr(assessing, "assess_from", fail)
     result = run(logs, [modes_only], tmp_path / "out")
     assert [row.identity for row in result.rows] == ["test-A"]
     assert set(result.failed) == {"other-A"}
@@ -731,13 +732,13 @@ def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) 
 def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List the machines that are assessed and not remembered."""
     machines: list[str] = []
-    whole = assessing._assess
+    whole = assess_from
 
     def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         machines.append(str(readings[0].metadata.stage))
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "_assess", listen)
+    monkeypatch.setattr(assessing, "assess_from", listen)
     return machines
 
 
@@ -972,7 +973,7 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
-    stored = assessing.StoredLife(start, 15, "healthy", "", ())
+    stored = LifeState(start, 15, "healthy", "", ())
     job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(stored), 40, prior, ())
     made = assessing._update(job)
     assert isinstance(made, PackedAssessment)

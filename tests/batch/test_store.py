@@ -25,7 +25,7 @@ from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch import store as store_module
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.status import Change, Status, compare, make_status, points
+from lmshealth.batch.dashboard import points
 from lmshealth.batch.store import (
     Announced,
     Identified,
@@ -38,10 +38,12 @@ from lmshealth.batch.store import (
     unpack_or_none,
 )
 from lmshealth.io.log import Metadata, Refusal
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.status import Change, Status, compare, make_status
+from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
-from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from studies.harness.servers import Postgres, wait_until

@@ -15,19 +15,18 @@ from msgspec import structs
 
 from lmshealth import examples
 from lmshealth._private.arrays import FloatArray
-from lmshealth.batch.assess import assess
-from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior
-from lmshealth.life.maintenance_decision import Service, probability_before
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.assessment import Assessment, assess
+from lmshealth.machine.service import Service, probability_before
+from lmshealth.machine.status import coming_states, make_status
+from lmshealth.machine.summary import summarise as summarise_machine
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.report import figures as plots
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.assessment import summarise as summarise_machine
 from lmshealth.report.fleet_page import write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.text import GAP, plain

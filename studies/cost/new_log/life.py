@@ -18,14 +18,14 @@ import numpy as np
 
 from lmshealth._private.serialize import fingerprint
 from lmshealth.batch import run as running
-from lmshealth.batch.assess import Machine, assess, assess_all
+from lmshealth.batch.assess import Machine, assess_all
 from lmshealth.batch.ingest import Progress, Resources
 from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
 from lmshealth.batch.workers import processes
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from studies.harness.cost import cpu_s, memory_bytes
