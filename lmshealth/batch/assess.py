@@ -6,11 +6,11 @@ import logging
 from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
-from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
+from lmshealth.batch.cache import Cached, Resources
+from lmshealth.batch.ingest import LogKey, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
 from lmshealth.errors import LmshealthError
 from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
@@ -87,9 +87,14 @@ def assess_all(
     fetch(machines)
     left = [machine for machine in machines if machine.name not in known]
     resources.progress("assessing", len(known), len(machines))
-    work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
-    mapper = partial(resources.pool.map_unordered, _assess_packed, on_crash=lambda _, why: why)
-    for k, ((machine, *_), made) in enumerate(work.divided(left, store, mapper), start=1):
+    assessing: Cached[Machine, _Job, PackedAssessment | str] = Cached(
+        _assess_packed,
+        lambda _, why: why,
+        key=lambda one: fingerprint(one.name, one.key),
+        fetch=fetch,
+        job=job,
+    )
+    for k, ((machine, *_), made) in enumerate(assessing.values(left, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         else:
@@ -213,9 +218,10 @@ def apply_fleet_priors(
     left = [one for one in updates if one[1] not in known]
     if left:
         resources.progress("fleet priors", 0, len(left))
-    work: Work[_Update, _UpdateJob] = Work(lambda one: one[1], job, fetch)
-    mapper = partial(resources.pool.map_unordered, _update, on_crash=lambda _, why: why)
-    for k, (one, made) in enumerate(work.divided(left, store, mapper), start=1):
+    updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
+        _update, lambda _, why: why, key=lambda one: one[1], fetch=fetch, job=job
+    )
+    for k, (one, made) in enumerate(updating.values(left, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(one.machine, one.key, made)
             keys[one.machine] = one.key

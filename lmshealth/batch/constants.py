@@ -35,8 +35,11 @@ ANSWER_TIMEOUT_S = 60
 """Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
 end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
-SCHEMA = 9
-"""Version of the tables of a store, part of their names: older tables are not read."""
+SCHEMA = 10
+"""Version of the table of values, part of its name: tables of other versions are not read."""
+
+DASHBOARD_SCHEMA = 9
+"""Version of the tables of dashboards, part of their names."""
 
 SETTLED_S = 10
 """Seconds (s) after its last change from which the digest of a file may be kept: clocks of file

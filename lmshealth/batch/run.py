@@ -5,7 +5,6 @@ from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -16,8 +15,10 @@ from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import NOT_LISTED, Ingested, Progress, Resources, Settings, Work, ingest
-from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
+from lmshealth.batch.cache import Cached, Progress, Resources
+from lmshealth.batch.dashboard import put_points, put_status
+from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
+from lmshealth.batch.outputs import MachineOutput, MachineRecord, output_or_reason, write_tables
 from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -120,7 +121,7 @@ def run(
         moment = datetime.now(UTC)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
-            store.put_status(statuses, changes, moment)
+            put_status(store, statuses, changes, moment)
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
@@ -166,10 +167,11 @@ def report(
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
         records = (_record(one.machine, one.key, files[one.machine], store) for one in present)
-        for record, output in write_pages(records, pool, out):
+        for record, output in pool.map_unordered(output_or_reason, records, lambda _, why: why):
             if isinstance(output, str):
                 failed[record.machine] = output
             elif output is not None:
+                write_text(out / record.file, output.page)
                 rows[record.machine] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
@@ -289,7 +291,10 @@ def _outputs(
     resources: Resources,
     out: Path,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write pages as `write_pages` does; those of unchanged results are taken from the store."""
+    """Write the pages of machines; those of unchanged results are taken from the store.
+
+    A machine whose assessment is missing, or cannot be decoded, is left out.
+    """
     store, missing = resources.store, dict[str, tuple[Machine, str]]()
     for machine in machines:
         name = machine.name
@@ -309,14 +314,20 @@ def _outputs(
         rows = packed_rows(missing[name][0], store)
         return _record(name, keys[name], files[name], store, rows)
 
-    work: Work[str, MachineRecord] = Work(lambda name: missing[name][1], job, fetch)
+    drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
+        output_or_reason,
+        lambda _, why: why,
+        key=lambda name: missing[name][1],
+        fetch=fetch,
+        job=job,
+    )
     left = set(missing)
-    mapper = partial(write_pages, pool=resources.pool, out=out)
-    for record, drawn in work.divided(list(missing), store, mapper):
+    for record, drawn in drawing.values(list(missing), resources):
         name = record.machine
         left.remove(name)
         if isinstance(drawn, MachineOutput):
-            store.put_points(name, drawn.points)
+            write_text(out / record.file, drawn.page)
+            put_points(store, name, drawn.points)
             store.put_part(name, missing[name][1], pack(drawn))
         if drawn is not None:
             yield name, drawn

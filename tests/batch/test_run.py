@@ -48,6 +48,7 @@ from lmshealth.life.posterior import fit as life_posterior
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.prognosis import prognose
+from lmshealth.machine import assessment as machine_assessment
 from lmshealth.machine.assessment import Assessment, LifeState, assess_from
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.identification import AmbientReading, read_ambient
@@ -65,6 +66,9 @@ from tests.signals import sine, write_archive, write_archive_stage, write_log
 __all__ = ["make"]
 
 N_LOGS = 6
+
+COUNT = f"SELECT count(*) FROM values_{constants.SCHEMA} WHERE kind = '{{}}'"
+UPDATE = f"UPDATE values_{constants.SCHEMA} SET content = x'00' WHERE kind = 'assessed'"
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -368,7 +372,7 @@ def run_twice(
 
     count(ingesting, "content_digest", "hashed", lambda path: path.name)
     count(ingesting, "read_log", "read", lambda path: path.name)
-    count(assessing, "assess_from", "assessed", lambda _, machine, __: machine.name)
+    count(assessing, "_assess_packed", "assessed", lambda job: job[0].name)
     count(outputs, "make_page", "drawn", lambda found, *_: found.history.stage)
     patch.setattr(constants, "OTHERS_POLL_S", 0.05)
     patch.setattr(constants, "SETTLED_S", -1)
@@ -448,8 +452,8 @@ def test_two_processes_on_a_server_divide_an_archive(
 
 
 def _ask_count(store: Store) -> Any:
-    with store._begin() as connection:
-        return connection.scalar(text(f"SELECT count(*) FROM identified_{constants.SCHEMA}"))
+    with store.transaction() as connection:
+        return connection.scalar(text(COUNT.format("identified")))
 
 
 def test_work_that_another_run_leaves_is_done(
@@ -636,7 +640,7 @@ def test_an_assessment_that_cannot_be_read_is_made_again(
     run(logs, [modes_only], out)
     before = tables(out), pages(out)
     with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
-        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
+        file.execute(UPDATE)
     run(logs, [modes_only], out)
     assert assessed == ["test-A"] * 2
     assert (tables(out), pages(out)) == before
@@ -667,13 +671,13 @@ def test_a_fleet_update_that_cannot_be_read_is_repeated(
         lambda machines, store: ((machine, learned, ()) for machine in machines),
     )
     # Without parameters there is nothing to fit.
-    monkeypatch.setattr(assessing, "fit_life", lambda *_, **__: None)
-    monkeypatch.setattr(assessing, "_with_life", lambda made, *_: made)
+    monkeypatch.setattr(machine_assessment, "fit_life", lambda *_, **__: None)
+    monkeypatch.setattr(machine_assessment, "_with_life", lambda made, *_: made)
     run(logs, [modes_only], tmp_path / "out")
     before = pages(tmp_path / "out")
     with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
-        (n,) = file.execute(f"SELECT count(*) FROM assessed_{constants.SCHEMA}").fetchone()
-        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
+        (n,) = file.execute(COUNT.format("assessed")).fetchone()
+        file.execute(UPDATE)
     assert n == 2
     result = run(logs, [modes_only], tmp_path / "out")
     assert result.failed == {}
