@@ -16,7 +16,17 @@ import lmshealth
 MOST_NAMES = 20
 # Of these nothing is needed to import the package or to show help, and all take their time.
 HEAVY = (
-    *("pandas", "scipy", "matplotlib", "sqlalchemy", "h5py", "pyarrow", "arviz_base", "emcee"),
+    *(
+        "pandas",
+        "scipy",
+        "matplotlib",
+        "sqlalchemy",
+        "loky",
+        "h5py",
+        "pyarrow",
+        "arviz_base",
+        "emcee",
+    ),
     *("filterpy", "control", "jinja2", "dask", "distributed", "weasyprint", "xarray"),
 )
 # What a user's own program may look like: every name is used, and every result has its type.
@@ -131,6 +141,26 @@ def test_import_leaves_heavy_libraries_alone(what: str) -> None:
     """What a name or a command needs comes with it, and not before."""
     told = _run("-c", f"import sys, {what}; print(*sys.modules)")
     assert not set(told.split()) & set(HEAVY)
+
+
+@pytest.mark.parametrize("command", ["", "run", "watch", "report"])
+def test_help_leaves_what_runs_alone(command: str) -> None:
+    """The list of commands, and help of those on archives, need no store, workers or statistics."""
+    code = (
+        "import contextlib, io, sys\nfrom lmshealth.cli.main import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()) as text:\n"
+        f"    main({[*filter(None, [command]), '--help']}, standalone_mode=False)\n"
+        "assert 'Usage' in text.getvalue()\nprint(*sys.modules)"
+    )
+    assert not set(_run("-c", code).split()) & {"scipy.stats", "sqlalchemy", "loky", "matplotlib"}
+
+
+def test_an_assessment_needs_no_store_and_no_workers() -> None:
+    """Machines are assessed by a pure function, without database, processes and pages."""
+    told = _run(
+        "-c", "import sys, lmshealth; lmshealth.assess, lmshealth.decide; print(*sys.modules)"
+    )
+    assert not set(told.split()) & {"sqlalchemy", "loky", "jinja2", "matplotlib"}
 
 
 @pytest.mark.slow

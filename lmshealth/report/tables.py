@@ -1,32 +1,36 @@
 """Tables of a run and of single logs, with the columns of the public contract (units in names)."""
 
+from __future__ import annotations
+
 import csv
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, astuple
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
-from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.notices import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
-from lmshealth.modal.frf.identification import FrfReading
-from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.mode_shapes import ModeShapes
-from lmshealth.modal.modes import Modes
-from lmshealth.signal.acceleration_levels import Growth, Magnitude
-from lmshealth.signal.following_error import FollowingError
-from lmshealth.signal.spectral_lines import Line
-from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.stage.planning import Plan
-from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Track, mode_columns
+
+if TYPE_CHECKING:  # so that help needs no scipy.stats
+    from lmshealth.machine.assessment import Assessment
+    from lmshealth.modal.frf.identification import FrfReading
+    from lmshealth.modal.log_estimates import LogEstimates
+    from lmshealth.modal.mode_shapes import ModeShapes
+    from lmshealth.modal.modes import Modes
+    from lmshealth.signal.acceleration_levels import Growth, Magnitude
+    from lmshealth.signal.following_error import FollowingError
+    from lmshealth.signal.spectral_lines import Line
+    from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
+    from lmshealth.stage.planning import Plan
+    from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
