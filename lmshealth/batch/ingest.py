@@ -60,7 +60,8 @@ class Settings:
     seed : int
         Of all random numbers.
     columns : ColumnMap or None
-        How logs are read; None where their columns are those of the log contract.
+        How logs are read (`lmshealth.io.column_map.column_map`); None where their columns are those
+        of the log contract.
     max_memory : float
         Most memory in bytes that reading a log may take.
     latest : datetime or None

@@ -57,9 +57,9 @@ class RunResult:
 
 
 def run(
-    folder: Path,
+    folder: str | Path,
     stages: Sequence[Stage],
-    out: Path,
+    out: str | Path,
     settings: Settings = Settings(),
     progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
@@ -67,11 +67,11 @@ def run(
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         Read recursively, with its ``manifest.csv`` and ``maintenance.csv``.
     stages : sequence of Stage
         Each log is read with the first description that matches it.
-    out : Path
+    out : str or Path
         Folder of the output, created if needed.
     settings : Settings
         Store, workers, seed and how logs are read.
@@ -97,13 +97,14 @@ def run(
     >>> noise = np.random.default_rng(1).standard_normal(20_000)
     >>> np.savetxt("logs/one.csv", noise, header=chr(10).join(head), comments="")
     >>> stage = lmshealth.load_stage("lms-y")
-    >>> result = lmshealth.run(Path("logs"), [stage], Path("result"))
+    >>> result = lmshealth.run("logs", [stage], "result")
     >>> result.n_logs, result.n_refused, result.index.name
     (1, 0, 'index.html')
     >>> refused = pd.read_csv("result/refused.csv")
     >>> dict(zip(refused["mode"], refused["reason"]))
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
+    folder, out = Path(folder), Path(out)
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
@@ -150,7 +151,7 @@ def run(
 
 def report(
     store: Store,
-    out: Path,
+    out: str | Path,
     settings: Settings = Settings(),
     progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
@@ -158,6 +159,7 @@ def report(
 
     `StoreError` if there is no assessment that this version can decode.
     """
+    out = Path(out)
     _prepare(out)
     present = store.published()
     files = file_names([one.machine for one in present])
