@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import date, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
@@ -70,6 +70,8 @@ class Settings:
         Whether symbolic links out of the folder of logs are followed.
     alerts : Alerts
         Which changes since the last run are delivered, and how.
+    today : date or None
+        Day whose end statuses are judged at, for runs that repeat; None for the moment of the run.
     growing : frozenset of Path
         Files that are left to a later run.
 
@@ -93,6 +95,7 @@ class Settings:
     latest: datetime | None = None
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
+    today: date | None = None
     growing: frozenset[Path] = frozenset()
 
     def pool(self) -> AbstractContextManager[Pool]:

@@ -4,7 +4,7 @@ from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime, time
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -119,7 +119,7 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         done, made, tables, excluded = _report(usable, refused, resources, out)
-        moment = datetime.now(UTC)
+        moment = _moment(settings.today)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
             put_status(store, statuses, changes, moment)
@@ -186,6 +186,11 @@ def report(
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
     )
+
+
+def _moment(today: date | None) -> datetime:
+    """Return the moment at which statuses are judged: the end of a day, by default now (UTC)."""
+    return datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
 
 
 def _prepare(out: Path) -> None:

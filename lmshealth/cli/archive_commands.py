@@ -89,6 +89,7 @@ def _errors(result: RunResult) -> list[str]:
     "run logs/ --stage lms-y --out result/ --silent-days 7 --alert-command 'mail -s lms me@host'",
 )
 @_run_options
+@options.TODAY
 @click.pass_context
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any

@@ -194,6 +194,12 @@ ALLOW_FUTURE = click.option(
     callback=lambda ctx, option, given: LAST_MOMENT if given else None,
     help="Accept logs and maintenance that are dated after tomorrow.",
 )
+TODAY = click.option(
+    "--today",
+    metavar="DAY",
+    callback=lambda ctx, option, given: None if given is None else day(given),
+    help="Judge status and silence as on this day, for runs that repeat; default now.",
+)
 PART = click.option(
     "--part",
     type=click.Choice(PARTS),

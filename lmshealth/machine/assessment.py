@@ -113,7 +113,10 @@ class Assessment:
         return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
-        """Return a sort key: days until the service; without a verdict before safe machines."""
+        """Return a sort key: day of the service; without a verdict before safe machines.
+
+        Days of the calendar: a machine whose last log is old may be overdue.
+        """
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
             return (0 if self.alarmed else 1), 0.0, 0.0, identity
@@ -121,9 +124,9 @@ class Assessment:
             return 1, 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
-        days = service.wait
-        group = 2 if verdict == "healthy" and np.isinf(days) else 0
-        return group, days, float(self.prognosis.beyond_horizon()[-1]), identity
+        day = np.inf if service.by is None else float(service.by.toordinal())
+        group = 2 if verdict == "healthy" and service.kind == "later" else 0
+        return group, day, float(self.prognosis.beyond_horizon()[-1]), identity
 
 
 def assess(

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -33,6 +33,7 @@ from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
+from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
@@ -1009,3 +1010,16 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     few = assessing._update(job)
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None
+
+
+def test_a_run_as_on_a_day_repeats(tmp_path: Path, modes_only: Stage) -> None:
+    """Status and silence are those of the end of that day, whenever the run is; pages stay."""
+    logs = write_archive(tmp_path / "logs", 2)  # the last one of 11 January 2024
+    days, found = {"a": date(2024, 1, 15), "b": date(2024, 1, 15), "c": date(2024, 2, 1)}, {}
+    for name, today in days.items():
+        settings = Settings(today=today, alerts=Alerts(silent_days=7))
+        (found[name],) = run(logs, [modes_only], tmp_path / name, settings).statuses
+    assert (found["a"].silent, found["c"].silent) == (False, True)
+    status, other, later = ((tmp_path / name / "status.json").read_bytes() for name in "abc")
+    assert status == other != later
+    assert pages(tmp_path / "a") == pages(tmp_path / "c")

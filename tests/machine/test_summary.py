@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
@@ -96,6 +97,17 @@ def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
     assert summary(assessment).step.kind in ("plan", "service-now")
     healthy = summary(make("sound", wear_km=400000, floor=0.98))
     assert summary(assessment).urgency < found.urgency < healthy.urgency
+
+
+def test_machines_are_sorted_by_the_calendar(make: Maker) -> None:
+    """A service on an earlier day comes first, whatever the days since the last log are."""
+    assessment = make()
+    service = assessment.service()
+    overdue = replace(service, kind="by", by=date(2026, 1, 1), wait=90.0)
+    due = replace(service, kind="by", by=date(2026, 3, 1), wait=10.0)
+    later = replace(service, kind="later", by=None, wait=np.inf)
+    keys = [assessment.urgency(one) for one in (overdue, due, later)]
+    assert keys == sorted(keys) and len(set(keys)) == 3
 
 
 def test_gauges_and_limits_are_of_the_same_draws(make: Maker) -> None:
