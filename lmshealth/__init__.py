@@ -12,24 +12,43 @@ from lmshealth._private.result import Result as _Result
 
 if TYPE_CHECKING:
     from lmshealth.batch.analysis import analyse as analyse
-    from lmshealth.batch.assess import assess as assess
     from lmshealth.batch.ingest import Settings as Settings
+    from lmshealth.batch.run import RunResult as RunResult
     from lmshealth.batch.run import run as run
     from lmshealth.errors import LmshealthError as LmshealthError
+    from lmshealth.io.log import Log as Log
+    from lmshealth.io.log import Refusal as Refusal
     from lmshealth.io.reading import read_log as read_log
+    from lmshealth.life.health import Health as Health
     from lmshealth.life.health import infer as infer
     from lmshealth.life.health import infer_drifts as infer_drifts
-    from lmshealth.life.maintenance_decision import decide as decide
+    from lmshealth.life.posterior.fit import LifePosterior as LifePosterior
     from lmshealth.life.posterior.fit import fit_life as fit_life
+    from lmshealth.life.prognosis import Prognosis as Prognosis
     from lmshealth.life.prognosis import prognose as prognose
+    from lmshealth.life.verdict import Verdict as Verdict
     from lmshealth.life.verdict import judge as judge
+    from lmshealth.machine.assessment import Assessment as Assessment
+    from lmshealth.machine.assessment import assess as assess
+    from lmshealth.machine.saving import load as load
+    from lmshealth.machine.saving import save as save
+    from lmshealth.machine.service import Service as Service
+    from lmshealth.machine.service import decide as decide
+    from lmshealth.machine.status import Status as Status
+    from lmshealth.machine.summary import Summary as Summary
     from lmshealth.modal.deterministic.free_decays import identify_decays as identify_decays
+    from lmshealth.modal.deterministic.frequency_response import FrfReading as FrfReading
     from lmshealth.modal.deterministic.frequency_response import read_frf as read_frf
     from lmshealth.modal.identification import identify as identify
     from lmshealth.modal.log_estimates import LogEstimates as LogEstimates
+    from lmshealth.modal.modes import Modes as Modes
+    from lmshealth.stage.description import Stage as Stage
     from lmshealth.stage.description import load_stage as load_stage
+    from lmshealth.stage.planning import Plan as Plan
     from lmshealth.stage.planning import plan as plan
+    from lmshealth.tracking.history import History as History
     from lmshealth.tracking.history import build_history as build_history
+    from lmshealth.tracking.track import Track as Track
     from lmshealth.tracking.track import track as track
 
 __version__ = version("lmshealth")
@@ -41,25 +60,48 @@ _HOMES = {
     "LogEstimates": "modal.log_estimates",
     "Settings": "batch.ingest",
     "analyse": "batch.analysis",
-    "assess": "batch.assess",
+    "assess": "machine.assessment",
     "build_history": "tracking.history",
-    "decide": "life.maintenance_decision",
+    "decide": "machine.service",
     "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
     "identify_decays": "modal.deterministic.free_decays",
     "infer": "life.health",
     "infer_drifts": "life.health",
     "judge": "life.verdict",
+    "load": "machine.saving",
     "load_stage": "stage.description",
     "plan": "stage.planning",
     "prognose": "life.prognosis",
     "read_frf": "modal.deterministic.frequency_response",
     "read_log": "io.reading",
     "run": "batch.run",
+    "save": "machine.saving",
     "track": "tracking.track",
 }
 
-__all__ = [*_HOMES]
+# Types of the results of these functions.
+_RESULTS = {
+    "Assessment": "machine.assessment",
+    "FrfReading": "modal.deterministic.frequency_response",
+    "Health": "life.health",
+    "History": "tracking.history",
+    "LifePosterior": "life.posterior.fit",
+    "Log": "io.log",
+    "Modes": "modal.modes",
+    "Plan": "stage.planning",
+    "Prognosis": "life.prognosis",
+    "Refusal": "io.log",
+    "RunResult": "batch.run",
+    "Service": "machine.service",
+    "Stage": "stage.description",
+    "Status": "machine.status",
+    "Summary": "machine.summary",
+    "Track": "tracking.track",
+    "Verdict": "life.verdict",
+}
+
+__all__ = [*_HOMES, *_RESULTS]
 
 
 def _draw(result: _Result, what: str, ax: Any) -> Any:
@@ -73,9 +115,10 @@ if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 
     def __getattr__(name: str) -> object:
         """Import a public name on first use."""
-        if name not in _HOMES:
+        homes = _HOMES | _RESULTS
+        if name not in homes:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+        found = getattr(import_module(f"{__name__}.{homes[name]}"), name)
         globals()[name] = found
         return found
 

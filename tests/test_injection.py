@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
+from lmshealth.batch.database import StoreError
 from lmshealth.batch.run import run
-from lmshealth.batch.store import Store, StoreError, default_url
+from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
 from lmshealth.report.fleet_page import file_names

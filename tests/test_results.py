@@ -12,9 +12,9 @@ from matplotlib.figure import Figure
 
 from lmshealth import examples
 from lmshealth._private.tables import TABLES
-from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, BadQuestion
 from lmshealth.io.log import Channel, Log, Metadata
+from lmshealth.machine.assessment import assess
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series

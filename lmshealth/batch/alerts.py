@@ -20,9 +20,10 @@ import msgspec
 
 from lmshealth._private.files import read_table, write_bytes
 from lmshealth.batch import constants
-from lmshealth.batch.status import Change, Fleet, Status, compare
 from lmshealth.batch.store import Announced, Store, Unsent
 from lmshealth.io.refusal import shown, visible
+from lmshealth.machine.constants import JSON_SCHEMA
+from lmshealth.machine.status import Change, Fleet, Status, compare
 
 FILE = "status.json"
 """Status of all machines in the folder of the output."""
@@ -137,7 +138,7 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
         with store.alone():
             unsent = waiting(name)  # another run may have delivered some meanwhile
             rows = [_row(one.change, by_stage[one.change.stage], out) for one in unsent]
-            content = {"schema": constants.JSON_SCHEMA, "changes": rows}
+            content = {"schema": JSON_SCHEMA, "changes": rows}
             why = run_command(command, msgspec.json.encode(content)) if rows else ""
             if why:
                 again = "are sent again by the next run with this option"

@@ -5,25 +5,24 @@ from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
 
-from lmshealth.batch.assess import assess
 from lmshealth.errors import BadLog, NotEnoughData
-from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.log import Refusal
-from lmshealth.io.manifest import find_logs, read_manifest, read_manifest_beside
+from lmshealth.io.column_map import ColumnsGiven, column_map
+from lmshealth.io.log import Log, Refusal
+from lmshealth.io.manifest import Manifest, find_logs, read_manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
+from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
 
 
 def analyse(
-    logs: str | Path | Iterable[str | Path],
+    logs: str | Path | Iterable[str | Path | Log],
     stage: Stage,
     *,
-    columns: ColumnMap | None = None,
+    columns: ColumnsGiven | None = None,
     latest: datetime | None = None,
     epochs: int = 40,
     seed: int = 0,
@@ -32,9 +31,9 @@ def analyse(
 
     Parameters
     ----------
-    logs : path, or iterable of paths
+    logs : path, or iterable of paths or logs
         A folder with its ``manifest.csv`` and ``maintenance.csv``, or files, with the manifest
-        beside each.
+        beside each, or results of `read_log`.
     stage : Stage
         Description of the machine.
     columns, latest
@@ -61,27 +60,32 @@ def analyse(
     lmshealth.errors.NotEnoughData: no log can be used: none is given
     """
     work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
+    given: list[Path | Log]
+    manifests: dict[Path, Manifest] = {}
+    used = column_map(columns)
     if isinstance(logs, str | Path):
         folder = Path(logs)
         manifest, work = read_manifest(folder), read_maintenance(folder, latest=latest)
         listed = find_logs(folder, manifest=manifest)
-        paths = [*listed.logs]
+        given = [*listed.logs]
         refused += [*listed.refused, *manifest.refused]
-        manifests = dict.fromkeys(paths, manifest)
+        manifests = dict.fromkeys(listed.logs, manifest)
     else:
-        paths = [*map(Path, logs)]
-        manifests = {path: read_manifest_beside(path) for path in paths}
-    for path in paths:
+        given = [one if isinstance(one, Log) else Path(one) for one in logs]
+    for one in given:
         try:
-            overrides = manifests[path].overrides(path)
-            log = read_log(path, columns=columns, overrides=overrides, latest=latest)
+            log = one
+            if isinstance(log, Path):
+                manifest = manifests[log] if log in manifests else read_manifest_beside(log)
+                overrides = manifest.overrides(log)
+                log = read_log(log, columns=used, overrides=overrides, latest=latest)
             modes = identify(log, stage)
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
-            refused.append(Refusal(str(path), error.reason, error.detail))
+            refused.append(Refusal(error.log, error.reason, error.detail))
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")
-    made = assess(found, stage, work, epochs=epochs, seed=seed)
+    made = assess(found, stage, work=work, epochs=epochs, seed=seed)
     return replace(made, refused=(*refused, *made.refused))

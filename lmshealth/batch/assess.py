@@ -1,4 +1,4 @@
-"""Assessment of machines: track, health, prognosis, verdict, and the update by the fleet prior."""
+"""Assessments of all machines of a run, and their update by the prior of their fleet."""
 
 from __future__ import annotations
 
@@ -6,41 +6,27 @@ import logging
 from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple, TypeVar
 
-from numpy.linalg import LinAlgError
-
-from lmshealth._private.seeds import seed_of
 from lmshealth._private.serialize import VERSION, fingerprint, pack
-from lmshealth.batch.ingest import LogKey, Resources, Work, unexpected
+from lmshealth.batch.cache import Cached, Resources
+from lmshealth.batch.ingest import LogKey, unexpected
 from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
-from lmshealth.errors import LmshealthError, NotEnoughData
-from lmshealth.io.log import Notice
-from lmshealth.life import constants
-from lmshealth.life.fleet_prior import (
-    EndedLife,
-    FleetContribution,
-    FleetPrior,
-    calibrate,
-    ended_lives,
-    fleet_priors,
-    machine_evidence,
+from lmshealth.errors import LmshealthError
+from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
+from lmshealth.machine.assessment import (
+    Assessment,
+    LifeState,
+    assess_from,
+    with_calibration,
+    with_fleet_prior,
 )
-from lmshealth.life.health import epochs_to_publish, health_of
-from lmshealth.life.posterior.exploration import LifeStart
-from lmshealth.life.posterior.fit import LifePosterior, fit_life
-from lmshealth.life.prognosis import parameters_with_limit, prognosis_of
-from lmshealth.life.verdict import doubt_of_names, judge
+from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.report.assessment import Assessment, summarise
 from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.contradictions import sort_by_time
-from lmshealth.tracking.history import History, build_history, missing_mode_notices, rate_notices
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
-from lmshealth.tracking.track import accepted_estimates, outlier_refusals, track
+from lmshealth.tracking.maintenance import Maintenance
 
 # Keys of the parts of an assessment with the rows of its logs, and a fingerprint of these logs.
 _ROWS, _ROWS_OF = fingerprint(VERSION, "rows"), fingerprint(VERSION, "rows of")
@@ -54,173 +40,6 @@ _Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]  # wit
 Part = TypeVar("Part")
 
 _logger = logging.getLogger(__name__)
-
-
-# One machine
-
-
-def assess(
-    readings: Sequence[LogEstimates],
-    stage: Stage,
-    work: Maintenance = NO_MAINTENANCE,
-    *,
-    epochs: int = 40,
-    seed: int = 0,
-) -> Assessment:
-    """Compute track, health, prognosis and verdict of one machine.
-
-    Parameters
-    ----------
-    readings : sequence of LogEstimates
-        Modal estimates of the logs of one machine, at least one.
-    stage : Stage
-        Its description.
-    work : Maintenance
-        Maintenance done to it.
-    epochs : int
-        Most epochs at which health is inferred.
-    seed : int
-        Of all random numbers.
-
-    Returns
-    -------
-    Assessment
-        Results that the data do not support are None, with the reason among the notices.
-
-    Examples
-    --------
-    Two logs are not enough for a baseline, and the verdict states that:
-
-    >>> import lmshealth
-    >>> from lmshealth import examples
-    >>> stage = lmshealth.load_stage("lms-y")
-    >>> found = lmshealth.assess(examples.readings()[:2], stage, epochs=1)
-    >>> found.judgement.verdict, found.judgement.why
-    ('not-enough-data', '2 usable logs since the baseline began; it needs 5.')
-    >>> found.notices[0].what.split("; ")[1]
-    'a life needs at least 3 logs and some travel'
-    """
-    machine = Machine("", (), stage, work, epochs, seed)
-    return _assess(readings, machine, None)[0]
-
-
-def _assess(
-    readings: Sequence[LogEstimates], machine: Machine, before: StoredLife | None
-) -> tuple[Assessment, StoredLife | None]:
-    """Assess a machine, whose name and keys of logs play no part, as `assess` does.
-
-    Begun with what the assessment before has stored; also returned is what the next begins with.
-    """
-    stage, work = machine.stage, machine.work
-    history, refused = build_history(readings, stage, work.actions)
-    notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
-    notices += missing_mode_notices(history, refused) + rate_notices(refused)
-    not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
-    by_log = {reading.log: reading for reading in readings}
-    used = [by_log[log] for log in history.logs]
-    made = Assessment(
-        stage=stage,
-        history=history,
-        digests=tuple(reading.digest for reading in used),
-        track=None,
-        health=None,
-        prognosis=None,
-        judgement=judge(stage, history, None),
-        refused=(*not_excited, *refused),
-        notices=tuple(notices),
-        seed=machine.seed,
-        waterfall=Waterfall.stack([(reading.spectra, reading.modes.lines) for reading in used]),
-        latest=used[-1] if used else None,
-        at_baseline=used[history.baseline] if used else None,
-    )
-    try:
-        tracked = track(history, stage)
-    except LmshealthError as error:
-        notice = Notice("no-result", "serious", "", str(error))
-        return replace(made, notices=(*made.notices, notice)), None
-    doubt = doubt_of_names(stage, history, tracked, used)
-    refused += outlier_refusals(history, tracked)
-    judgement = judge(stage, history, None, tracked, doubt=doubt)
-    made = replace(
-        made,
-        track=tracked,
-        doubt=doubt,
-        refused=(*not_excited, *refused),
-        judgement=judgement,
-    )
-    if doubt or not stage.parameters:
-        return made, None
-    try:
-        accepted = accepted_estimates(history, tracked)
-        return _with_results(made, accepted, machine.epochs, before)
-    except LmshealthError as error:
-        why = str(error)
-    except LinAlgError as error:  # one machine must not end the run
-        why = (
-            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
-            "with modes.csv"
-        )
-    notice = Notice("no-result", "serious", "", why)
-    return replace(made, notices=(*made.notices, notice)), None
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class StoredLife:
-    """What the next assessment of a life begins with."""
-
-    start: LifeStart  # draws of its posterior
-    n_logs: int
-    verdict: str
-    past: str  # fingerprint of the logs before the baseline, and the lives that ended with them
-    ended: tuple[EndedLife, ...]
-
-
-def _with_results(
-    made: Assessment, history: History, epochs: int, before: StoredLife | None
-) -> tuple[Assessment, StoredLife]:
-    """Add what follows from the posterior of the life of accepted estimates.
-
-    emcee draws it the first time, after each sixteenth log and where the verdict changes; otherwise
-    importance sampling updates it.
-    """
-    stage, every = made.stage, constants.EMCEE_EVERY
-    seed = seed_of(made.seed, history.stage, stage.digest)
-    past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
-    if before is None or before.past != past:
-        ended = ended_lives(history, stage, seed)
-    else:
-        ended = before.ended
-    chains = before is None or len(history.logs) // every > before.n_logs // every
-    start = None if before is None else before.start
-    life = fit_life(history, stage, seed, chains=chains, before=start)
-    found = _with_life(made, life, history, epochs)
-    if before is not None and not chains and found.judgement.verdict != before.verdict:
-        life = fit_life(history, stage, seed, before=start)
-        found = _with_life(made, life, history, epochs)
-    found = replace(found, ended=ended, evidence=machine_evidence(stage, life))
-    n_logs, verdict = len(history.logs), found.judgement.verdict
-    return found, StoredLife(life.start, n_logs, verdict, past, ended)
-
-
-def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: int) -> Assessment:
-    """Add what follows from the draws of a life: health, remaining life and verdict."""
-    stage, prognosis, notices = made.stage, None, made.notices
-    health = health_of(life, history, stage, epochs_to_publish(history, stage, epochs))
-    if parameters_with_limit(stage):
-        try:
-            prognosis = prognosis_of(life, history, stage)
-        except NotEnoughData as error:
-            notices = (*notices, Notice("no-result", "serious", "", str(error)))
-    judgement = judge(stage, made.history, health, made.track, doubt=made.doubt)
-    return replace(made, health=health, prognosis=prognosis, judgement=judgement, notices=notices)
-
-
-def _life_key(stage: Stage, seed: int) -> str:
-    """Return the key of the part of an assessment that the next one begins with."""
-    return fingerprint(VERSION, "life", stage.digest, seed)
-
-
-# All machines of a run
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,6 +58,11 @@ class Machine:
         """Key of its assessment in a store."""
         inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed
         return fingerprint(VERSION, *inputs)
+
+
+def _life_key(stage: Stage, seed: int) -> str:
+    """Return the key of the part of an assessment that the next one begins with."""
+    return fingerprint(VERSION, "life", stage.digest, seed)
 
 
 def assess_all(
@@ -263,9 +87,14 @@ def assess_all(
     fetch(machines)
     left = [machine for machine in machines if machine.name not in known]
     resources.progress("assessing", len(known), len(machines))
-    work: Work[Machine, _Job] = Work(lambda one: fingerprint(one.name, one.key), job, fetch)
-    mapper = partial(resources.pool.map_unordered, _assess_packed, on_crash=lambda _, why: why)
-    for k, ((machine, *_), made) in enumerate(work.divided(left, store, mapper), start=1):
+    assessing: Cached[Machine, _Job, PackedAssessment | str] = Cached(
+        _assess_packed,
+        lambda _, why: why,
+        key=lambda one: fingerprint(one.name, one.key),
+        fetch=fetch,
+        job=job,
+    )
+    for k, ((machine, *_), made) in enumerate(assessing.values(left, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         else:
@@ -300,8 +129,9 @@ def _assess_packed(job: _Job) -> PackedAssessment | str:
 
     def work() -> PackedAssessment:
         readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
-        before = unpack_or_none(known.get(key), StoredLife)
-        found, after = _assess(readings, machine, before)
+        before = unpack_or_none(known.get(key), LifeState)
+        how = {"epochs": machine.epochs, "seed": machine.seed}
+        found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
         parts = _pack_rows(readings, machine, known.get(_ROWS))
         if after is not None:
             parts[key] = pack(after)
@@ -388,9 +218,10 @@ def apply_fleet_priors(
     left = [one for one in updates if one[1] not in known]
     if left:
         resources.progress("fleet priors", 0, len(left))
-    work: Work[_Update, _UpdateJob] = Work(lambda one: one[1], job, fetch)
-    mapper = partial(resources.pool.map_unordered, _update, on_crash=lambda _, why: why)
-    for k, (one, made) in enumerate(work.divided(left, store, mapper), start=1):
+    updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
+        _update, lambda _, why: why, key=lambda one: one[1], fetch=fetch, job=job
+    )
+    for k, (one, made) in enumerate(updating.values(left, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(one.machine, one.key, made)
             keys[one.machine] = one.key
@@ -430,36 +261,25 @@ class _UpdateJob(NamedTuple):
     machine: str
     key: str
     content: bytes | None  # packed assessment by the description
-    life: bytes | None  # packed `StoredLife`
+    life: bytes | None  # packed `LifeState`
     epochs: int
     prior: FleetPrior | None  # None where the prognosis is calibrated instead
     ended: tuple[EndedLife, ...]
 
 
 def _update(job: _UpdateJob) -> PackedAssessment | str | None:
-    """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails.
-
-    Coordinates of scenarios do not depend on what a fleet changes of a description: draws of the
-    posterior by the description are the start of that with the prior of the fleet.
-    """
+    """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
 
     def work() -> PackedAssessment | None:
         found: Assessment | None = unpack_or_none(job.content, Assessment)
         if found is None or found.track is None:
             return None
         if job.prior is None:
-            if found.prognosis is None:
-                return None
-            calibration = calibrate(found.prognosis, job.ended)
-            return pack_assessment(replace(found, calibration=calibration))
-        history = accepted_estimates(found.history, found.track)
-        stage = job.prior.apply_to(found.stage)
-        seed = seed_of(found.seed, history.stage, stage.digest)
-        before = unpack_or_none(job.life, StoredLife)
-        start = None if before is None else before.start
-        life = fit_life(history, stage, seed, chains=before is None, before=start)
-        made = _with_life(replace(found, stage=stage), life, history, job.epochs)
-        return pack_assessment(replace(made, stage=found.stage, fleet=job.prior))
+            is_open = found.prognosis is None
+            return None if is_open else pack_assessment(with_calibration(found, job.ended))
+        before = unpack_or_none(job.life, LifeState)
+        made = with_fleet_prior(found, job.prior, epochs=job.epochs, before=before)
+        return pack_assessment(made)
 
     return reason_if_failed(work, job.machine)
 

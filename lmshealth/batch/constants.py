@@ -35,8 +35,11 @@ ANSWER_TIMEOUT_S = 60
 """Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
 end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
-SCHEMA = 9
-"""Version of the tables of a store, part of their names: older tables are not read."""
+SCHEMA = 10
+"""Version of the table of values, part of its name: tables of other versions are not read."""
+
+DASHBOARD_SCHEMA = 9
+"""Version of the tables of dashboards, part of their names."""
 
 SETTLED_S = 10
 """Seconds (s) after its last change from which the digest of a file may be kept: clocks of file
@@ -62,18 +65,6 @@ instance because a run at the same time removed it."""
 SHORTEST_SECRET = 4
 """Least length of a value of a URL's options that is masked in messages. Shorter values are
 numbers and switches, which occur everywhere in a message."""
-
-JSON_SCHEMA = 2
-"""Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,
-and what alerts get. It changes when a key or a value changes its meaning or is removed."""
-
-FAILURE_PROBABILITY = 0.5
-"""Probability that a limit is reached now, from which a machine has the state ``FAILURE``: it is
-more probable than not that the machine is outside what its description allows."""
-
-SERVICE_LEAD_DAYS = 30
-"""Days before the service date from which a machine has the state ``MAINTENANCE_REQUIRED``: time to
-plan a service."""
 
 ALERT_TIMEOUT_S = 60
 """Seconds (s) that an alert command may take before it is killed with its children."""

@@ -3,18 +3,19 @@
 import logging
 import os
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
-from datetime import datetime
+from datetime import date, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, Generic, NamedTuple, Self, TypeVar
+from typing import Any, NamedTuple, Self
 
-from lmshealth._private.serialize import VERSION, fingerprint
+from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.store import Identified, OutcomeRow, Store
+from lmshealth.batch.cache import Cached, Resources
+from lmshealth.batch.store import Identified, Store
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
@@ -32,90 +33,13 @@ from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summaris
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 
-Progress = Callable[[str, int, int], None]
-"""Callback: name of the step, how many items are done, how many there are."""
-
 NOT_LISTED = "not-listed"
 """Reason in refused.csv of a log that is analysed, though the manifest of its folder omits it."""
 
 LogKey = tuple[str, str]
 """Name of a log, and the key of its estimates in the store."""
 
-Piece = TypeVar("Piece")
-Job = TypeVar("Job")
-Result = TypeVar("Result")
-
 _logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class Resources:
-    """Store, workers and progress callback of a batch."""
-
-    store: Store
-    pool: Pool
-    progress: Progress = lambda step, done, total: None
-
-
-@dataclass(frozen=True, slots=True)
-class Work(Generic[Piece, Job]):
-    """Work that the runs on a store divide among them: pieces by their keys.
-
-    A run claims pieces, ``size`` at a time, and makes a ``job`` of those that it gets. ``fetch``
-    takes results of pieces from the store, and yields those pieces whose result was there.
-    """
-
-    key: Callable[[Piece], str]
-    job: Callable[[Sequence[Piece]], Job]
-    fetch: Callable[[Sequence[Piece]], Iterable[Piece]]
-    size: int = 1
-
-    def divided(
-        self,
-        pieces: Sequence[Piece],
-        store: Store,
-        mapper: Callable[[Iterator[Job]], Iterator[tuple[Job, Result]]],
-    ) -> Iterator[tuple[Job, Result]]:
-        """Map over jobs of all pieces that no other run does; yield each job with its result.
-
-        What other runs have claimed is looked at again in the end: they store its result, or end
-        without. The caller stores a result before it asks for the next.
-        """
-        left = pieces
-        while left:
-            others = yield from self._unclaimed(left, store, mapper)
-            if len(others) == len(left):
-                time.sleep(constants.OTHERS_POLL_S)
-            left = others
-
-    def _unclaimed(
-        self,
-        pieces: Sequence[Piece],
-        store: Store,
-        mapper: Callable[[Iterator[Job]], Iterator[tuple[Job, Result]]],
-    ) -> Generator[tuple[Job, Result], None, list[Piece]]:
-        """Map over jobs of unclaimed pieces; return the pieces that others have claimed."""
-        others, claimed = list[Piece](), dict[int, list[str]]()
-
-        def jobs() -> Iterator[Job]:
-            for first in range(0, len(pieces), self.size):
-                part = [(self.key(piece), piece) for piece in pieces[first : first + self.size]]
-                own = store.claim([key for key, _ in part])
-                others.extend(piece for key, piece in part if key not in own)
-                mine = [piece for key, piece in part if key in own]
-                if store.is_divided:  # another run may have done it since this one began
-                    done = {self.key(piece) for piece in self.fetch(mine)}
-                    store.release(list(done))
-                    mine = [piece for piece in mine if self.key(piece) not in done]
-                if mine:
-                    job = self.job(mine)
-                    claimed[id(job)] = [self.key(piece) for piece in mine]
-                    yield job
-
-        for job, result in mapper(jobs()):
-            yield job, result
-            store.release(claimed.pop(id(job)))
-        return others
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,7 +60,8 @@ class Settings:
     seed : int
         Of all random numbers.
     columns : ColumnMap or None
-        How logs are read; None where their columns are those of the log contract.
+        How logs are read (`lmshealth.io.column_map.column_map`); None where their columns are those
+        of the log contract.
     max_memory : float
         Most memory in bytes that reading a log may take.
     latest : datetime or None
@@ -145,6 +70,8 @@ class Settings:
         Whether symbolic links out of the folder of logs are followed.
     alerts : Alerts
         Which changes since the last run are delivered, and how.
+    today : date or None
+        Day whose end statuses are judged at, for runs that repeat; None for the moment of the run.
     growing : frozenset of Path
         Files that are left to a later run.
 
@@ -168,6 +95,7 @@ class Settings:
     latest: datetime | None = None
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
+    today: date | None = None
     growing: frozenset[Path] = frozenset()
 
     def pool(self) -> AbstractContextManager[Pool]:
@@ -211,16 +139,16 @@ class _Outcome(NamedTuple):
     description: str
     machine: str | None
     refused: tuple[Refusal, ...]  # of the log as a whole
-    row: OutcomeRow | None = None  # packed by the worker, if it is to be stored
+    packed: bytes | None = None  # by the worker, if it is to be stored
 
     @classmethod
     def of(cls, task: _Task, found: Identified, *, is_new: bool) -> Self:
         """Make it from an outcome."""
         refused = () if isinstance(found.outcome, LogEstimates) else found.outcome
         key = task.key(found.description)
-        row = OutcomeRow.of(key, task.digest, found) if is_new and found.lasting else None
+        packed = pack(found) if is_new and found.lasting else None
         machine = None if refused else found.stage
-        return cls((task.name, key), found.description, machine, refused, row)
+        return cls((task.name, key), found.description, machine, refused, packed)
 
 
 def ingest(
@@ -269,7 +197,7 @@ def ingest(
     identify = partial(_identify_logs, stages=tuple(stages), how=how)
     done = 0
     for part in _identified(left, identify, resources, fetch):
-        store.put_identified(one.row for one in part if one.row is not None)
+        store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
         for one in part:
             add(one)
         done += len(part)
@@ -362,7 +290,7 @@ def _all_digests(
     files: Mapping[Path, tuple[str, bool]], resources: Resources
 ) -> dict[Path, str | BadLog]:
     """Hash the files that have changed since they were hashed last, by this run or another one."""
-    store, pool, digests = resources.store, resources.pool, dict[Path, str | BadLog]()
+    store, digests = resources.store, dict[Path, str | BadLog]()
 
     def fetch(paths: Sequence[Path]) -> Iterator[Path]:
         known = store.digests(files[path][0] for path in paths)
@@ -373,11 +301,16 @@ def _all_digests(
 
     known = set(fetch([*files]))
     resources.progress("reading", len(digests), len(files))
-    size = constants.FILES_PER_HASH_TASK
-    work: Work[Path, tuple[Path, ...]] = Work(lambda path: files[path][0], tuple, fetch, size)
+    hashing: Cached[Path, tuple[Path, ...], dict[Path, str | BadLog]] = Cached(
+        _digests,
+        _no_digests,
+        key=lambda path: files[path][0],
+        fetch=fetch,
+        job=tuple,
+        size=constants.FILES_PER_HASH_TASK,
+    )
     left = [path for path in files if path not in known]
-    mapper = lambda jobs: pool.map_unordered(_digests, jobs, _no_digests)  # noqa: E731
-    for _, part in work.divided(left, store, mapper):
+    for _, part in hashing.values(left, resources):
         digests |= part
         new = {files[path]: digest for path, digest in part.items() if isinstance(digest, str)}
         store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
@@ -439,10 +372,15 @@ def _identified(
 ) -> Iterator[list[_Outcome]]:
     """Identify logs, several in one task; those of a task that ended its worker one by one."""
     pool, lost = resources.pool, list[tuple[_Task, ...]]()
-    size = min(constants.LOGS_PER_TASK, max(1, len(left) // (4 * pool.size)))
-    work: Work[_Task, tuple[_Task, ...]] = Work(lambda task: task.key(""), tuple, fetch, size)
-    mapper = lambda jobs: pool.map_unordered(identify, jobs, lambda part, why: [])  # noqa: E731
-    for part, outcomes in work.divided(left, resources.store, mapper):
+    identifying: Cached[_Task, tuple[_Task, ...], list[_Outcome]] = Cached(
+        identify,
+        lambda part, why: [],
+        key=lambda task: task.key(""),
+        fetch=fetch,
+        job=tuple,
+        size=min(constants.LOGS_PER_TASK, max(1, len(left) // (4 * pool.size))),
+    )
+    for part, outcomes in identifying.values(left, resources):
         lost += [] if outcomes else [(task,) for task in part]
         yield outcomes
     for _, outcomes in pool.map_unordered(identify, lost, _crashed):

@@ -4,20 +4,21 @@ Memory holds the packed tables of all machines, and besides them only the machin
 """
 
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from lmshealth._private.files import replacing, write_text
+from lmshealth._private.files import replacing
 from lmshealth._private.serialize import pack, unpack
 from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch.assess import LogRows, reason_if_failed
-from lmshealth.batch.status import Status, coming_states, make_status, points
+from lmshealth.batch.dashboard import points
 from lmshealth.batch.store import unpack_or_none
-from lmshealth.batch.workers import Pool
-from lmshealth.report.assessment import Assessment, Summary, summarise
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.status import Status, coming_states, make_status
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT
@@ -77,20 +78,8 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     )
 
 
-def write_pages(
-    records: Iterable[MachineRecord], pool: Pool, out: Path
-) -> Iterator[tuple[MachineRecord, MachineOutput | str | None]]:
-    """Write the pages of machines; yield each record with its output, or why there is none.
-
-    The output is None where the assessment is missing or cannot be decoded.
-    """
-    for record, output in pool.map_unordered(_output_or_reason, records, lambda _, why: why):
-        if isinstance(output, MachineOutput):
-            write_text(out / record.file, output.page)
-        yield record, output
-
-
-def _output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
+def output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
+    """Return the output of a machine, why it fails, or None where `machine_output` does."""
     return reason_if_failed(lambda: machine_output(record), record.machine)
 
 

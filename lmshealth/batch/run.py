@@ -4,8 +4,7 @@ from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
-from functools import partial
+from datetime import UTC, date, datetime, time
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -16,15 +15,17 @@ from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.ingest import NOT_LISTED, Ingested, Progress, Resources, Settings, Work, ingest
-from lmshealth.batch.outputs import MachineOutput, MachineRecord, write_pages, write_tables
-from lmshealth.batch.status import Change, Status
+from lmshealth.batch.cache import Cached, Progress, Resources
+from lmshealth.batch.dashboard import put_points, put_status
+from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
+from lmshealth.batch.outputs import MachineOutput, MachineRecord, output_or_reason, write_tables
 from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.io.refusal import visible
-from lmshealth.report.assessment import Summary
+from lmshealth.machine.status import Change, Status
+from lmshealth.machine.summary import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
@@ -56,9 +57,9 @@ class RunResult:
 
 
 def run(
-    folder: Path,
+    folder: str | Path,
     stages: Sequence[Stage],
-    out: Path,
+    out: str | Path,
     settings: Settings = Settings(),
     progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
@@ -66,11 +67,11 @@ def run(
 
     Parameters
     ----------
-    folder : Path
+    folder : str or Path
         Read recursively, with its ``manifest.csv`` and ``maintenance.csv``.
     stages : sequence of Stage
         Each log is read with the first description that matches it.
-    out : Path
+    out : str or Path
         Folder of the output, created if needed.
     settings : Settings
         Store, workers, seed and how logs are read.
@@ -96,13 +97,14 @@ def run(
     >>> noise = np.random.default_rng(1).standard_normal(20_000)
     >>> np.savetxt("logs/one.csv", noise, header=chr(10).join(head), comments="")
     >>> stage = lmshealth.load_stage("lms-y")
-    >>> result = lmshealth.run(Path("logs"), [stage], Path("result"))
+    >>> result = lmshealth.run("logs", [stage], "result")
     >>> result.n_logs, result.n_refused, result.index.name
     (1, 0, 'index.html')
     >>> refused = pd.read_csv("result/refused.csv")
     >>> dict(zip(refused["mode"], refused["reason"]))
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
+    folder, out = Path(folder), Path(out)
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
@@ -117,10 +119,10 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         done, made, tables, excluded = _report(usable, refused, resources, out)
-        moment = datetime.now(UTC)
+        moment = _moment(settings.today)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
-            store.put_status(statuses, changes, moment)
+            put_status(store, statuses, changes, moment)
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
@@ -149,7 +151,7 @@ def run(
 
 def report(
     store: Store,
-    out: Path,
+    out: str | Path,
     settings: Settings = Settings(),
     progress: Progress = lambda step, done, total: None,
 ) -> RunResult:
@@ -157,6 +159,7 @@ def report(
 
     `StoreError` if there is no assessment that this version can decode.
     """
+    out = Path(out)
     _prepare(out)
     present = store.published()
     files = file_names([one.machine for one in present])
@@ -166,10 +169,11 @@ def report(
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
         records = (_record(one.machine, one.key, files[one.machine], store) for one in present)
-        for record, output in write_pages(records, pool, out):
+        for record, output in pool.map_unordered(output_or_reason, records, lambda _, why: why):
             if isinstance(output, str):
                 failed[record.machine] = output
             elif output is not None:
+                write_text(out / record.file, output.page)
                 rows[record.machine] = output.summary
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
@@ -182,6 +186,11 @@ def report(
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
     )
+
+
+def _moment(today: date | None) -> datetime:
+    """Return the moment at which statuses are judged: the end of a day, by default now (UTC)."""
+    return datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
 
 
 def _prepare(out: Path) -> None:
@@ -289,7 +298,10 @@ def _outputs(
     resources: Resources,
     out: Path,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write pages as `write_pages` does; those of unchanged results are taken from the store."""
+    """Write the pages of machines; those of unchanged results are taken from the store.
+
+    A machine whose assessment is missing, or cannot be decoded, is left out.
+    """
     store, missing = resources.store, dict[str, tuple[Machine, str]]()
     for machine in machines:
         name = machine.name
@@ -309,14 +321,20 @@ def _outputs(
         rows = packed_rows(missing[name][0], store)
         return _record(name, keys[name], files[name], store, rows)
 
-    work: Work[str, MachineRecord] = Work(lambda name: missing[name][1], job, fetch)
+    drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
+        output_or_reason,
+        lambda _, why: why,
+        key=lambda name: missing[name][1],
+        fetch=fetch,
+        job=job,
+    )
     left = set(missing)
-    mapper = partial(write_pages, pool=resources.pool, out=out)
-    for record, drawn in work.divided(list(missing), store, mapper):
+    for record, drawn in drawing.values(list(missing), resources):
         name = record.machine
         left.remove(name)
         if isinstance(drawn, MachineOutput):
-            store.put_points(name, drawn.points)
+            write_text(out / record.file, drawn.page)
+            put_points(store, name, drawn.points)
             store.put_part(name, missing[name][1], pack(drawn))
         if drawn is not None:
             yield name, drawn

@@ -1,26 +1,27 @@
-"""Commands on archives and stores: run, watch, report."""
+"""Commands on archives and stores: run, watch, report.
+
+What runs is imported by each command: their help needs no database, no workers and no scipy.
+"""
+
+from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import click
 
-from lmshealth.batch import constants
-from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.ingest import Settings
-from lmshealth.batch.run import RunResult
-from lmshealth.batch.run import report as write_pages
-from lmshealth.batch.run import run as run_pipeline
-from lmshealth.batch.store import Store
-from lmshealth.batch.watch import watch as watch_folder
-from lmshealth.cli import options, terminal, views
+from lmshealth.cli import options, terminal
 from lmshealth.errors import LmshealthError
+from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.constants import TERMINAL_ROWS
-from lmshealth.report.rendering import write_pdfs
-from lmshealth.stage.description import Stage
+
+if TYPE_CHECKING:
+    from lmshealth.batch.ingest import Settings
+    from lmshealth.batch.run import RunResult
+    from lmshealth.stage.description import Stage
 
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
@@ -54,6 +55,9 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 def _settings(given: dict[str, Any]) -> Settings:
     """Return the settings of a run by its options."""
+    from lmshealth.batch.alerts import Alerts
+    from lmshealth.batch.ingest import Settings
+
     alerts = Alerts(**{name: given.pop(name) for name in ("silent_days", "command", "notify")})
     return Settings(**given, alerts=alerts, follow_links=options.follow_links())
 
@@ -62,8 +66,14 @@ def _document(result: RunResult) -> dict[str, Any]:
     """Return the result of a run for other programs."""
     counts = ["n_logs", "n_refused", "n_remembered", "n_unlisted", "n_unread"]
     names = [*counts, "failed", "unsent", "notes", "changes"]
-    head = {"schema": constants.JSON_SCHEMA, "report": str(result.index.absolute())}
+    head = {"schema": JSON_SCHEMA, "report": str(result.index.absolute())}
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
+
+
+def _write_pdfs(result: RunResult) -> None:
+    from lmshealth.report.rendering import write_pdfs
+
+    write_pdfs(result.pages)
 
 
 def _errors(result: RunResult) -> list[str]:
@@ -79,11 +89,15 @@ def _errors(result: RunResult) -> list[str]:
     "run logs/ --stage lms-y --out result/ --silent-days 7 --alert-command 'mail -s lms me@host'",
 )
 @_run_options
+@options.TODAY
 @click.pass_context
 def run(
     ctx: click.Context, /, logs: Path, stages: tuple[Stage, ...], out: Path, **given: Any
 ) -> None:
     """Analyse a folder of logs: tables, verdicts and report. Run again to continue."""
+    from lmshealth.batch.run import run as run_pipeline
+    from lmshealth.cli import views
+
     pdf, style = given.pop("pdf"), given.pop("style")
     with terminal.progress_bars() as progress:
         result = run_pipeline(logs, stages, out, _settings(given), progress)
@@ -107,7 +121,7 @@ def run(
         terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     if pdf:
-        write_pdfs(result.pages)
+        _write_pdfs(result)
     some = result.n_refused or result.n_unlisted or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
 
@@ -129,6 +143,8 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 
     Prints one line for each run, change and failure; with --format json one document a line.
     """
+    from lmshealth.batch.watch import watch as watch_folder
+
     pdf, style = given.pop("pdf"), given.pop("style")
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):
         now = f"{datetime.now().astimezone().isoformat(timespec='seconds')} "
@@ -147,7 +163,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
                 terminal.print_line(f"{now}{change}")
         terminal.print_errors(now + error for error in _errors(result))
         if pdf:
-            write_pdfs(result.pages)
+            _write_pdfs(result)
 
 
 @options.command(
@@ -164,10 +180,14 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
 
     The pages are those that `run` wrote last for each machine, byte for byte.
     """
+    from lmshealth.batch.ingest import Settings
+    from lmshealth.batch.run import report as write_pages
+    from lmshealth.batch.store import Store
+
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     terminal.print_line(f"Report: {result.index}")
     terminal.print_errors(_errors(result))
     if pdf:
-        write_pdfs(result.pages)
+        _write_pdfs(result)
     ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)

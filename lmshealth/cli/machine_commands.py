@@ -17,12 +17,12 @@ from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress
 from lmshealth.errors import NotConverged, NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_drifts
-from lmshealth.life.maintenance_decision import decide, probability_before
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import prognosis_of
 from lmshealth.life.verdict import doubt_of_names
+from lmshealth.machine.service import decide, probability_before
+from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.report import tables
-from lmshealth.report.assessment import summarise_life
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision
 from lmshealth.tracking.history import History, missing_mode_notices
@@ -237,7 +237,7 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             note = f"{life.stage}: --by {by} is not after the last log ({last}): no probability"
             print_notes([f"{note} is given for that day"])
         views.print_life(life, service, before)
-        rows += tables.prognosis_rows(life, service, before)
+        rows += prognosis_rows(life, service, before)
     _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost)
 
 

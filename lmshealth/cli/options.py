@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import click
-from loky import cpu_count
 from msgspec.structs import replace
 
 from lmshealth.batch.constants import NOTIFY
@@ -30,6 +29,13 @@ SOME_REFUSED = 3
 # and 60 bits address so many GB.
 _MOST_SEED, _MOST_DAYS, _MOST_GB = (1 << 63) - 1, 36_525, 1e9
 _MOST_EPOCHS, _MOST_WORKERS = 1_000_000, 1_000
+
+
+def _processors() -> int:
+    """Return the number of processors that this process may use."""
+    from loky import cpu_count  # late: --help needs no workers
+
+    return int(cpu_count())
 
 
 class Finite(click.FloatRange):
@@ -188,6 +194,12 @@ ALLOW_FUTURE = click.option(
     callback=lambda ctx, option, given: LAST_MOMENT if given else None,
     help="Accept logs and maintenance that are dated after tomorrow.",
 )
+TODAY = click.option(
+    "--today",
+    metavar="DAY",
+    callback=lambda ctx, option, given: None if given is None else day(given),
+    help="Judge status and silence as on this day, for runs that repeat; default now.",
+)
 PART = click.option(
     "--part",
     type=click.Choice(PARTS),
@@ -215,7 +227,7 @@ SEED = click.option(
 WORKERS = click.option(
     "--workers",
     type=click.IntRange(1, _MOST_WORKERS),
-    callback=lambda ctx, option, count: count or cpu_count(),
+    callback=lambda ctx, option, count: count or _processors(),
     help="Number of processes; default one per processor (in Python: 1).",
 )
 _SILENT_DAYS = click.option(

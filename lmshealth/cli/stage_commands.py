@@ -4,8 +4,8 @@ from typing import Any
 
 import click
 
-from lmshealth.batch.constants import JSON_SCHEMA
 from lmshealth.cli import options, terminal, views
+from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.constants import DURATIONS

@@ -5,6 +5,7 @@ from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
 
+from lmshealth._private.names import spell
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.cli.terminal import (
     print_line,
@@ -15,9 +16,10 @@ from lmshealth.cli.terminal import (
     short_names,
 )
 from lmshealth.life.health import Health
-from lmshealth.life.maintenance_decision import ProbabilityBounds, Service
+from lmshealth.machine.constants import RUL_LEVELS
+from lmshealth.machine.service import ProbabilityBounds, Service
+from lmshealth.machine.summary import Life, ParameterHealth, Summary
 from lmshealth.report import constants
-from lmshealth.report.assessment import Life, ParameterHealth, Summary
 from lmshealth.report.tables import events_rows, to_rows, track_rows
 from lmshealth.report.text import (
     GAP,
@@ -32,11 +34,11 @@ from lmshealth.report.text import (
     probability,
     probability_range,
     service_text,
-    spell,
     time_left,
     travel_left,
     whole_km,
 )
+from lmshealth.report.wording import next_step
 from lmshealth.tracking.track import Track
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
@@ -389,8 +391,8 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
             print_text(f"{one.identity}: {one.verdict}{in_brackets(one.probability)}. {one.why}")
-            if one.to_do:
-                print_text(f"  {one.to_do}")
+            if to_do := next_step(one.step):
+                print_text(f"  {to_do}")
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
             if one.life is not None:
@@ -465,7 +467,7 @@ def _limit_cells(
     life: Life, index: int, before: tuple[date, ProbabilityBounds] | None
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
-    one, levels = life.limits[index], constants.RUL_LEVELS
+    one, levels = life.limits[index], RUL_LEVELS
     text = one.name if one.parameter == "any" else f"{one.name} below {percent(one.share)}"
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"

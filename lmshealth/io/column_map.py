@@ -5,13 +5,14 @@ A column map translates the names of one export, a layout states how a program w
 """
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from msgspec import Meta, Struct
+from msgspec import Meta, Struct, ValidationError, convert
 from msgspec.structs import asdict
 
 from lmshealth._private.files import read_table
@@ -339,6 +340,31 @@ class ColumnMap(_MapFile, frozen=True, forbid_unknown_fields=True, dict=True):
         if self.sample_rate_hz is not None:
             text["sample_rate_hz"] = repr(self.sample_rate_hz)
         return text
+
+
+ColumnsGiven = ColumnMap | Mapping[str, Any] | str | Path
+"""A column map, its tables as a mapping, or its file."""
+
+
+def column_map(given: ColumnsGiven | None) -> ColumnMap:
+    """Return the column map that was given: itself, a mapping of its tables, or its TOML file.
+
+    None is that of the log contract. `BadTable` as `load_columns`.
+    """
+    if given is None:
+        return ColumnMap()
+    if isinstance(given, ColumnMap):
+        return given
+    if not isinstance(given, Mapping):
+        return load_columns(given)
+    try:
+        columns = ColumnMap(**asdict(convert(given, _MapFile)))
+        _check(columns)
+    except (ValidationError, ValueError) as error:
+        raise BadTable(f"column map: {error}") from error
+    except Unusable as error:
+        raise BadTable(f"column map: {error.detail}") from error
+    return columns
 
 
 def load_columns(path: str | Path) -> ColumnMap:

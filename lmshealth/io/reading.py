@@ -24,7 +24,7 @@ from lmshealth.io.checks.channel_checks import (
 from lmshealth.io.checks.consistency import Findings, Motion, compare
 from lmshealth.io.checks.prediction import filled
 from lmshealth.io.checks.sample_faults import check_sign, coarse_levels, spikes, unwrapped
-from lmshealth.io.column_map import ColumnMap, Role, Signal
+from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
@@ -49,7 +49,7 @@ _REFERENCES: tuple[Role, ...] = ("reference_velocity", "reference_position")
 def read_log(
     path: str | Path,
     *,
-    columns: ColumnMap | None = None,
+    columns: ColumnsGiven | None = None,
     overrides: Mapping[str, str] | None = None,
     name: str | None = None,
     max_memory: float = constants.MAX_MEMORY,
@@ -61,9 +61,9 @@ def read_log(
     ----------
     path : str or Path
         The file; its suffix names the format and its content must agree.
-    columns : ColumnMap, optional
-        How an export is read, and layouts of the user; by default the columns are those of the log
-        contract.
+    columns : ColumnMap, mapping, str or Path, optional
+        How an export is read: a column map, its tables as in the file (``{"columns": {"delta_e_um":
+        "PE(0)"}}``), or its file. By default the columns are those of the log contract.
     overrides : mapping of str to str, optional
         Metadata of a manifest, which override those of the file and the column map.
     name : str, optional
@@ -85,6 +85,8 @@ def read_log(
     ------
     BadLog
         For every fault of the file; the reasons are listed in the README of this folder.
+    BadTable
+        For a column map that breaks its contract.
 
     Examples
     --------
@@ -105,7 +107,7 @@ def read_log(
     """
     label = shown(path) if name is None else name
     digest = content_digest(path, name=label)
-    used = ColumnMap() if columns is None else columns
+    used = column_map(columns)
     try:
         content = load(Path(path), used, max_memory)
         filled_in = {key: value for key, value in (overrides or {}).items() if value.strip()}

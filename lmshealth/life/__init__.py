@@ -1,1 +1,1 @@
-"""Remaining useful life: degradation scenarios, life posterior, first passage, service date."""
+"""Remaining useful life: degradation scenarios, life posterior, first passage."""

@@ -98,14 +98,6 @@ MIN_PAST = 0.5
 SURPRISE = 0.01
 """Probability of as many early ends, were the predictions right, below which they are noticed."""
 
-INSPECTION_RISK = 0.2
-"""Share of the accepted risk that may come from ends between two logs that no log announced: small,
-as the service date uses the risk that is accepted."""
-
-MIN_SAVING = 0.01
-"""A service that saves a smaller share of the long-run costs gets no date: draws do not resolve
-it."""
-
 # Sampling.
 N_DRAWS = 4000
 """Draws of the published posterior, of all ensembles together."""

@@ -15,7 +15,7 @@ from lmshealth.life import constants
 from lmshealth.life.posterior.data import KM, SECONDS_PER_DAY, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.scenarios import DegradationPath
-from lmshealth.stage.degradation_laws import Accelerating, Law
+from lmshealth.stage.degradation_laws import Accelerating, AnyLaw, Law
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History
@@ -46,7 +46,7 @@ class LawWeight:
 class Prognosis(Result):
     """Remaining useful life of one machine, of which `n` health parameters have a limit.
 
-    `lmshealth.life.maintenance_decision.probability_before` has the probability by a day.
+    `lmshealth.machine.service.probability_before` has the probability by a day.
     """
 
     stage: str  # identity of the machine
@@ -267,7 +267,7 @@ def rate_std(law: Law) -> float:
     return constants.ACCELERATION_STD if late else constants.RATE_STD
 
 
-def early_life(law: Law, limit: float, rng: np.random.Generator) -> float:
+def early_life(law: AnyLaw, limit: float, rng: np.random.Generator) -> float:
     """Return the travel in m before which few machines of the description reach a limit."""
     path = DegradationPath(law, 0.0, ())
     lives = path.passage(path.natural(path.draw(rng, _N_LIVES, KM), KM), limit)

@@ -11,6 +11,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray
+from lmshealth._private.names import spell
 from lmshealth.life import constants
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.fit import LoneMode
@@ -213,7 +214,7 @@ def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
         k = track.modes.index(mode)
         moved, std = track.drift[-1, k], np.sqrt(track.drift_cov[-1, k, k])
         size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
-        when, name = track.recorded_at[event.epoch].date().isoformat(), mode.replace("_", " ")
+        when, name = track.recorded_at[event.epoch].date().isoformat(), spell(mode)
         size = size.replace("-", "−")
         yield f"Alarm since {when}: {name} has moved by {size} since the baseline."
 
@@ -260,8 +261,8 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
 def lone_sentence(lone: LoneMode, stage: Stage) -> str:
     """Return a sentence about a mode that moved alone, and what to check."""
     moved, std = 100 * np.expm1(lone.size), 100 * np.exp(lone.size) * lone.std
-    name = lone.mode.replace("_", " ").capitalize()
-    states = " and ".join(one.name.replace("_", " ") for one in stage.parameters)
+    name = spell(lone.mode).capitalize()
+    states = " and ".join(spell(one.name) for one in stage.parameters)
     size = f"{moved:+.1f}".replace("-", "−")
     return (
         f"{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check "
@@ -274,7 +275,7 @@ def _parameter_sentences(stage: Stage, health: Health) -> str:
     informed = health.publishable_parameters()
     sentences = []
     for j, parameter in enumerate(stage.parameters):
-        name = parameter.name.replace("_", " ").capitalize()
+        name = spell(parameter.name).capitalize()
         low, middle, high = quantiles[:, j]
         if not health.identifiable[-1, j]:
             text = f"{name}: not identifiable from the tracked modes."

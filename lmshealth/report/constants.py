@@ -1,10 +1,6 @@
 """Constants that decide what pages, tables and terminals publish."""
 
 # --- Quantile levels ---
-# Levels of a published interval: 90 % credible interval and median.
-LEVELS = (0.05, 0.5, 0.95)
-# Levels of the remaining useful life; columns of prognosis.csv (public contract).
-RUL_LEVELS = (0.05, 0.10, 0.25, 0.50, 0.75, 0.90, 0.95)
 # Levels of the bands in figures: 50 and 90 % around the median.
 BAND_LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 # Probabilities are quoted between these; posterior draws cannot prove 0 or 1.
@@ -32,8 +28,6 @@ REFUSED_SHOWN, REFUSED_UNFOLDED = 50, 12
 LIFE_EDGES = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
 # Weeks by which a service may be late, of which the page has the risk.
 POSTPONED_WEEKS = (0, 1, 2, 4, 8)
-# Epochs, at most, in a small picture of health over travel.
-COURSE_POINTS = 24
 # Months of the calendar of services.
 CALENDAR_MONTHS = 12
 # Points per figure, of logs spaced evenly up to the last: more would cover each other.

@@ -15,19 +15,20 @@ from itertools import cycle, pairwise
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.names import spell
 from lmshealth._private.result import Result
 from lmshealth.errors import BadQuestion
 from lmshealth.io.log import SI_UNITS, Log
 from lmshealth.life.health import Health
-from lmshealth.life.maintenance_decision import Service
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.notices import chi_square_band
+from lmshealth.machine.service import Service
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import constants
-from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, spell, whole_km
+from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, whole_km
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
@@ -669,11 +670,6 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
     ax.set_ylabel("change of frequency in %")
     return legend(ax, room=35)
-
-
-def chi_square_band(dof: FloatArray) -> FloatArray:
-    """Return the 95 % interval of chi-square variables, shape ``(2, ...)``."""
-    return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
 
 
 def _logs(

@@ -11,10 +11,12 @@ import numpy as np
 
 from lmshealth._private.files import write_text
 from lmshealth.io.log import Refusal
+from lmshealth.machine.constants import RUL_LEVELS
+from lmshealth.machine.summary import Summary
 from lmshealth.report import constants
-from lmshealth.report.assessment import Summary
 from lmshealth.report.rendering import read, render
 from lmshealth.report.text import number
+from lmshealth.report.wording import headline
 
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
@@ -75,6 +77,7 @@ def write_index(
         "index.html.j2",
         generated,
         rows=ranked,
+        headline=headline,
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
         states=Counter(one.state for one in ranked),
         kinds=Counter(one.service.kind for one in ranked),
@@ -93,7 +96,7 @@ def write_index(
 
 def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     """Count machines by their median remaining travel; the last bin is beyond the horizon."""
-    median = len(constants.RUL_LEVELS) // 2
+    median = len(RUL_LEVELS) // 2
     left = [one.life.any.travel[median] / 1000 for one in summaries if one.life]
     edges = [0.0, *constants.LIFE_EDGES, np.inf]
     labels = ["passed", *(f"to {number(edge)}" for edge in edges[1:-1]), "more", "beyond"]

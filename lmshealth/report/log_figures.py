@@ -16,6 +16,7 @@ from scipy.stats import gamma
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
+from lmshealth._private.names import spell
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.search import Found
@@ -28,7 +29,6 @@ from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
 from lmshealth.report import figures, tables
 from lmshealth.report.rendering import render
-from lmshealth.report.text import spell
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
 

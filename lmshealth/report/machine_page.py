@@ -14,19 +14,23 @@ from typing import Any, TypeVar
 
 import numpy as np
 
+from lmshealth._private.names import spell
 from lmshealth.io.log import Refusal
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
-from lmshealth.life.maintenance_decision import Service, day_after, probability_before
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
-from lmshealth.report import constants, figures
-from lmshealth.report.assessment import Assessment, Summary, changes, first_limit, limit_of
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.constants import LEVELS
+from lmshealth.machine.next_step import first_limit
+from lmshealth.machine.notices import chi_square_band, notices
+from lmshealth.machine.service import Service, day_after, probability_before
+from lmshealth.machine.summary import Summary, limit_of
+from lmshealth.report import constants, figures, wording
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
-from lmshealth.report.notices import notices
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import track_rows
-from lmshealth.report.text import GAP, coarse, km, spell
+from lmshealth.report.text import GAP, coarse, km
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -59,7 +63,7 @@ def make_page(
     generated : datetime, optional
         Printed as the time at which the page was written.
     """
-    service, parameters = summary.service, assessment.stage.parameters
+    service = summary.service
     highest = max((one.high for one in summary.health), default=1.0)
     content = {
         "assessment": assessment,
@@ -70,7 +74,9 @@ def make_page(
         "postponed": list(_postponed(assessment.prognosis, service)),
         "first_limit": first_limit(assessment.prognosis),
         "before": before,
-        "news": before and [*changes(before, summary, parameters)],
+        "headline": wording.headline(summary),
+        "to_do": wording.next_step(summary.step),
+        "news": before and [*wording.changes(before, summary)],
         **_track_content(assessment),
         **_health_content(assessment),
     }
@@ -111,7 +117,7 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
     """Compare χ² with its 95 % interval; None without degrees of freedom."""
     if dof <= 0:
         return None
-    low, high = figures.chi_square_band(np.array(dof, dtype=float)).tolist()
+    low, high = chi_square_band(np.array(dof, dtype=float)).tolist()
     side = "above" if value > high else "below" if value < low else "inside"
     return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
 
@@ -190,7 +196,7 @@ def _nis(track: Track) -> dict[str, Any] | None:
     seen = (track.nis_dof > 0) & np.isfinite(track.nis)
     nis, dof = track.nis[seen], track.nis_dof[seen]
     total = chi_square_side(float(nis.sum()), float(dof.sum()))
-    low, high = figures.chi_square_band(dof)
+    low, high = chi_square_band(dof)
     inside = int(np.sum((nis >= low) & (nis <= high)))
     return total and {"inside": inside, "epochs": nis.size, "side": total["side"]}
 
@@ -239,7 +245,7 @@ def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str,
 
 def _pace(law: LawPrior, pace: Pace) -> str:
     """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
-    low, middle, high = (float(q) for q in pace.quantile(np.array(constants.LEVELS)))
+    low, middle, high = (float(q) for q in pace.quantile(np.array(LEVELS)))
     if law.field == "life_km":
         return f"life {km(1e3 * middle)} ({coarse(low)} to {coarse(high)})"
     low, middle, high = (1e5 * rate for rate in (low, middle, high))  # % per 1,000 km

@@ -1,34 +1,36 @@
 """Tables of a run and of single logs, with the columns of the public contract (units in names)."""
 
+from __future__ import annotations
+
 import csv
 import io
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, astuple
-from datetime import date
 from itertools import combinations
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
-from lmshealth.life.maintenance_decision import ProbabilityBounds, Service
-from lmshealth.modal.deterministic.frequency_response import FrfReading
-from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.mode_shapes import ModeShapes
-from lmshealth.modal.modes import Modes
-from lmshealth.report.assessment import Assessment, Life, summarise_life
-from lmshealth.report.constants import RUL_LEVELS
-from lmshealth.report.notices import notices
-from lmshealth.signal.acceleration_levels import Growth, Magnitude
-from lmshealth.signal.following_error import FollowingError
-from lmshealth.signal.spectral_lines import Line
-from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
+from lmshealth.machine.notices import notices
+from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.stage.planning import Plan
-from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Track, mode_columns
+
+if TYPE_CHECKING:  # so that help needs no scipy.stats
+    from lmshealth.machine.assessment import Assessment
+    from lmshealth.modal.deterministic.frequency_response import FrfReading
+    from lmshealth.modal.log_estimates import LogEstimates
+    from lmshealth.modal.mode_shapes import ModeShapes
+    from lmshealth.modal.modes import Modes
+    from lmshealth.signal.acceleration_levels import Growth, Magnitude
+    from lmshealth.signal.following_error import FollowingError
+    from lmshealth.signal.spectral_lines import Line
+    from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
+    from lmshealth.stage.planning import Plan
+    from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
@@ -201,39 +203,6 @@ def events_rows(track: Track) -> list[Row]:
         )
         for one in track.events
     ]
-
-
-def prognosis_rows(
-    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
-) -> list[Row]:
-    """Return a remaining life, one row per limit and one for any, which has the service.
-
-    ``before`` is a day with the probabilities that a limit is reached before it: extra columns.
-    """
-    fleet = life.calibration
-    of_any = (
-        *(service.kind, service.by, service.risk, service.inspect_by),
-        *(_or_none(service.inspect_every / _KM), service.earliest_end),
-        *((_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives) if fleet else [None] * 3),
-    )
-    rows = []
-    for j, one in enumerate(life.limits):
-        days = np.array(one.days)
-        quantiles = np.concatenate([np.array(one.travel) / _KM, 24 * days, days]).tolist()
-        pairs = zip(RUL_LEVELS, one.days, strict=True)
-        row = TABLES["prognosis"].row(
-            *(life.stage, one.parameter, one.limit),
-            *(None if np.isinf(value) else value for value in quantiles),
-            next((level for level, wait in pairs if np.isinf(wait)), None),
-            *(one.beyond_horizon, one.already_past),
-            *(of_any if one.parameter == "any" else [None] * len(of_any)),
-        )
-        if before is not None:
-            day, reached = before
-            at_least, at_most = reached.at_least[j], reached.at_most[j]
-            row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
-        rows.append(row)
-    return rows
 
 
 def error_row(log: str, error: FollowingError) -> Row:

@@ -10,21 +10,18 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.names import spell
+from lmshealth.machine.constants import LEVELS
 from lmshealth.report import constants
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
-    from lmshealth.life.maintenance_decision import Service
+    from lmshealth.machine.service import Service
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB"}
 
 Number = float | np.floating[Any]
-
-
-def spell(name: str) -> str:
-    """Return a name with blanks instead of underscores."""
-    return name.replace("_", " ")
 
 
 def plain(text: str) -> str:
@@ -172,9 +169,7 @@ def service_text(service: Service) -> str:
     return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
 
 
-def quantiles(
-    values: FloatArray, levels: tuple[float, ...] = constants.LEVELS
-) -> tuple[float, ...]:
+def quantiles(values: FloatArray, levels: tuple[float, ...] = LEVELS) -> tuple[float, ...]:
     """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
 

@@ -392,12 +392,12 @@ def shipped() -> tuple[str, ...]:
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
 
 
-def load_stage(reference: str, *, follow_links: bool = False) -> Stage:
+def load_stage(reference: str | Path, *, follow_links: bool = False) -> Stage:
     """Load and check a stage description.
 
     Parameters
     ----------
-    reference : str
+    reference : str or Path
         A path ending in ``.toml``, or the name of a shipped description.
     follow_links : bool, optional
         Whether its modal map may lie outside the folder of the description.
@@ -422,6 +422,7 @@ def load_stage(reference: str, *, follow_links: bool = False) -> Stage:
     >>> np.exp(stage.drift(np.log([[0.8, 1.0]]), ("roll", "pitch"))).round(3)
     array([[0.979, 0.97 ]])
     """
+    reference = str(reference)
     if reference.endswith(".toml"):
         path = Path(reference)
     elif reference in shipped():

@@ -45,7 +45,7 @@ sorted(path.name for path in result.index.parent.iterdir())
 
 # %%
 for row in result.rows:
-    print(f"{row.identity} ({lives[row.identity]}): {row.headline}")
+    print(f"{row.identity} ({lives[row.identity]}): {row.verdict}")
 
 # %%
 verdicts = pd.read_csv(folder / "result" / "verdict.csv").set_index("stage")

@@ -371,9 +371,10 @@ def test_damage_of_what_was_announced_announces_it_again(nights: Nights, table: 
     """A damaged row costs a second message about its machine, and no first one."""
     fails = (sys.executable, "-c", "raise SystemExit(1)")
     nights.run(N_BEFORE + 3, command=fails if table == "unsent" else nights.command)
-    name = f"{table}_{constants.SCHEMA}"
+    name = f"values_{constants.SCHEMA}"
     with closing(sqlite3.connect(nights.out / "lmshealth.sqlite")) as file, file:
-        (rowid,) = file.execute(f"SELECT min(rowid) FROM {name}").fetchone()
+        first = f"SELECT min(rowid) FROM {name} WHERE kind = ?"
+        (rowid,) = file.execute(first, (table,)).fetchone()
         file.execute(f"UPDATE {name} SET content = x'00' WHERE rowid = ?", (rowid,))
     found = nights.run(N_BEFORE + 3)
     assert "1 damaged rows" in found.notes[0] and table in found.notes[0]

@@ -5,7 +5,8 @@ from contextlib import closing
 from pathlib import Path
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import Resources, _identified, _Outcome, _Task
+from lmshealth.batch.cache import Resources
+from lmshealth.batch.ingest import _identified, _Outcome, _Task
 from lmshealth.batch.store import Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal

@@ -15,7 +15,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -33,6 +33,7 @@ from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import assess as assessing
 from lmshealth.batch import constants, outputs, workers
 from lmshealth.batch import ingest as ingesting
+from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
@@ -48,9 +49,11 @@ from lmshealth.life.posterior import fit as life_posterior
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.prognosis import prognose
+from lmshealth.machine import assessment as machine_assessment
+from lmshealth.machine.assessment import Assessment, LifeState, assess_from
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment, Summary, summarise
 from lmshealth.report.machine_page import make_page
 from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
@@ -66,6 +69,9 @@ from tests.stops import Ring, stop
 __all__ = ["make"]
 
 N_LOGS = 6
+
+COUNT = f"SELECT count(*) FROM values_{constants.SCHEMA} WHERE kind = '{{}}'"
+UPDATE = f"UPDATE values_{constants.SCHEMA} SET content = x'00' WHERE kind = 'assessed'"
 
 
 def rows(path: Path) -> list[dict[str, str]]:
@@ -298,7 +304,7 @@ def test_a_second_run_takes_all_from_the_store_and_the_truth_does_not_matter(
 ) -> None:
     """With truth.csv deleted a second run remembers every log and result: the same bytes."""
     (done.logs / "truth.csv").unlink()
-    monkeypatch.setattr(assessing, "_assess", None)  # nothing may be inferred again
+    monkeypatch.setattr(assessing, "assess_from", None)  # nothing may be inferred again
     again = run(done.logs, [done.stage], done.out, Settings(epochs=2))
     # The broken file is identified by its content and tried no more than once.
     assert again.n_remembered == N_LOGS + 2
@@ -421,7 +427,7 @@ def run_twice(
 
     count(ingesting, "content_digest", "hashed", lambda path: path.name)
     count(ingesting, "read_log", "read", lambda path: path.name)
-    count(assessing, "_assess", "assessed", lambda _, machine, __: machine.name)
+    count(assessing, "_assess_packed", "assessed", lambda job: job[0].name)
     count(outputs, "make_page", "drawn", lambda found, *_: found.history.stage)
     patch.setattr(constants, "OTHERS_POLL_S", 0.05)
     patch.setattr(constants, "SETTLED_S", -1)
@@ -501,8 +507,8 @@ def test_two_processes_on_a_server_divide_an_archive(
 
 
 def _ask_count(store: Store) -> Any:
-    with store._begin() as connection:
-        return connection.scalar(text(f"SELECT count(*) FROM identified_{constants.SCHEMA}"))
+    with store.transaction() as connection:
+        return connection.scalar(text(COUNT.format("identified")))
 
 
 def test_work_that_another_run_leaves_is_done(
@@ -689,7 +695,7 @@ def test_an_assessment_that_cannot_be_read_is_made_again(
     run(logs, [modes_only], out)
     before = tables(out), pages(out)
     with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file, file:
-        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
+        file.execute(UPDATE)
     run(logs, [modes_only], out)
     assert assessed == ["test-A"] * 2
     assert (tables(out), pages(out)) == before
@@ -720,13 +726,13 @@ def test_a_fleet_update_that_cannot_be_read_is_repeated(
         lambda machines, store: ((machine, learned, ()) for machine in machines),
     )
     # Without parameters there is nothing to fit.
-    monkeypatch.setattr(assessing, "fit_life", lambda *_, **__: None)
-    monkeypatch.setattr(assessing, "_with_life", lambda made, *_: made)
+    monkeypatch.setattr(machine_assessment, "fit_life", lambda *_, **__: None)
+    monkeypatch.setattr(machine_assessment, "_with_life", lambda made, *_: made)
     run(logs, [modes_only], tmp_path / "out")
     before = pages(tmp_path / "out")
     with closing(sqlite3.connect(tmp_path / "out" / "lmshealth.sqlite")) as file, file:
-        (n,) = file.execute(f"SELECT count(*) FROM assessed_{constants.SCHEMA}").fetchone()
-        file.execute(f"UPDATE assessed_{constants.SCHEMA} SET content = x'00'")
+        (n,) = file.execute(COUNT.format("assessed")).fetchone()
+        file.execute(UPDATE)
     assert n == 2
     result = run(logs, [modes_only], tmp_path / "out")
     assert result.failed == {}
@@ -756,14 +762,14 @@ def test_a_machine_that_cannot_be_assessed_does_not_end_the_batch(
     """It is named with the reason, and the others are reported."""
     logs = write_archive(tmp_path / "logs", 2)
     write_log(logs / "b.h5", 1.0, 7, stage="other-A")
-    whole = assessing._assess
+    whole = assess_from
 
     def fail(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         if readings[0].metadata.stage == "other-A":
             raise ZeroDivisionError("a mistake of ours")
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "_assess", fail)
+    monkeypatch.setattr(assessing, "assess_from", fail)
     result = run(logs, [modes_only], tmp_path / "out")
     assert [row.identity for row in result.rows] == ["test-A"]
     assert set(result.failed) == {"other-A"}
@@ -785,13 +791,13 @@ def test_a_changed_description_is_done_again(tmp_path: Path, modes_only: Stage) 
 def assessed(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """List the machines that are assessed and not remembered."""
     machines: list[str] = []
-    whole = assessing._assess
+    whole = assess_from
 
     def listen(readings: Sequence[LogEstimates], *given: Any, **options: Any) -> Any:
         machines.append(str(readings[0].metadata.stage))
         return whole(readings, *given, **options)
 
-    monkeypatch.setattr(assessing, "_assess", listen)
+    monkeypatch.setattr(assessing, "assess_from", listen)
     return machines
 
 
@@ -1026,7 +1032,7 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     fresh = prognose(history, prior.apply_to(own.stage), seed=1, chains=False)
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
-    stored = assessing.StoredLife(start, 15, "healthy", "", ())
+    stored = LifeState(start, 15, "healthy", "", ())
     job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(stored), 40, prior, ())
     made = assessing._update(job)
     assert isinstance(made, PackedAssessment)
@@ -1058,3 +1064,16 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     few = assessing._update(job)
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None
+
+
+def test_a_run_as_on_a_day_repeats(tmp_path: Path, modes_only: Stage) -> None:
+    """Status and silence are those of the end of that day, whenever the run is; pages stay."""
+    logs = write_archive(tmp_path / "logs", 2)  # the last one of 11 January 2024
+    days, found = {"a": date(2024, 1, 15), "b": date(2024, 1, 15), "c": date(2024, 2, 1)}, {}
+    for name, today in days.items():
+        settings = Settings(today=today, alerts=Alerts(silent_days=7))
+        (found[name],) = run(logs, [modes_only], tmp_path / name, settings).statuses
+    assert (found["a"].silent, found["c"].silent) == (False, True)
+    status, other, later = ((tmp_path / name / "status.json").read_bytes() for name in "abc")
+    assert status == other != later
+    assert pages(tmp_path / "a") == pages(tmp_path / "c")

@@ -936,8 +936,8 @@ def test_an_unreadable_machine_is_reported_and_the_others_are_written(tmp_path: 
     store.close()
     with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
         file.execute(
-            f"UPDATE assessed_{constants.SCHEMA} SET content = x'00' WHERE machine = "
-            f"(SELECT machine FROM present_{constants.SCHEMA} WHERE name = 'M8-Y')"
+            f"UPDATE values_{constants.SCHEMA} SET content = x'00' "
+            "WHERE kind = 'assessed' AND name = 'M8-Y'"
         )
     url = default_url(tmp_path).render_as_string()
     result = call("report", "--store", url, "--out", tmp_path / "pages")
@@ -1003,7 +1003,7 @@ def test_an_interrupt_has_its_status(
     def interrupted(*arguments: object, **options: object) -> None:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("lmshealth.cli.archive_commands.run_pipeline", interrupted)
+    monkeypatch.setattr("lmshealth.batch.run.run", interrupted)
     monkeypatch.setattr("lmshealth.cli.stage_commands.check_stage", interrupted)
     words = [tmp_path, "--stage", "lms-y", "--out", tmp_path / "out"] if kept else ["lms-y"]
     result = call(command, *words)

@@ -23,12 +23,13 @@ from lmshealth.cli.views import (
     print_summaries,
     print_track,
 )
-from lmshealth.life.maintenance_decision import decide, probability_before
 from lmshealth.life.prognosis import LawWeight, Prognosis
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.service import decide, probability_before
+from lmshealth.machine.summary import prognosis_rows, summarise, summarise_life
 from lmshealth.modal.naming import Difference
-from lmshealth.report.assessment import Assessment, summarise, summarise_life
 from lmshealth.report.fleet_page import by_urgency
-from lmshealth.report.tables import prognosis_rows, stage_rows
+from lmshealth.report.tables import stage_rows
 from lmshealth.report.text import service_text
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.description import Decision, Stage, load_stage

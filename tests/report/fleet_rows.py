@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io.log import Refusal
-from lmshealth.life.maintenance_decision import Service
-from lmshealth.report.assessment import Life, LimitLife, ParameterHealth, State, Summary
+from lmshealth.machine.next_step import NextStep
+from lmshealth.machine.service import Service
+from lmshealth.machine.summary import Life, LimitLife, ParameterHealth, State, Summary
 
 TODAY = date(2026, 11, 20)
 HORIZON = 20e6
@@ -40,9 +41,6 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
     level = rng.uniform(0.66, 0.9, 2) if worn else rng.uniform(0.94, 1.03, 2)
     lost = [name for name, value in zip(LIMITS, level, strict=True) if value < 0.88]
     days = float(rng.uniform(-60, 400) if worn else rng.uniform(200, 6000))
-    headline = "Not enough data for a verdict" if young else "Healthy"
-    if worn:
-        headline = f"Loss of {' and '.join(lost or LIMITS)}".replace("_", " ")
     state: State = "open" if young else "bad" if worn else "good"
     service = _service(None if young else days)
     probability = rng.uniform(0.8, 1)
@@ -57,13 +55,15 @@ def _row(k: int, rng: np.random.Generator) -> Summary:
         n_logs=40,
         travel=1e6,
         state=state,
-        headline=headline,
-        verdict=state,
+        alarmed=(),
+        lost=tuple(lost or LIMITS) if worn else (),
+        verdict="not-enough-data" if young else "both" if worn else "healthy",
         probability=np.nan if young else probability,
         why="as drawn",
         health=health,
         life=None if young else _life(identity, 1.6 * days),
         service=service,
+        step=NextStep("none"),
     )
 
 

@@ -11,15 +11,17 @@ import numpy as np
 import pytest
 
 from lmshealth._private.serialize import pack, unpack
-from lmshealth.life.maintenance_decision import Service
-from lmshealth.report.assessment import (
+from lmshealth.life.verdict import degraded_words
+from lmshealth.machine.next_step import NextStep
+from lmshealth.machine.service import Service
+from lmshealth.machine.summary import (
     Life,
     LimitLife,
     ParameterHealth,
     Summary,
-    changes,
     summarise,
 )
+from lmshealth.report.wording import changes
 from lmshealth.stage.description import ParameterSpec, load_stage
 from lmshealth.stage.priors import Lognormal
 from tests.assessments import nothing, worn
@@ -69,13 +71,15 @@ def summary(state: dict[str, Any]) -> Summary:
     service = Service("by", by, 1.0, 0.05, None, (np.nan, np.nan), 0.05, None)
     more: dict[str, Any] = {"health": tuple(health), "life": life, "service": service}
     page: dict[str, Any] = {"file": "a.html", "identity": "M7-Y", "urgency": (0, 0.0, 0.0, "M7-Y")}
-    return Summary(**own, **more, **page, state="good", headline="", why="")
+    lost = tuple(one.name for one in PARAMETERS if one.word in degraded_words(own["verdict"]))
+    of_verdict: dict[str, Any] = {"alarmed": (), "lost": lost, "step": NextStep("none")}
+    return Summary(**own, **more, **page, **of_verdict, state="good", why="")
 
 
 def sentences(now: dict[str, Any] | Summary, before: dict[str, Any] | Summary = THEN) -> list[str]:
     """Give the sentences with all spaces alike."""
     one, other = (x if isinstance(x, Summary) else summary(x) for x in (before, now))
-    return [sentence.replace("\u202f", " ") for sentence in changes(one, other, PARAMETERS)]
+    return [sentence.replace("\u202f", " ") for sentence in changes(one, other)]
 
 
 def test_every_number_of_two_reports_is_set_side_by_side() -> None:

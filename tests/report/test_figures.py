@@ -18,8 +18,8 @@ from matplotlib.figure import Figure
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life.health import Health
-from lmshealth.life.maintenance_decision import decide
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.service import decide
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import figures as plots
 from lmshealth.report.text import plain

@@ -14,7 +14,8 @@ import numpy as np
 import pytest
 
 from lmshealth._private.serialize import pack, unpack
-from lmshealth.report.assessment import Assessment, Summary, summarise
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.text import GAP
 from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
@@ -330,7 +331,8 @@ def test_no_name_is_ever_run(browser: Any, tmp_path: Path) -> None:
             row,
             identity=evil,
             file=files[evil],
-            headline=evil,
+            verdict=evil,
+            lost=(evil,),
             health=tuple(replace(one, name=evil) for one in row.health),
         )
         for row, evil in zip(rows, HOSTILE, strict=True)

@@ -199,12 +199,12 @@ def test_the_search_shows_its_poles_and_leaves_out_lines_that_wander(log: Log) -
     marks = {str(line.get_label()): line for line in whole.axes[-1].lines}
     stable: Any = marks["stable pole of the search"].get_xydata()
     assert np.median(stable[:, 0]) == pytest.approx(62.0, abs=1.0)
-    line = Harmonic(60.0, 59.0, 61.0, 1.0, 0, np.full((2, 2), 1e6, dtype=complex))
+    line = Harmonic(60.0, 59.0, 61.0, 1.0, 0, np.full(2, 1e3, dtype=complex))
     fitted = []
     for fit in reading.fitted:
         rows = [reading.spectra.channels.index(name) for name in fit.channels]
-        added = line.expected(fit.spectrum.frequency)[:, rows][:, :, rows]
-        fitted.append(replace(fit, expected=fit.expected + added / np.outer(fit.unit, fit.unit)))
+        added = np.abs(line.expected(fit.spectrum.frequency)[:, rows, 0]) ** 2
+        fitted.append(replace(fit, density=fit.density + added / fit.unit**2))
     sought = (replace(part, harmonics=(line,)),)
     other = replace(reading, fitted=tuple(fitted), sought=sought)
     again = draw(modes_figure(log, other, band=(40.0, 90.0)))

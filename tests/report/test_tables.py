@@ -13,12 +13,13 @@ import pytest
 
 from lmshealth._private.tables import RUN_TABLES, TABLES, Row
 from lmshealth.io.log import Metadata, Refusal
-from lmshealth.life.maintenance_decision import decide, probability_before
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import Verdict
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.service import decide, probability_before
+from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
-from lmshealth.report.assessment import Assessment, summarise_life
 from lmshealth.report.tables import (
     csv_text,
     join_csv,
@@ -26,7 +27,6 @@ from lmshealth.report.tables import (
     log_tables,
     machine_tables,
     modes_rows,
-    prognosis_rows,
     refused_rows,
     track_rows,
 )

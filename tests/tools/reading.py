@@ -19,9 +19,10 @@ from typing import Any
 
 from lmshealth._private.serialize import unpack
 from lmshealth.batch.store import Store, default_url
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.summary import limit_of
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report import figures, log_figures
-from lmshealth.report.assessment import Assessment, limit_of
 from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
 from studies.harness.command_line import ROOT, call
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.life import constants
-from lmshealth.stage.degradation_laws import AnyLaw, Free, Law
+from lmshealth.stage.degradation_laws import AnyLaw, Free
 from lmshealth.stage.description import ParameterSpec
 
 
@@ -24,7 +24,7 @@ class DegradationPath:
     step.
     """
 
-    law: Law
+    law: AnyLaw
     begin: float
     steps: tuple[float, ...]
 

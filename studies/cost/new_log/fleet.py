@@ -29,8 +29,8 @@ from lmshealth._private.seeds import seed_of
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
 from lmshealth.life.prognosis import prognose
+from lmshealth.machine.assessment import Assessment
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.track import accepted_estimates
 from studies.cost.archive import Steps

@@ -16,16 +16,16 @@ from pathlib import Path
 
 import numpy as np
 
-from lmshealth._private.serialize import fingerprint
+from lmshealth._private.serialize import fingerprint, pack
 from lmshealth.batch import run as running
-from lmshealth.batch.assess import Machine, assess, assess_all
-from lmshealth.batch.ingest import Progress, Resources
-from lmshealth.batch.store import Identified, OutcomeRow, Store, unpack_or_none
+from lmshealth.batch.assess import Machine, assess_all
+from lmshealth.batch.cache import Progress, Resources
+from lmshealth.batch.store import Identified, Store, unpack_or_none
 from lmshealth.batch.workers import processes
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.assessment import Assessment
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from studies.harness.cost import cpu_s, memory_bytes
@@ -44,10 +44,8 @@ def machine_of(
 ) -> Machine:
     """Return a machine with these logs, of which so many are in the store already; add the rest."""
     keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
-    store.put_identified(
-        OutcomeRow.of(key, log.digest, Identified(log, stage.digest, name))
-        for (_, key), log in zip(keys[stored:], logs[stored:], strict=True)
-    )
+    new = zip(keys[stored:], logs[stored:], strict=True)
+    store.put_identified({key: pack(Identified(log, stage.digest, name)) for (_, key), log in new})
     return Machine(name, tuple(keys), stage, NO_MAINTENANCE, epochs, SEED)
 
 

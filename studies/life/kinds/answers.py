@@ -112,12 +112,13 @@ def _shortened(how: str) -> Iterator[Answer]:
     if how == PUBLISHED:
         yield {}
         return
-    module: Any = import_module("lmshealth.batch.assess")
     if how == IMPORTANCE:
+        module: Any = import_module("lmshealth.machine.assessment")
         fit = module.fit_life
         with patch.object(module, "fit_life", lambda *a, **k: fit(*a, **(k | {"chains": False}))):
             yield {"epochs": 1}
         return
+    module = import_module("lmshealth.batch.assess")  # its place in that revision
     name = "prognose_with_posterior"
 
     def no_life(*_: Any, **__: Any) -> None:

@@ -165,7 +165,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def rows(store: str) -> dict[str, int]:
-    """Count the rows of every table of a store, their version left out of their names.
+    """Count the values of every kind, and the rows of the other tables of a store.
 
     Digests of files are left out: those of files that were written just now are not kept.
     """
@@ -173,10 +173,17 @@ def rows(store: str) -> dict[str, int]:
         return {}  # to connect would make it
     engine = create_engine(store)
     try:
-        names = [n for n in inspect(engine).get_table_names() if not n.startswith("hashed_")]
+        names = inspect(engine).get_table_names()
         with engine.connect() as connection:
-            counts = {n: connection.execute(text(f'SELECT count(*) FROM "{n}"')) for n in names}
-            return {re.sub(r"_\d+$", "", n): int(count.scalar_one()) for n, count in counts.items()}
+            found = dict[str, int]()
+            for name in names:
+                if name.startswith("values_"):
+                    kinds = text(f'SELECT kind, count(*) FROM "{name}" GROUP BY kind')
+                    found |= {kind: int(n) for kind, n in connection.execute(kinds)}
+                else:
+                    count = connection.execute(text(f'SELECT count(*) FROM "{name}"'))
+                    found[re.sub(r"_\d+$", "", name)] = int(count.scalar_one())
+            return {kind: n for kind, n in found.items() if kind != "hashed"}
     finally:
         engine.dispose()
 

@@ -7,9 +7,9 @@ from typing import Literal
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
-from lmshealth.life import constants
 from lmshealth.life.posterior.data import SECONDS_PER_DAY
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine import constants
 from lmshealth.stage.constants import MAX_RISK
 from lmshealth.stage.description import Decision
 

@@ -3,13 +3,14 @@
 from collections.abc import Iterator
 
 import numpy as np
+from scipy.special import gammaincinv
 
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.names import spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, SURPRISE
 from lmshealth.life.verdict import lone_sentence
-from lmshealth.report import figures
-from lmshealth.report.assessment import Assessment
-from lmshealth.report.text import spell
+from lmshealth.machine.assessment import Assessment
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -89,7 +90,7 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             what = lone_sentence(lone, assessment.stage)
             yield Notice("mode-off-map", "caution", lone.mode, what)
     dof = prognosis.degrees_of_freedom
-    if dof > 0 and prognosis.chi_square > figures.chi_square_band(np.array(dof))[1]:
+    if dof > 0 and prognosis.chi_square > chi_square_band(np.array(dof))[1]:
         what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof:.0f})."
         to_do = "Do not rely on the remaining life, and record further logs soon."
         yield Notice("laws-do-not-fit", "serious", "", what, to_do)
@@ -99,3 +100,8 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
         what += f"travel predicted for {CALIBRATED_RISK:.0%} of them (p = {fleet.p_value:.1g})."
         to_do = "Plan by the calibrated travel instead of the service date; add a law that fits."
         yield Notice("fleet-ends-early", "serious", "", what, to_do)
+
+
+def chi_square_band(dof: FloatArray) -> FloatArray:
+    """Return the 95 % interval of chi-square variables, shape ``(2, ...)``."""
+    return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])

@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import date
 
 import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.report.assessment import Summary, first_limit, summarise, summarise_life
+from lmshealth.machine.next_step import first_limit
+from lmshealth.machine.summary import Summary, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
+from lmshealth.report.wording import headline as headline_of
+from lmshealth.report.wording import next_step
 from lmshealth.tracking.change_detection import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
 
@@ -38,7 +42,7 @@ def test_every_verdict_has_a_headline(make: Maker, verdict: str, headline: str, 
     """A loss names the parameters of the description."""
     assessment = make()
     found = summary(replace(assessment, judgement=replace(assessment.judgement, verdict=verdict)))
-    assert (found.headline, found.state) == (headline, state)
+    assert (headline_of(found), found.state) == (headline, state)
 
 
 def test_an_alarm_replaces_a_missing_verdict(make: Maker) -> None:
@@ -52,7 +56,7 @@ def test_an_alarm_replaces_a_missing_verdict(make: Maker) -> None:
     judgement = replace(assessment.judgement, verdict="not-enough-data")
     found = replace(judged, judgement=judgement)
     expected = (f"Alarm: unexplained change of {track.modes[0]}", "bad")
-    assert (summary(found).headline, summary(found).state) == expected
+    assert (headline_of(summary(found)), summary(found).state) == expected
     assert found.urgency(found.service())[0] == 0
     quiet = replace(found, track=replace(track, events=()))
     assert quiet.urgency(quiet.service())[0] == 1
@@ -66,7 +70,7 @@ def test_a_description_without_parameters_has_no_verdict(make: Maker) -> None:
     stage = replace(assessment.stage, description=description)
     judgement = replace(assessment.judgement, verdict="no-alarm")
     found = summary(replace(assessment, stage=stage, health=None, judgement=judgement))
-    assert (found.headline, found.state) == ("Modes tracked, no alarm", "open")
+    assert (headline_of(found), found.state) == ("Modes tracked, no alarm", "open")
 
 
 def test_health_is_that_of_the_draws(make: Maker) -> None:
@@ -88,10 +92,22 @@ def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
     assessment = make()
     outside = replace(assessment.judgement, verdict="outside-map")
     found = summary(replace(assessment, judgement=outside))
-    assert found.to_do.startswith("Find out what moved the mode: its sensor, cables, payload")
-    assert "Order" in summary(assessment).to_do or "Do " in summary(assessment).to_do
+    sentence = next_step(found.step)
+    assert sentence.startswith("Find out what moved the mode: its sensor, cables, payload")
+    assert summary(assessment).step.kind in ("plan", "service-now")
     healthy = summary(make("sound", wear_km=400000, floor=0.98))
     assert summary(assessment).urgency < found.urgency < healthy.urgency
+
+
+def test_machines_are_sorted_by_the_calendar(make: Maker) -> None:
+    """A service on an earlier day comes first, whatever the days since the last log are."""
+    assessment = make()
+    service = assessment.service()
+    overdue = replace(service, kind="by", by=date(2026, 1, 1), wait=90.0)
+    due = replace(service, kind="by", by=date(2026, 3, 1), wait=10.0)
+    later = replace(service, kind="later", by=None, wait=np.inf)
+    keys = [assessment.urgency(one) for one in (overdue, due, later)]
+    assert keys == sorted(keys) and len(set(keys)) == 3
 
 
 def test_gauges_and_limits_are_of_the_same_draws(make: Maker) -> None:

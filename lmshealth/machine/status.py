@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from datetime import date, datetime, timedelta
 from typing import Any, Literal
 
 import msgspec
 import numpy as np
 
-from lmshealth._private.tables import Row
-from lmshealth.batch import constants
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
-from lmshealth.report.assessment import Assessment, Summary
-from lmshealth.report.notices import notices
-from lmshealth.report.tables import prognosis_rows
-from lmshealth.stage.constants import INFORMED
+from lmshealth.machine import constants
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.notices import notices
+from lmshealth.machine.summary import Summary, prognosis_rows
 
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
 """State by NAMUR NE 107, as OPC 10000-100 names the values of ``DeviceHealthEnumeration``."""
@@ -115,7 +113,7 @@ def coming_states(status: Status) -> dict[date, dict[str, DeviceHealth]]:
 
 
 def make_status(assessment: Assessment, summary: Summary) -> Status:
-    """Collect the status of a machine from its results, before it is compared and judged."""
+    """Collect the status of a machine from its results, judged on `Assessment.today`."""
     track, life, service = assessment.track, summary.life, summary.service
     alarms = undeclared_events(track, assessment.history.baseline, "alarm")
     shown = [one for one in summary.health if one.determined]
@@ -128,7 +126,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         }
         for one in shown
     ]
-    return Status(
+    made = Status(
         stage=summary.identity,
         page=summary.file,
         description=assessment.stage.name,
@@ -147,6 +145,14 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         service_by=service.by,
         inspect_by=service.inspect_by,
     )
+    return _judged(made, assessment.today or summary.recorded_at.date())
+
+
+def _judged(status: Status, today: date) -> Status:
+    """Set the conditions of a status on a day, and its state by NE 107."""
+    found = conditions(status, today)
+    state: DeviceHealth = next(iter(found.values()), "NORMAL")
+    return msgspec.structs.replace(status, conditions=found, device_health=state)
 
 
 def _or_none(value: float) -> float | None:
@@ -170,9 +176,7 @@ def compare(
     now = msgspec.structs.replace(
         now, schema=constants.JSON_SCHEMA, silent=silent, announced=announced
     )
-    found = conditions(now, moment.date())
-    state: DeviceHealth = next(iter(found.values()), "NORMAL")
-    now = msgspec.structs.replace(now, conditions=found, device_health=state)
+    now = _judged(now, moment.date())
     changes = [("alarm", "", mode) for mode in announced if mode not in known]
     changes += _transitions(before, now, moment)
     return now, [Change(now.stage, *one, now.recorded_at) for one in changes]
@@ -197,26 +201,3 @@ def _transitions(
 
 def _is_loss(verdict: str) -> bool:
     return verdict not in ("", "healthy", *NO_HEALTH)
-
-
-def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
-    """Return values of a machine with 90 % intervals for dashboards, from the rows of its tables.
-
-    Health (in units of the parameter) and frequency at its newest logs, remaining life at the last.
-    """
-    tables = {name: rows.get(name, ()) for name in ("health", "track", "prognosis", "verdict")}
-    found = [
-        ("health", row["parameter"], row["recorded_at"], row["q05"], row["median"], row["q95"])
-        for row in tables["health"]
-        if row["identifiable"] and row["informed"] >= INFORMED
-    ]
-    for row in tables["track"][-constants.TRACK_POINTS :]:
-        hertz, spread = row["frequency_hz"], 1.645 * row["frequency_std_hz"]
-        own = hertz - spread, hertz, hertz + spread
-        if np.isfinite(own).all():
-            found.append(("frequency_hz", row["mode"], row["recorded_at"], *map(float, own)))
-    for row in tables["prognosis"]:
-        own = tuple(row[f"rul_km_{name}"] for name in ("q05", "q50", "q95"))
-        found.append(("remaining_km", row["parameter"], tables["verdict"][0]["recorded_at"], *own))
-    names = "quantity", "subject", "recorded_at", "low", "median", "high"
-    return [dict(zip(names, own, strict=True)) for own in found]

@@ -12,8 +12,8 @@ from msgspec import structs
 from lmshealth._private.tables import TABLES
 from lmshealth.io.log import Refusal
 from lmshealth.life.posterior.fit import LoneMode
-from lmshealth.report.assessment import summarise
-from lmshealth.report.notices import notices
+from lmshealth.machine.notices import notices
+from lmshealth.machine.summary import summarise
 from lmshealth.report.tables import machine_tables
 from tests.assessments import Assessment, Maker, make, nothing
 

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 
 from lmshealth._private.serialize import pack, unpack
-from lmshealth.batch import assess as assessing
-from lmshealth.batch.assess import Machine, StoredLife
 from lmshealth.life import constants
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.machine import assessment as assessing
+from lmshealth.machine.assessment import Assessment, LifeState
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
@@ -58,24 +58,27 @@ def fits(monkeypatch: pytest.MonkeyPatch) -> list[tuple[bool, bool]]:
     return seen
 
 
-def machine(stage: Stage) -> Machine:
-    """Name no logs: their keys play no part."""
-    return Machine("", (), stage, NO_MAINTENANCE, 5, 0)
+def assess_from(
+    logs: list[LogEstimates], stage: Stage, before: LifeState | None
+) -> tuple[Assessment, LifeState | None]:
+    """Assess a machine without maintenance from the state before."""
+    how: dict[str, int] = {"epochs": 5, "seed": 0}
+    return assessing.assess_from(logs, stage, NO_MAINTENANCE, **how, before=before)
 
 
 def test_emcee_samples_the_first_and_each_sixteenth_log(
     stage: Stage, fits: list[tuple[bool, bool]]
 ) -> None:
     """In between importance sampling updates, from draws that a store has kept, and says so."""
-    before: StoredLife | None = None
+    before: LifeState | None = None
     found = {}
     for n in (13, 14, 15, 16, 17, 31, 33):
-        made, after = assessing._assess(readings(n), machine(stage), before)
+        made, after = assess_from(readings(n), stage, before)
         assert made.health is not None and after is not None
         (found[n],) = set(made.health.sampler)
         assert made.judgement.verdict == after.verdict == "healthy"
         assert after.n_logs == n
-        before = unpack(pack(after), StoredLife)
+        before = unpack(pack(after), LifeState)
     emcee = [n for n, sampler in found.items() if sampler == "emcee"]
     assert emcee == [13, 16, 33]
     assert fits == [(n in emcee, n > 13) for n in found]
@@ -85,10 +88,10 @@ def test_emcee_samples_where_the_verdict_changes(
     stage: Stage, fits: list[tuple[bool, bool]]
 ) -> None:
     """An update that turns healthy to degraded is repeated by chains, and these are published."""
-    _, before = assessing._assess(readings(17, loss=0.2), machine(stage), None)
+    _, before = assess_from(readings(17, loss=0.2), stage, None)
     assert before is not None and before.verdict == "healthy"
     fits.clear()
-    made, after = assessing._assess(readings(31, loss=0.2), machine(stage), before)
+    made, after = assess_from(readings(31, loss=0.2), stage, before)
     assert made.health is not None and after is not None
     assert made.judgement.verdict == after.verdict == "preload"
     assert set(made.health.sampler) == {"emcee"}

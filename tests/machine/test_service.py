@@ -12,14 +12,14 @@ from scipy.optimize import brentq
 from scipy.stats import weibull_min
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.life.maintenance_decision import (
+from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.service import (
     cheapest_travel,
     day_after,
     decide,
     probability_before,
     remaining_days,
 )
-from lmshealth.life.prognosis import Prognosis
 from lmshealth.stage.description import Decision
 from tests.lives import START, make_prognosis
 

@@ -1,0 +1,1 @@
+"""Assessment of one machine: verdict, service, next step, notices, status and summary."""

@@ -1,0 +1,317 @@
+"""Assessment of one machine: track, health, prognosis and verdict; update by its fleet.
+
+Everything here is a function of its arguments: no store, no file, no process, no clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from datetime import date
+
+import numpy as np
+from numpy.linalg import LinAlgError
+
+from lmshealth._private.seeds import seed_of
+from lmshealth._private.serialize import fingerprint
+from lmshealth.errors import LmshealthError, NotEnoughData
+from lmshealth.io.log import Notice, Refusal
+from lmshealth.life import constants
+from lmshealth.life.fleet_prior import (
+    Calibration,
+    EndedLife,
+    FleetPrior,
+    MachineEvidence,
+    calibrate,
+    ended_lives,
+    machine_evidence,
+)
+from lmshealth.life.health import Health, epochs_to_publish, health_of
+from lmshealth.life.posterior.exploration import LifeStart
+from lmshealth.life.posterior.fit import LifePosterior, fit_life
+from lmshealth.life.prognosis import Prognosis, parameters_with_limit, prognosis_of
+from lmshealth.life.verdict import (
+    NO_HEALTH,
+    OUTSIDE_MAP,
+    Verdict,
+    doubt_of_names,
+    judge,
+    undeclared_events,
+)
+from lmshealth.machine.service import Service, decide
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.modal.spectra_summary import Waterfall
+from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import History, build_history, missing_mode_notices, rate_notices
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
+from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
+
+
+@dataclass(frozen=True, slots=True, eq=False, repr=False)
+class Assessment:
+    """All results of one machine, as far as its data carry them."""
+
+    stage: Stage  # description that the logs were analysed with
+    history: History  # history, judgement: modal estimates of all logs, and the verdict
+    digests: tuple[str, ...]  # SHA-256 of each log of the history
+    track: Track | None  # none without an estimate of a tracked mode
+    health: Health | None  # none without a health parameter, or with too few logs
+    prognosis: Prognosis | None  # none without health, or without a limit
+    judgement: Verdict
+    refused: tuple[Refusal, ...]  # everything of this machine that was not analysed
+    notices: tuple[Notice, ...]  # about logs and maintenance; `notices` of this folder adds others
+    seed: int  # seed of all random streams
+    # Spectra of the logs of the history; None when no log covers the band of the modes.
+    waterfall: Waterfall | None = None
+    # Estimates of the last log, and of the first one of the baseline.
+    latest: LogEstimates | None = None
+    at_baseline: LogEstimates | None = None
+    # Evidence for the fleet prior; None without a posterior of the life.
+    evidence: MachineEvidence | None = None
+    # Fleet prior of the prognosis; None when it rests on the prior of the description.
+    fleet: FleetPrior | None = None
+    # Lives before the present baseline, and what those of the fleet support; None with too few.
+    ended: tuple[EndedLife, ...] = ()
+    calibration: Calibration | None = None
+    doubt: str = ""  # why the names of the modes are in doubt; then there is no health
+    today: date | None = None  # day of its status; None for that of the last log
+
+    def __repr__(self) -> str:
+        judged, service = self.judgement, self.service()
+        at = f"{judged.recorded_at.date()}: {judged.verdict}"
+        lines = [f"Assessment of {judged.stage} at {at}", judged.why]
+        lines += [f"Service: {service.kind} {service.by or ''}".rstrip()] * bool(self.prognosis)
+        parts = ("history", "track", "health", "prognosis")
+        there = ", ".join(name for name in parts if getattr(self, name) is not None)
+        lines.append(f"{len(self.history.logs)} logs, {len(self.refused)} refusals; with {there}")
+        return "\n".join(lines)
+
+    def service(self) -> Service:
+        """Choose the day of the service by the rule of the description."""
+        return decide(self.prognosis, self.stage.description.decision)
+
+    @property
+    def alarmed(self) -> tuple[str, ...]:
+        """Modes with an alarm since the baseline, when no verdict explains it."""
+        if self.judgement.verdict not in NO_HEALTH:
+            return ()
+        alarms = undeclared_events(self.track, self.history.baseline, "alarm")
+        return tuple(dict.fromkeys(event.mode for event in alarms))
+
+    @property
+    def compared(self) -> LogEstimates | None:
+        """The first log of the baseline, beside which the last is shown; None if it is the last."""
+        latest, before = self.latest, self.at_baseline
+        return before if latest and before and before.log != latest.log else None
+
+    @property
+    def latest_health(self) -> Health | None:
+        """The health as fractions of the baseline, if it has an epoch and a parameter."""
+        health = self.health
+        if health is None or not (health.recorded_at and health.parameters):
+            return None
+        return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
+
+    def urgency(self, service: Service) -> tuple[int, float, float, str]:
+        """Return a sort key: day of the service; without a verdict before safe machines.
+
+        Days of the calendar: a machine whose last log is old may be overdue.
+        """
+        identity, verdict = self.judgement.stage, self.judgement.verdict
+        if verdict in NO_HEALTH:
+            return (0 if self.alarmed else 1), 0.0, 0.0, identity
+        if verdict == OUTSIDE_MAP:
+            return 1, 0.0, 0.0, identity
+        if self.prognosis is None:
+            return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
+        day = np.inf if service.by is None else float(service.by.toordinal())
+        group = 2 if verdict == "healthy" and service.kind == "later" else 0
+        return group, day, float(self.prognosis.beyond_horizon()[-1]), identity
+
+
+def assess(
+    logs: Sequence[LogEstimates],
+    stage: Stage,
+    *,
+    work: Maintenance = NO_MAINTENANCE,
+    today: date | None = None,
+    epochs: int = 40,
+    seed: int = 0,
+) -> Assessment:
+    """Compute track, health, prognosis and verdict of one machine.
+
+    Parameters
+    ----------
+    logs : sequence of LogEstimates
+        Modal estimates of the logs of one machine, at least one.
+    stage : Stage
+        Its description.
+    work : Maintenance
+        Maintenance done to it.
+    today : date, optional
+        Day of its status (`make_status`); that of the last log by default.
+    epochs : int
+        Most epochs at which health is inferred.
+    seed : int
+        Of all random numbers.
+
+    Returns
+    -------
+    Assessment
+        Results that the data do not support are None, with the reason among the notices.
+
+    Examples
+    --------
+    Two logs are not enough for a baseline, and the verdict states that:
+
+    >>> import lmshealth
+    >>> from lmshealth import examples
+    >>> stage = lmshealth.load_stage("lms-y")
+    >>> found = lmshealth.assess(examples.readings()[:2], stage, epochs=1)
+    >>> found.judgement.verdict, found.judgement.why
+    ('not-enough-data', '2 usable logs since the baseline began; it needs 5.')
+    >>> found.notices[0].what.split("; ")[1]
+    'a life needs at least 3 logs and some travel'
+    """
+    found, _ = assess_from(logs, stage, work, epochs=epochs, seed=seed)
+    return replace(found, today=today)
+
+
+def assess_from(
+    readings: Sequence[LogEstimates],
+    stage: Stage,
+    work: Maintenance,
+    *,
+    epochs: int,
+    seed: int,
+    before: LifeState | None = None,
+) -> tuple[Assessment, LifeState | None]:
+    """Assess a machine as `assess` does, from the state that its assessment before has left.
+
+    Also returned is the state from which the next assessment begins.
+    """
+    history, refused = build_history(readings, stage, work.actions)
+    notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
+    notices += missing_mode_notices(history, refused) + rate_notices(refused)
+    not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
+    by_log = {reading.log: reading for reading in readings}
+    used = [by_log[log] for log in history.logs]
+    made = Assessment(
+        stage=stage,
+        history=history,
+        digests=tuple(reading.digest for reading in used),
+        track=None,
+        health=None,
+        prognosis=None,
+        judgement=judge(stage, history, None),
+        refused=(*not_excited, *refused),
+        notices=tuple(notices),
+        seed=seed,
+        waterfall=Waterfall.stack([(reading.spectra, reading.modes.lines) for reading in used]),
+        latest=used[-1] if used else None,
+        at_baseline=used[history.baseline] if used else None,
+    )
+    try:
+        tracked = track(history, stage)
+    except LmshealthError as error:
+        notice = Notice("no-result", "serious", "", str(error))
+        return replace(made, notices=(*made.notices, notice)), None
+    doubt = doubt_of_names(stage, history, tracked, used)
+    refused += outlier_refusals(history, tracked)
+    judgement = judge(stage, history, None, tracked, doubt=doubt)
+    made = replace(
+        made,
+        track=tracked,
+        doubt=doubt,
+        refused=(*not_excited, *refused),
+        judgement=judgement,
+    )
+    if doubt or not stage.parameters:
+        return made, None
+    try:
+        accepted = accepted_estimates(history, tracked)
+        return _with_results(made, accepted, epochs, before)
+    except LmshealthError as error:
+        why = str(error)
+    except LinAlgError as error:  # one machine must not end the run
+        why = (
+            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
+            "with modes.csv"
+        )
+    notice = Notice("no-result", "serious", "", why)
+    return replace(made, notices=(*made.notices, notice)), None
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class LifeState:
+    """State from which the next assessment of a machine begins."""
+
+    start: LifeStart  # draws of its posterior
+    n_logs: int
+    verdict: str
+    past: str  # fingerprint of the logs before the baseline, and the lives that ended with them
+    ended: tuple[EndedLife, ...]
+
+
+def _with_results(
+    made: Assessment, history: History, epochs: int, before: LifeState | None
+) -> tuple[Assessment, LifeState]:
+    """Add what follows from the posterior of the life of accepted estimates.
+
+    emcee draws it the first time, after each sixteenth log and where the verdict changes; otherwise
+    importance sampling updates it.
+    """
+    stage, every = made.stage, constants.EMCEE_EVERY
+    seed = seed_of(made.seed, history.stage, stage.digest)
+    past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
+    if before is None or before.past != past:
+        ended = ended_lives(history, stage, seed)
+    else:
+        ended = before.ended
+    chains = before is None or len(history.logs) // every > before.n_logs // every
+    start = None if before is None else before.start
+    life = fit_life(history, stage, seed, chains=chains, before=start)
+    found = _with_life(made, life, history, epochs)
+    if before is not None and not chains and found.judgement.verdict != before.verdict:
+        life = fit_life(history, stage, seed, before=start)
+        found = _with_life(made, life, history, epochs)
+    found = replace(found, ended=ended, evidence=machine_evidence(stage, life))
+    n_logs, verdict = len(history.logs), found.judgement.verdict
+    return found, LifeState(life.start, n_logs, verdict, past, ended)
+
+
+def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: int) -> Assessment:
+    """Add what follows from the draws of a life: health, remaining life and verdict."""
+    stage, prognosis, notices = made.stage, None, made.notices
+    health = health_of(life, history, stage, epochs_to_publish(history, stage, epochs))
+    if parameters_with_limit(stage):
+        try:
+            prognosis = prognosis_of(life, history, stage)
+        except NotEnoughData as error:
+            notices = (*notices, Notice("no-result", "serious", "", str(error)))
+    judgement = judge(stage, made.history, health, made.track, doubt=made.doubt)
+    return replace(made, health=health, prognosis=prognosis, judgement=judgement, notices=notices)
+
+
+def with_fleet_prior(
+    found: Assessment, prior: FleetPrior, *, epochs: int, before: LifeState | None
+) -> Assessment:
+    """Recompute health, prognosis and verdict with the prior of a fleet; there must be a track.
+
+    Coordinates of scenarios do not depend on what a fleet changes of a description: draws of the
+    posterior by the description are the start of that with the prior of the fleet.
+    """
+    assert found.track is not None  # of a machine with evidence
+    history = accepted_estimates(found.history, found.track)
+    stage = prior.apply_to(found.stage)
+    seed = seed_of(found.seed, history.stage, stage.digest)
+    start = None if before is None else before.start
+    life = fit_life(history, stage, seed, chains=before is None, before=start)
+    made = _with_life(replace(found, stage=stage), life, history, epochs)
+    return replace(made, stage=found.stage, fleet=prior)
+
+
+def with_calibration(found: Assessment, ended: Sequence[EndedLife]) -> Assessment:
+    """Calibrate a prognosis by the ended lives of the fleet; there must be one."""
+    assert found.prognosis is not None
+    return replace(found, calibration=calibrate(found.prognosis, tuple(ended)))

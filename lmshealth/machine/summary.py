@@ -1,0 +1,256 @@
+"""Summary of an assessment in a few numbers, for pages, terminals and later reports."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from datetime import date, datetime
+from typing import Literal
+
+import numpy as np
+
+from lmshealth._private.arrays import FloatArray
+from lmshealth._private.names import spell
+from lmshealth._private.tables import TABLES, Row
+from lmshealth.life.fleet_prior import Calibration
+from lmshealth.life.prognosis import LawWeight, Prognosis
+from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words
+from lmshealth.machine import constants
+from lmshealth.machine.assessment import Assessment
+from lmshealth.machine.next_step import NextStep, next_step
+from lmshealth.machine.service import ProbabilityBounds, Service, day_after, remaining_days
+from lmshealth.stage.description import ParameterSpec, Stage
+
+State = Literal["good", "bad", "open"]
+_KM = 1000.0
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterHealth:
+    """A health parameter now."""
+
+    name: str
+    determined: bool  # whether the data determine it; else its interval is mostly the prior
+    informed: float  # as `Health.informed`
+    low: float  # low, median, high: 5, 50 and 95 % quantiles, as fractions of the baseline
+    median: float
+    high: float
+    limit: float | None  # as a fraction of the baseline
+    below_limit: float  # probability of being below the limit; NaN without one
+    baseline: float = 1.0  # baseline, unit: baseline value with its unit; "" for a pure fraction
+    unit: str = ""
+    # Odometer in m, low, median and high of some epochs, in order; empty if not determined.
+    course: tuple[tuple[float, ...], ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class LimitLife:
+    """Remaining life until one limit, quantiles at `constants.RUL_LEVELS`."""
+
+    parameter: str  # of the limit; ``any`` for the first limit reached
+    limit: float  # limit, baseline: in the unit of the parameter; the limit of ``any`` is NaN
+    baseline: float
+    # travel, days: in m and days, at least 0, infinite beyond the horizon.
+    travel: tuple[float, ...]
+    days: tuple[float, ...]
+    dates: tuple[date | None, ...]  # days of the calendar; None beyond the horizon or the calendar
+    already_past: float  # already_past, beyond_horizon: probabilities
+    beyond_horizon: float
+
+    @property
+    def name(self) -> str:
+        """Name of the limit in words."""
+        return "any limit" if self.parameter == "any" else spell(self.parameter)
+
+    @property
+    def share(self) -> float:
+        """Limit as a fraction of the baseline."""
+        return self.limit / self.baseline
+
+
+@dataclass(frozen=True, slots=True)
+class Life:
+    """Remaining life of a machine in a few numbers."""
+
+    stage: str  # stage, recorded_at: identity of the machine, and its last log
+    recorded_at: datetime
+    # travel, horizon: odometer at the last log, and travel from there beyond which nothing is
+    # claimed, in m.
+    travel: float
+    horizon: float
+    limits: tuple[LimitLife, ...]  # one per limit, then any
+    laws: tuple[LawWeight, ...]
+    # Parameters with a limit that the modes do not determine: excluded.
+    undetermined: tuple[str, ...]
+    calibration: Calibration | None = None  # by the ended lives of the fleet
+
+    @property
+    def any(self) -> LimitLife:
+        """The life until any limit."""
+        return self.limits[-1]
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """A machine in a few numbers, for the fleet page, a terminal and later reports."""
+
+    file: str  # its page, in the folder of the fleet page
+    identity: str
+    urgency: tuple[int, float, float, str]  # sort key, most urgent first
+    recorded_at: datetime  # recorded_at, baseline_at: the last log, and that at the baseline
+    baseline_at: datetime
+    description: str  # digest of the stage description
+    n_logs: int
+    travel: float  # odometer at the last log in m, NaN without one
+    state: State  # ``good``, ``bad`` or ``open`` (no verdict)
+    alarmed: tuple[str, ...]  # as `Assessment.alarmed`
+    lost: tuple[str, ...]  # parameters that the verdict reports as degraded
+    verdict: str  # verdict, probability, why: as in `Verdict`
+    probability: float
+    why: str
+    health: tuple[ParameterHealth, ...]
+    life: Life | None
+    service: Service
+    step: NextStep
+
+
+def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
+    """Summarise an assessment, with its page and the result of `Assessment.service`."""
+    judgement, prognosis = assessment.judgement, assessment.prognosis
+    history, of_fleet = assessment.history, assessment.calibration
+    states: dict[str, State] = {"healthy": "good", OUTSIDE_MAP: "open"}
+    states |= dict.fromkeys(NO_HEALTH, "open")
+    state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
+    words = degraded_words(judgement.verdict)
+    lost = [spec.name for spec in assessment.stage.parameters if spec.word in words]
+    return Summary(
+        file=file,
+        identity=judgement.stage,
+        urgency=assessment.urgency(service),
+        recorded_at=judgement.recorded_at,
+        baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
+        description=assessment.stage.digest,
+        n_logs=len(history.logs),
+        travel=float(history.travel[-1]) if history.logs else np.nan,
+        state=state,
+        alarmed=assessment.alarmed,
+        lost=tuple(lost or words),
+        verdict=judgement.verdict,
+        probability=judgement.probability,
+        why=judgement.why,
+        health=tuple(_parameters(assessment)),
+        life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
+        service=service,
+        step=next_step(assessment, service),
+    )
+
+
+def summarise_life(
+    prognosis: Prognosis, stage: Stage, calibration: Calibration | None = None
+) -> Life:
+    """Summarise a prognosis: quantiles and probabilities of every limit, and of any."""
+    baselines = {spec.name: spec.baseline for spec in stage.parameters}
+    past, beyond = prognosis.already_past(), prognosis.beyond_horizon()
+    travel, days = np.maximum(prognosis.censored(), 0), np.maximum(remaining_days(prognosis), 0)
+    limits = []
+    for k, name in enumerate(prognosis.parameters):
+        baseline = baselines.get(name, 1.0)
+        wait = _quantiles(days[:, k])
+        limits.append(
+            LimitLife(
+                parameter=name,
+                limit=float(prognosis.limits[k]),
+                travel=_quantiles(travel[:, k]),
+                days=wait,
+                dates=tuple(day_after(prognosis, one) for one in wait),
+                already_past=float(past[k]),
+                beyond_horizon=float(beyond[k]),
+                baseline=baseline,
+            )
+        )
+    return Life(
+        stage=prognosis.stage,
+        recorded_at=prognosis.recorded_at,
+        travel=prognosis.travel,
+        horizon=prognosis.horizon,
+        limits=tuple(limits),
+        laws=prognosis.laws,
+        undetermined=prognosis.unidentifiable,
+        calibration=calibration,
+    )
+
+
+def _quantiles(values: FloatArray) -> tuple[float, ...]:
+    """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
+    levels = constants.RUL_LEVELS
+    return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
+
+
+def limit_of(spec: ParameterSpec) -> float | None:
+    """Return the limit of a parameter as a fraction of its baseline; None without one."""
+    return None if spec.limit is None else spec.limit.below / spec.baseline
+
+
+def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
+    health = assessment.latest_health
+    if health is None:
+        return
+    for k, spec in enumerate(assessment.stage.parameters):
+        limit, draws = limit_of(spec), health.samples[-1, :, k]
+        below = np.nan if limit is None else float(np.mean(draws < limit))
+        low, median, high = np.quantile(draws, constants.LEVELS).tolist()
+        determined = bool(health.publishable_parameters()[k])
+        rows = np.linspace(0, len(health.travel) - 1, constants.COURSE_POINTS).round().astype(int)
+        rows = np.unique(rows)
+        bands = np.quantile(health.samples[rows, :, k], constants.LEVELS, axis=1)
+        # Without an odometer the epochs are at equal distances.
+        at = health.travel if np.isfinite(health.travel).all() else np.arange(len(health.travel))
+        course = np.stack([at[rows], *bands], axis=1).round(4)
+        yield ParameterHealth(
+            name=spec.name,
+            determined=determined,
+            informed=float(health.informed[-1, k]),
+            low=low,
+            median=median,
+            high=high,
+            limit=limit,
+            below_limit=below,
+            baseline=spec.baseline,
+            unit=spec.unit,
+            course=tuple(map(tuple, course.tolist())) if determined else (),
+        )
+
+
+def prognosis_rows(
+    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
+) -> list[Row]:
+    """Return a remaining life, one row per limit and one for any, which has the service.
+
+    ``before`` is a day with the probabilities that a limit is reached before it: extra columns.
+    """
+    fleet = life.calibration
+    of_any = (
+        *(service.kind, service.by, service.risk, service.inspect_by),
+        *(_or_none(service.inspect_every / _KM), service.earliest_end),
+        *((_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives) if fleet else [None] * 3),
+    )
+    rows = []
+    for j, one in enumerate(life.limits):
+        days = np.array(one.days)
+        quantiles = np.concatenate([np.array(one.travel) / _KM, 24 * days, days]).tolist()
+        pairs = zip(constants.RUL_LEVELS, one.days, strict=True)
+        row = TABLES["prognosis"].row(
+            *(life.stage, one.parameter, one.limit),
+            *(None if np.isinf(value) else value for value in quantiles),
+            next((level for level, wait in pairs if np.isinf(wait)), None),
+            *(one.beyond_horizon, one.already_past),
+            *(of_any if one.parameter == "any" else [None] * len(of_any)),
+        )
+        if before is not None:
+            day, reached = before
+            at_least, at_most = reached.at_least[j], reached.at_most[j]
+            row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
+        rows.append(row)
+    return rows
+
+
+def _or_none(value: float) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,60 @@
+"""Analysis of one machine in one call: a folder, files and logs that are read give the same."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import lmshealth
+from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.io.column_map import column_map
+
+EXPORT = {"columns": {"acc_pitch_m_s2": "a2"}}
+
+
+@pytest.fixture(scope="module")
+def logs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write two logs of noise, which excite no mode, with a column of another name."""
+    folder = tmp_path_factory.mktemp("logs")
+    for k in range(2):
+        head = ["# sample_rate_hz: 1000", "# stage: AX-3-Y", f"# travel_km: {k}"]
+        head += [f"# recorded_at: 2026-07-1{k}T06:00:00Z", "a2"]
+        noise = np.random.default_rng(k).standard_normal(20_000)
+        np.savetxt(folder / f"{k}.csv", noise, header="\n".join(head), comments="")
+    return folder
+
+
+def test_a_folder_files_and_logs_give_the_same(logs: Path) -> None:
+    """Paths may be texts; a log that was read is not read again."""
+    stage = lmshealth.load_stage("lms-y")
+    paths = sorted(logs.glob("*.csv"))
+    read = [lmshealth.read_log(path, columns=EXPORT) for path in paths]
+    given: list[Any] = [str(logs), logs, paths, [str(path) for path in paths], read]
+    found = [lmshealth.analyse(one, stage, columns=EXPORT) for one in given]
+    assert {one.judgement.verdict for one in found} == {"not-enough-data"}
+    assert {len(one.refused) for one in found} == {6}  # three modes of two logs
+    refused = {(Path(row.log).name, row.mode) for one in found for row in one.refused}
+    assert len(refused) == 6
+
+
+def test_a_map_is_a_mapping_or_a_file(logs: Path, tmp_path: Path) -> None:
+    """Both read the same channels; a mapping with unknown keys is refused as a file is."""
+    path = tmp_path / "map.toml"
+    path.write_text('[columns]\nacc_pitch_m_s2 = "a2"\n')
+    for columns in (EXPORT, path, str(path), column_map(EXPORT)):
+        (channel,) = lmshealth.read_log(logs / "0.csv", columns=columns).channels
+        assert channel.name == "acc_pitch"
+    with pytest.raises(BadTable, match=r"column map: .*collumns"):
+        lmshealth.read_log(logs / "0.csv", columns={"collumns": {}})
+    with pytest.raises(BadTable, match=r"column map: .*one column twice"):
+        twice = {"acc_pitch_m_s2": "a2", "acc_roll_m_s2": "a2"}
+        lmshealth.read_log(logs / "0.csv", columns={"columns": twice})
+
+
+def test_without_a_usable_log_the_reason_is_named(logs: Path) -> None:
+    """Each log that was refused is in the error, by the name that was given."""
+    with pytest.raises(NotEnoughData, match=r"0\.csv: "):
+        lmshealth.analyse([logs / "0.csv"], lmshealth.load_stage("lms-y"))

@@ -1,0 +1,71 @@
+"""Next step: the table of cases by verdict, service and age, and the sentences."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from datetime import date
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from lmshealth.machine import constants
+from lmshealth.machine.next_step import CASES, NextStep, Step, next_step, step_of
+from lmshealth.report import wording
+from tests.assessments import Maker, make
+
+__all__ = ["make"]
+
+
+@pytest.mark.parametrize(
+    ("verdict", "service", "age", "expected"),
+    [
+        ("alarm", "by", "old", "inspect"),
+        ("outside", "now", "old", "find-cause"),
+        ("healthy", "unknown", "young", "none"),
+        ("open", "unknown", "young", "record"),
+        ("loss", "unknown", "old", "record"),
+        ("loss", "now", "old", "service-now"),
+        ("healthy", "now", "young", "service-now"),
+        ("healthy", "by", "young", "confirm"),
+        ("healthy", "by", "old", "plan"),
+        ("loss", "by", "young", "plan"),
+        ("healthy", "later", "old", "later"),
+    ],
+)
+def test_the_step_follows_from_verdict_service_and_age(
+    verdict: str, service: str, age: str, expected: Step
+) -> None:
+    """The first case that applies decides: alarms before services, young machines before plans."""
+    assert step_of(verdict, service, age) == expected
+
+
+def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
+    """No combination is without a case, and no step without words."""
+    for verdict in ("alarm", "outside", "open", "healthy", "loss"):
+        for service in ("now", "by", "later", "unknown"):
+            for age in ("young", "old"):
+                assert step_of(verdict, service, age) in get_args(Step)
+    assert {case[0] for case in CASES} == set(get_args(Step))
+    for kind in get_args(Step):
+        sentence = wording.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
+        assert (sentence == "") == (kind == "none")
+
+
+def test_a_healthy_young_machine_orders_no_service(
+    make: Maker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With few logs since the baseline further logs come before an order, with many the order."""
+    assessment = make()
+    assert assessment.prognosis is not None
+    healthy = replace(assessment, judgement=replace(assessment.judgement, verdict="healthy"))
+    service = replace(assessment.service(), kind="by", by=date(2027, 3, 1))
+    n_logs = len(healthy.history.logs) - healthy.history.baseline
+    monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs - 1)
+    assert next_step(healthy, service).kind == "plan"
+    monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs)
+    found = next_step(healthy, service)
+    assert found.kind == "confirm"
+    assert (found.by, found.horizon) == (date(2027, 3, 1), assessment.prognosis.horizon)
+    assert found.log_every == service.inspect_every / np.median(assessment.prognosis.usage)
+    assert "order nothing yet" in wording.next_step(found)
