@@ -114,7 +114,7 @@ class CrossSpectrum:
 
     def powers(self) -> FloatArray:
         """Return the periodograms of all channels, shape ``(n_ordinates, n_channels)``."""
-        return np.mean(self.transforms.real**2 + self.transforms.imag**2, axis=0)
+        return np.asarray(np.mean(np.abs(self.transforms) ** 2, axis=0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -120,8 +120,8 @@ def _project(spectrum: CrossSpectrum) -> ComplexArray:
     """Return the transforms without the directions of what no mode causes."""
     if spectrum.foreign is None:
         return spectrum.transforms
-    shown = spectrum.foreign.any(axis=1)
-    within = np.flatnonzero(shown.any(axis=1))
+    shown: BoolArray = np.abs(spectrum.foreign).sum(axis=1) > 0
+    within = np.flatnonzero(shown.sum(axis=1))
     root = np.sqrt(spectrum.powers()[within].mean(axis=0).clip(1e-300))
     transforms = spectrum.transforms.copy()
     patterns, place = np.unique(shown[within], axis=0, return_inverse=True)
