@@ -54,9 +54,13 @@ vain: after a minute work of a computer that was cut off is left to other runs."
 
 RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow", "future")
 """Reasons of refusal that depend on more than the log: on the moment, ``--max-memory``,
-``--allow-future`` or the speed of the computer. They are not stored, and the next run tries the log
-again. The same holds for logs that fail for lack of resources, by an error of this program, or by a
-crash of their process."""
+``--seconds-per-log``, ``--allow-future`` or the speed of the computer. They are not stored, and the
+next run tries the log again. The same holds for logs that fail for lack of resources, by an error
+of this program, or by a crash of their process."""
+
+LOG_SECONDS = 600.0
+"""Processor time in s after which a log is refused (``too-slow``): an hour of eight channels takes
+less than a minute. The option ``--seconds-per-log``."""
 
 ASSESSMENT_ATTEMPTS = 2
 """How often a machine is assessed in one run when its assessment is missing from the store, for

@@ -1,6 +1,7 @@
 """Ingest of an archive: every log is hashed, and identified once in the life of a store."""
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -64,6 +65,8 @@ class Settings:
         of the log contract.
     max_memory : float
         Most memory in bytes that reading a log may take.
+    seconds_per_log : float
+        Most processor time in s that the identification of a log may take.
     latest : datetime or None
         Latest moment of a log or of maintenance; None for a day from now.
     follow_links : bool
@@ -92,6 +95,7 @@ class Settings:
     seed: int = 0
     columns: ColumnMap | None = None
     max_memory: float = MAX_MEMORY
+    seconds_per_log: float = constants.LOG_SECONDS
     latest: datetime | None = None
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
@@ -194,7 +198,8 @@ def ingest(
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in known]
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
-    identify = partial(_identify_logs, stages=tuple(stages), how=how)
+    options = {"stages": tuple(stages), "how": how, "limit": settings.seconds_per_log}
+    identify = partial(_identify_logs, **options)
     done = 0
     for part in _identified(left, identify, resources, fetch):
         store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
@@ -395,16 +400,33 @@ def _crashed(tasks: Sequence[_Task], why: str) -> list[_Outcome]:
 
 
 def _identify_logs(
-    tasks: Sequence[_Task], stages: tuple[Stage, ...], how: Mapping[str, Any]
+    tasks: Sequence[_Task], stages: tuple[Stage, ...], how: Mapping[str, Any], limit: float
 ) -> list[_Outcome]:
     """Read and identify logs, and pack their outcomes where these are to be stored."""
-    return [_Outcome.of(task, identify_log(task, stages, how), is_new=True) for task in tasks]
+    found = (identify_log(task, stages, how, limit) for task in tasks)
+    return [_Outcome.of(task, one, is_new=True) for task, one in zip(tasks, found, strict=True)]
 
 
-def identify_log(task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any]) -> Identified:
+def _within(limit: float, name: str) -> Callable[[str, int, int], None]:
+    """Return a callback of progress that refuses (``too-slow``) a log at the end of its time."""
+    start = time.process_time()
+
+    def check(step: str, done: int, total: int) -> None:
+        if (taken := time.process_time() - start) > limit:
+            found = f"{step} {done} of {total} parts of the band after {taken:.3g} s of processor "
+            next_step = "record shorter or with fewer channels, or raise --seconds-per-log"
+            raise BadLog(name, "too-slow", f"{found}time, allowed are {limit:.3g} s: {next_step}")
+
+    return check
+
+
+def identify_log(
+    task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any], limit: float = math.inf
+) -> Identified:
     """Read and identify one log; every failure becomes its refusal, never an exception.
 
-    It is read with `max_memory` and `latest` of `read_log`.
+    It is read with `max_memory` and `latest` of `read_log`; the identification may take ``limit``
+    seconds of processor time.
     """
     by, stage, asked = "", None, None
     try:
@@ -419,7 +441,7 @@ def identify_log(task: _Task, stages: tuple[Stage, ...], how: Mapping[str, Any])
             by = _none_of(stages)
             raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
         by = described.digest
-        reading = read_modes(log, described)
+        reading = read_modes(log, described, progress=_within(limit, task.name))
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)
         rms, shapes = loop_error(log), mode_shapes(modes, reading.fitted)

@@ -40,6 +40,7 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         options.out_option(type=options.FOLDER, help="Folder for tables and report."),
         options.store_option(help=store),
         options.reading_options,
+        options.SECONDS_PER_LOG,
         options.WORKERS,
         scheduler,
         options.EPOCHS,

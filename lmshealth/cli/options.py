@@ -14,7 +14,7 @@ from typing import Any
 import click
 from msgspec.structs import replace
 
-from lmshealth.batch.constants import NOTIFY
+from lmshealth.batch.constants import LOG_SECONDS, NOTIFY
 from lmshealth.cli import terminal
 from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import ColumnMap, Layout, load_columns, load_layouts
@@ -186,6 +186,14 @@ MOST_MEMORY = click.option(
     metavar="GB",
     callback=lambda ctx, option, gigabytes: 1e9 * gigabytes,
     help="Refuse a log that needs more memory than this to be read (MAT, UFF58, TDMS).",
+)
+SECONDS_PER_LOG = click.option(
+    "--seconds-per-log",
+    type=Finite(0, min_open=True),
+    default=LOG_SECONDS,
+    show_default=True,
+    metavar="S",
+    help="Refuse a log whose identification takes more processor time than this.",
 )
 ALLOW_FUTURE = click.option(
     "--allow-future",

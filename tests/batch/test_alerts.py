@@ -55,7 +55,9 @@ class Nights:
         monkeypatch.setattr(ingest, "identify_log", self.identify)
         monkeypatch.setattr(outputs, "make_page", lambda *_, **__: "")
 
-    def identify(self, task: Any, stages: tuple[Stage, ...], max_memory: float) -> Identified:
+    def identify(
+        self, task: Any, stages: tuple[Stage, ...], how: dict[str, Any], limit: float
+    ) -> Identified:
         """Return the estimates that a file states."""
         machine, day, drift = task.path.read_text().split(",")
         rng = np.random.default_rng([*machine.encode(), int(day)])

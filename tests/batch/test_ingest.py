@@ -2,14 +2,20 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from hashlib import sha256
 from pathlib import Path
+
+import numpy as np
 
 from lmshealth.batch import constants
 from lmshealth.batch.cache import Resources
-from lmshealth.batch.ingest import _identified, _Outcome, _Task
+from lmshealth.batch.ingest import _identified, _Outcome, _Task, identify_log
 from lmshealth.batch.store import Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal
+from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.stage.description import load_stage
+from tests.signals import Mode, accelerations
 
 BAD = "log-0013"
 
@@ -59,3 +65,23 @@ def test_few_logs_are_spread_over_the_workers() -> None:
         parts = list(_identified(tasks, work, Resources(store, pool), lambda part: ()))
     assert len([one for part in parts for one in part]) == len(tasks)
     assert pool.sizes == [1] * len(tasks)
+
+
+def test_a_log_is_refused_at_the_end_of_its_time(tmp_path: Path) -> None:
+    """Its refusal states how far it came and the next step; with enough time it has modes."""
+    stage = load_stage("lms-y")
+    noise = accelerations(np.random.default_rng(1), [Mode(126.4, 0.015)], 20_000, 1000.0, 0.5)
+    path = tmp_path / "log.csv"
+    facts = {"sample_rate_hz": 1000, "stage": "one-Y", "recorded_at": "2026-01-01T00:00:00Z"}
+    facts |= {"travel_km": 10, "temperature_c": 21}
+    head = "\n".join([*(f"# {key}: {value}" for key, value in facts.items()), "acc_roll_m_s2"])
+    np.savetxt(path, noise[0], header=head, comments="")
+    digest = sha256(path.read_bytes()).hexdigest()
+    task = _Task(path, "log.csv", {}, digest, None)
+    short = identify_log(task, (stage,), {}, 1e-3)
+    (refusal,) = short.outcome if isinstance(short.outcome, tuple) else ()
+    assert refusal.reason == "too-slow"
+    assert "allowed are 0.001 s" in refusal.detail
+    assert "--seconds-per-log" in refusal.detail
+    assert not short.lasting
+    assert isinstance(identify_log(task, (stage,), {}, 60.0).outcome, LogEstimates)
