@@ -11,9 +11,8 @@ USABLE = 0.45
 # Standard deviations of ln f and ln ζ beyond which an estimate is refused: a frequency known to
 # 3 % cannot show the drifts that are tracked, a damping known to a factor of two cannot be used.
 WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
-# Most channels that are fitted together, those that add most to each other: cross spectra of 64
-# channels over a minute at 1 kHz take 2 GB each. Of 64 accelerometers, 16 take twelve times as long
-# as 10, for standard deviations 2 % smaller; 8 take half, for 5 % larger ones.
+# Most channels of free decays that are fitted together, those that add most to each other: the time
+# of a fit grows with the cube of their number, and 10 hold all but 2 % of the information of 16.
 MOST_CHANNELS = 10
 # Most modes that are fitted together.
 MOST_TOGETHER = 4

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from lmshealth import identify
+from lmshealth import Modes, identify
 from lmshealth.modal.ambient.joint_model import BandData, JointModel
-from lmshealth.modal.ambient.wandering import find_harmonic
+from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.signal.spectra import CrossSpectrum
 from studies.modes.without_description.worlds import FAMILIES, World, log_of
+from tests.signals import Mode, accelerations, make_log
 
 RATE, SECONDS = 128.0, 300.0
 FREQUENCY = np.arange(1, 12_000) / SECONDS
@@ -96,3 +99,97 @@ def test_the_score_of_the_joint_model_is_the_derivative_of_its_misfit() -> None:
     slope = (model(1e-5).misfit - model(-1e-5).misfit) / 2e-5
     assert gradient[0] == pytest.approx(slope, rel=1e-5)
     assert before.refined(3).misfit < before.misfit
+
+
+def many_channels(n: int, seconds: float, rate: float = 200.0) -> tuple[list[Mode], np.ndarray]:
+    """Return modes of which each moves few of n channels, and accelerations under white forces."""
+    rng = np.random.default_rng([n, 5])
+    places = [(12.0, 0.012), (17.0, 0.01), (24.0, 0.013), (31.0, 0.01)]
+    shapes = rng.standard_normal((4, n)) * (rng.random((4, n)) < 0.4)
+    shapes[range(4), [0, 1, 2, 3]] = 1.0  # the first channels show them all
+    shapes[3, 4:] *= 5.0
+    modes = [Mode(f, zeta, 1.0, tuple(x)) for (f, zeta), x in zip(places, shapes, strict=True)]
+    return modes, accelerations(rng, modes, round(seconds * rate), rate, 0.1)
+
+
+def identified_from(values: np.ndarray, rate: float = 200.0) -> Modes:
+    """Return the modes from 8 to 40 Hz that channels show."""
+    return identify(make_log({f"acc_{k:02d}": row for k, row in enumerate(values)}, rate),
+                    band=(8.0, 40.0))  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [12, 20])
+def test_more_channels_lose_no_mode(n: int) -> None:
+    """What four channels show is found in all of them, at its truth, and no channel is left out."""
+    modes, values = many_channels(n, 120.0)
+    few, all_ = identified_from(values[:4]), identified_from(values)
+    truth = np.log([mode.frequency for mode in modes])
+    for found in (few, all_):
+        assert len(found.names) == len(modes)
+        std = np.sqrt(np.diag(found.cov))[: len(modes)]
+        assert np.abs((found.ln_frequency - truth) / std).max() < 4
+    assert all_.shape_channels == tuple(f"acc_{k:02d}" for k in range(n))
+    assert not any(row.channel for row in all_.refused)
+
+
+@pytest.mark.slow
+def test_a_mode_that_only_later_channels_show_is_found() -> None:
+    """One of three in twenty-four that is strong in three others, which are weak in the first."""
+    rng = np.random.default_rng(9)
+    shapes = np.zeros((2, 24))
+    shapes[0, :21] = rng.choice([-1.0, 1.0], 21) * rng.uniform(5, 10, 21)
+    shapes[1, 21:] = [1.0, -0.8, 0.6]
+    modes = [Mode(12.0, 0.012, 1.0, tuple(shapes[0])), Mode(24.0, 0.01, 1.0, tuple(shapes[1]))]
+    found = identified_from(accelerations(rng, modes, 24_000, 200.0, 0.1))
+    assert found.frequency == pytest.approx([12.0, 24.0], rel=0.01)
+    # Negative control: the first channels alone do not show it.
+    alone = identified_from(accelerations(rng, modes, 24_000, 200.0, 0.1)[:21])
+    assert alone.frequency == pytest.approx([12.0], rel=0.01)
+
+
+def exact_model() -> JointModel:
+    """Return a model of two modes in four channels whose data are its own expectation."""
+    f, n = np.linspace(8.0, 40.0, 400), 4
+    phi = np.array([[1.0, 0.2], [-0.5, 0.6], [0.3, -0.9], [0.8, 0.4]])
+    r = np.array([[1.0, 0.4], [0.4, 1.0]])
+    data = BandData(f, np.full(400, 50.0), np.zeros((400, n, n), complex), None, np.ones(n),
+                    np.ones((1, 400)))  # fmt: skip
+    poles = np.array([14.0, 25.0]), np.array([0.02, 0.015])
+    model = JointModel(data, np.full((n, 1), 0.5), *poles, phi, np.zeros_like(phi), r)
+    return replace(model, data=replace(data, matrix=model.expected))
+
+
+def test_channels_are_added_by_what_they_have_in_common() -> None:
+    """On exact data the shapes of the added channels are true, and follow a sign."""
+    whole = exact_model()
+    few = whole.of_channels([0, 1])
+    added = few.with_channels(whole.data)
+    np.testing.assert_allclose(added.phi, whole.phi, rtol=1e-6)
+    half = few.with_channels(whole.data, lambda f: f > 20.0)
+    np.testing.assert_allclose(half.phi, whole.phi, rtol=1e-6)
+    turned = replace(whole.data, matrix=whole.data.matrix * np.array([[1], [1], [-1], [1]]))
+    np.testing.assert_allclose(few.with_channels(turned).phi[2], -whole.phi[2], rtol=1e-6)
+
+
+def test_joined_models_have_the_channels_of_both() -> None:
+    """Channels added in two steps are those added at once, with a mode that only one step has."""
+    whole = exact_model()
+    first = whole.of_channels([0, 1, 2])
+    other = whole.of_channels([0, 1, 3]).with_mode(33.0, 0.01, np.array([0.0, 0.0, 1.0]))
+    both = first.joined(other, 2, whole.data)
+    np.testing.assert_array_equal(both.phi[:, :2], whole.phi)
+    np.testing.assert_array_equal(both.phi[:, 2], [0.0, 0.0, 0.0, 1.0])
+    assert both.f.tolist() == [14.0, 25.0, 33.0]
+
+
+def test_a_harmonic_is_seen_by_all_channels() -> None:
+    """From the cross spectra in its band the column of the added channels follows."""
+    whole = exact_model()
+    column = np.array([3.0, -2.0 + 1j, 0.5, 4.0])
+    line = Harmonic(18.0, 17.0, 19.0, 1.0, 0, 10 * column[:2])
+    within = line.along(10 * column).expected(whole.data.frequency)
+    shown = replace(whole.data, matrix=whole.data.matrix + within @ within.conj().swapaxes(1, 2))
+    seen = line.seen_by(replace(whole, data=shown))
+    np.testing.assert_allclose(seen, 10 * column, rtol=0.02, atol=0.2)
+    assert line.along(seen).channel == 3
