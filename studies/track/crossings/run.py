@@ -31,8 +31,8 @@ from studies.track.crossings.lives import KINDS, Life, judge, make_life, nearest
 SEED = 20261124
 N_LIVES = 200
 NOT_MET = {
-    "no life is swapped silently": "a label is given from a probability of 95 % on; where estimates "
-    "are missing or spurious at the crossing, it is sometimes that of the other mode"
+    "no life is swapped silently": "a label is given from a probability of 95 % on, and where "
+    "estimates are missing or spurious at a crossing it is sometimes that of the other mode"
 }
 
 
