@@ -126,7 +126,7 @@ def search(
         first = _informative(spectra, low, high)
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
-    model = _without_splits(model, len(hints)) if hints else model
+    model = _without_splits(model, len(hints))
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
