@@ -41,7 +41,7 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 # Width of the bins at a resonance in damping ratios, of which the least counts, and the widest as a
 # fraction of the frequency.
 _BIN, _NARROWEST, _WIDEST_BIN = 0.4, 2e-3, 0.006
-_MOST_HARMONICS = 6
+_MOST_HARMONICS = 10
 # Channels that are searched together, and that are added to these at a time.
 _FIRST, _MORE = 8, 8
 # Of these, whose modes are not all refined, a residual shows a further mode from a larger gain on.

@@ -3,13 +3,15 @@
 A mode under random forces has a Gaussian response: of its complex envelope z the ratio
 E|z|⁴ / (E|z|²)² is 2. The harmonic of a shaft whose speed wanders has nearly constant amplitude:
 the ratio is 1, and 2 - s² where a share s of the power is its. Its spectrum alone may look like a
-mode's.
+mode's. Harmonics of one shaft wander together: the phase of the n-th is n times that of the first,
+by which the others are recognised, however weak they are.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from math import gcd
 
 import numpy as np
 from scipy.linalg import eigh
@@ -31,6 +33,11 @@ _STANDS_OUT = 2.0
 _LEAST_ORDINATES = 8
 # Its tails reach beyond where it stands out, by this share of that band to either side.
 _WIDER = 0.3
+# Ratios of the orders of harmonics of one shaft; least mean of a signal that is turned back by the
+# phase of another one, over its root mean square; and minus the logarithm of the probability of a
+# larger one by chance, exp(-N c²).
+_ORDERS = [(n, m) for n in range(1, 9) for m in range(1, 9) if n != m and gcd(n, m) == 1]
+_SAME_SHAFT, _CHANCE = 0.5, 7.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,11 +50,34 @@ class Harmonic:
     amplitude: float  # root mean square times √2 in the channel that shows it best, m/s²
     channel: int
     vector: ComplexArray  # column v of its covariance v v*, in (m/s²)/Hz^½, (n_channels,)
+    first: int = 0  # index of the Fourier frequency at which its signal begins
+    signal: ComplexArray = field(default_factory=lambda: np.zeros(0, complex))  # its transform
 
     def expected(self, frequency: FloatArray) -> ComplexArray:
         """Return the column in its band and zero elsewhere, ``(n, n_channels, 1)``."""
         within = (frequency >= self.low) & (frequency <= self.high)
         return np.asarray(within[:, None, None] * self.vector[:, None])
+
+    def follows(self, other: Harmonic) -> bool:
+        """Return whether both are harmonics of one shaft, from the phases of their signals.
+
+        Of a mode under random forces the phase is independent, and the mean of N ordinates turned
+        back by the phase of the other is of the order N^-½.
+        """
+        size = 4 * max(self.signal.size, other.signal.size)
+        if not size or self.frequency == other.frequency:
+            return False
+        own, theirs = (np.fft.ifft(one.signal, size) for one in (self, other))
+        turn = 2 * np.pi * np.arange(size) / size
+        phase = np.unwrap(np.angle(theirs)) + turn * other.first
+        least = max(_SAME_SHAFT, np.sqrt(_CHANCE / self.signal.size))
+        reach = (other.high - other.low) / other.frequency / 2
+        for n, m in _ORDERS:
+            if abs(self.frequency / other.frequency * m / n - 1) < reach:
+                turned = own * np.exp(-1j * (phase * n / m - turn * self.first))
+                if abs(turned.mean()) > least * np.sqrt(np.mean(np.abs(own) ** 2)):
+                    return True
+        return False
 
     def seen_by(self, model: JointModel) -> ComplexArray:
         """Return its column for the channels of a model, of which it was found in the first ones.
@@ -75,7 +105,8 @@ def find_harmonic(
     """Return the clearest harmonic that wanders among the modes; None if there is none.
 
     They are recognised in the first segment of the recording, without its lines. Less evidence is
-    needed in the bands of known harmonics, whose direction may vary, and at other lines, in Hz.
+    needed in the bands of known harmonics, whose direction may vary, and at other lines, in Hz; and
+    no other of one whose phase follows that of a known one.
     """
     at_line = near_lines(model.f, model.zeta, lines)
     found = [
@@ -86,7 +117,7 @@ def find_harmonic(
     for sigmas, harmonic, near in sorted(found, key=lambda one: one[0]):
         near |= any(harmonic.low < h.high and h.low < harmonic.high for h in known)
         needed = constants.WANDERING_SIGMAS / (2 if near else 1)
-        if sigmas < -needed:
+        if sigmas < -needed or any(harmonic.follows(h) for h in known):
             return harmonic
     return None
 
@@ -130,6 +161,7 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
     physical = phi * model.data.scale
     channel = int(np.argmax(np.abs(physical)))
     more = _WIDER * float(wide[-1] - wide[0])
+    reach = slice(*np.searchsorted(frequency, [wide[0] - more, wide[-1] + more]))
     return sigmas, Harmonic(
         float(np.average(wide, weights=power)),
         float(wide[0]) - more,
@@ -137,6 +169,8 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
         float(np.sqrt(2 * power.sum() / recording.duration) * abs(physical[channel])),
         channel,
         size * physical,
+        first=int(np.rint(frequency[reach.start] * recording.duration)),
+        signal=z[reach],
     )
 
 

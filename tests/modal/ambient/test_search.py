@@ -193,3 +193,31 @@ def test_a_harmonic_is_seen_by_all_channels() -> None:
     seen = line.seen_by(replace(whole, data=shown))
     np.testing.assert_allclose(seen, 10 * column, rtol=0.02, atol=0.2)
     assert line.along(seen).channel == 3
+
+
+def shaft_signals(wander: float) -> tuple[Harmonic, Harmonic, Harmonic]:
+    """Return the second and the fifth harmonic of a shaft, and noise in the band of the fifth."""
+    rng, n = np.random.default_rng(11), round(RATE * SECONDS)
+    slow = np.convolve(rng.standard_normal(n + 1279), np.ones(1280), "valid") / np.sqrt(1280)
+    phase = 2 * np.pi * np.cumsum(4.0 * (1 + wander * slow)) / RATE
+
+    def line(frequency: float, transform: np.ndarray) -> Harmonic:
+        first, last = (round(frequency * (1 + side * 0.05) * SECONDS) for side in (-1, 1))
+        ends = first / SECONDS, last / SECONDS
+        column = np.ones(1, complex)
+        return Harmonic(frequency, *ends, 1.0, 0, column, first, transform[first:last])
+
+    second, fifth = (
+        line(4.0 * k, np.fft.rfft(np.cos(k * phase) + 0.3 * rng.standard_normal(n))) for k in (2, 5)
+    )
+    return second, fifth, line(20.0, np.fft.rfft(rng.standard_normal(n)))
+
+
+@pytest.mark.parametrize("wander", [0.003, 0.01])
+def test_harmonics_of_one_shaft_are_recognised_by_their_phases(wander: float) -> None:
+    """The fifth follows the second, and noise in its band does not (the control)."""
+    second, fifth, noise = shaft_signals(wander)
+    assert fifth.follows(second)
+    assert second.follows(fifth)
+    assert not noise.follows(second)
+    assert not fifth.follows(replace(second, frequency=8.8))  # no ratio of small numbers
