@@ -2,8 +2,9 @@
 
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
-from typing import IO, ClassVar, cast
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, ClassVar
 
 import numpy as np
 
@@ -76,27 +77,24 @@ def smallest_step(values: FloatArray) -> float:
 class Spool:
     """Collects the samples of one column in blocks; the number expected saves copies.
 
-    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
-    ``send`` is set, in the process that reads for others, blocks go there and are not kept.
+    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where a
+    ``folder`` is set, in the process that reads for others, every column is a file in it.
     """
 
-    send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
+    folder: ClassVar[Path | None] = None
 
     def __init__(self, expected: int = 0) -> None:
-        self.expected = expected
-        self._memory = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
+        self._most = MINUTE if Spool.folder is None else -1  # samples in memory
+        self._memory = np.empty(expected if expected <= self._most else 0)
         self._file: IO[bytes] | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        if Spool.send is not None:
-            Spool.send(self, block)
-            return
         start, self.size = self.size, self.size + block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size > MINUTE:
+            if self.size > self._most:
                 self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
                 return
             if self.size > self._memory.size:
@@ -107,17 +105,17 @@ class Spool:
 
     def samples(self) -> Samples:
         """Return all samples."""
-        if Spool.send is not None:
-            return cast(Samples, self)  # a place for what was sent
-        if self._file is None:
+        if self._file is None and self._most >= 0:
             return self._memory[: self.size]
+        self._write()
+        assert self._file is not None
         self._file.flush()
         return Stored(self._file, self.size)
 
     def _write(self, *parts: FloatArray) -> None:
         try:
             if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+                self._file = _new_file(Spool.folder)
             for values in parts:
                 self._file.write(values.data)
         except OSError as error:
@@ -127,9 +125,18 @@ class Spool:
         self._memory = np.empty(0)
 
 
-def as_samples(values: np.ndarray) -> Samples:
-    """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
-    if values.size <= MINUTE and values.dtype == np.float64 and Spool.send is None:
+def _new_file(folder: Path | None) -> IO[bytes]:
+    """Open a temporary file, which has the number of its place in a folder as its name."""
+    if folder is None:
+        return tempfile.TemporaryFile(prefix="lmshealth-")
+    return (folder / str(len(list(folder.iterdir())))).open("w+b")
+
+
+def as_samples(values: np.ndarray | Stored) -> Samples:
+    """Take a column, shape ``(n,)``; a long one that is in memory is put on disk."""
+    if isinstance(values, Stored):
+        return values
+    if values.size <= MINUTE and values.dtype == np.float64 and Spool.folder is None:
         return values
     spool = Spool()
     spool.append(values)
