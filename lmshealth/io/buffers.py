@@ -133,9 +133,9 @@ def _new_file(folder: Path | None) -> IO[bytes]:
 
 
 def as_samples(values: np.ndarray | Stored) -> Samples:
-    """Take a column, shape ``(n,)``; a long one that is in memory is put on disk."""
+    """Take a column, shape ``(n,)``: a short one into memory, a long one on disk."""
     if isinstance(values, Stored):
-        return values
+        return values if Spool.folder or values.size > MINUTE else values[:]
     if values.size <= MINUTE and values.dtype == np.float64 and Spool.folder is None:
         return values
     spool = Spool()

@@ -30,7 +30,7 @@ import msgspec
 from lmshealth._private.interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
-from lmshealth.io.buffers import MINUTE, Samples, Spool, Stored, as_samples
+from lmshealth.io.buffers import Spool, Stored, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
@@ -163,7 +163,8 @@ class _Reader:
         if isinstance(answer, _Refused):
             raise Unusable(answer.reason, answer.detail)
         files = {name: Path(request.folder, str(number)) for name, number in answer[0].items()}
-        return Content({name: _samples(file) for name, file in files.items()}, *answer[1:])
+        stored = {k: Stored(own.open("rb"), own.stat().st_size // 8) for k, own in files.items()}
+        return Content({name: as_samples(own) for name, own in stored.items()}, *answer[1:])
 
     def _end(self, patience: float = 0.0) -> int:
         """Wait some seconds for its end, or end it; return its status, negative for a signal."""
@@ -192,12 +193,6 @@ class _Reader:
         if self.process is not None:
             self.process.returncode = 0  # so that it is not waited for
         self._lock, self.process = threading.Lock(), None
-
-
-def _samples(file: Path) -> Samples:
-    """Take the samples of a file, which stays open where they are many."""
-    stored = Stored(file.open("rb"), file.stat().st_size // 8)
-    return stored if stored.size > MINUTE else stored[:]
 
 
 def _reason(status: int, request: _Request, spent: float) -> Exception:
