@@ -146,8 +146,9 @@ class _OneSidedTest:
         noise = self.information.drift_variance(duration, many)
         value_std = float(self.information.std(noise)[self.index])
         gap = float(ndtri(self.required) - ndtri(self.false_alarm))
-        losses = (float(-np.expm1(-self.std(duration, n) * gap)) for n in (1, many))
-        return Effort(duration, n_logs, hindrance, self.power(duration, 1), *losses, value_std)
+        power = self.power(duration, 1)
+        one, more = (float(-np.expm1(-self.std(duration, n) * gap)) for n in (1, many))
+        return Effort(duration, n_logs, hindrance, power, one, more, value_std)
 
 
 def _index(stage: Stage, parameter: str, loss: float) -> int:
