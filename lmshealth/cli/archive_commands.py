@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add argument and options of a run."""
     scheduler = click.option(
         "--scheduler",
         metavar="ADDRESS",
@@ -54,7 +53,6 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _settings(given: dict[str, Any]) -> Settings:
-    """Return the settings of a run by its options."""
     from lmshealth.batch.alerts import Alerts
     from lmshealth.batch.ingest import Settings
 

@@ -75,7 +75,7 @@ def smallest_step(values: FloatArray) -> float:
 
 
 class Spool:
-    """Collects the samples of one column in blocks; the number expected saves copies.
+    """Collects the samples of one column in blocks.
 
     The temporary file of a long column has no name and is deleted with the `Stored` of it. Where a
     ``folder`` is set, in the process that reads for others, every column is a file in it.
@@ -83,46 +83,42 @@ class Spool:
 
     folder: ClassVar[Path | None] = None
 
-    def __init__(self, expected: int = 0) -> None:
+    def __init__(self) -> None:
         self._most = MINUTE if Spool.folder is None else -1  # samples in memory
-        self._memory = np.empty(expected if expected <= self._most else 0)
+        self._blocks = [np.empty(0)]
         self._file: IO[bytes] | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        start, self.size = self.size, self.size + block.size
+        self.size += block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size > self._most:
-                self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
-                return
-            if self.size > self._memory.size:
-                grown = np.empty(max(self.size, 2 * start))
-                grown[:start] = self._memory[:start]
-                self._memory = grown
-            self._memory[start : self.size] = block
+            self._blocks.append(np.array(block, np.float64, order="C"))
+        if self.size > self._most:
+            self._write()
 
     def samples(self) -> Samples:
         """Return all samples."""
-        if self._file is None and self._most >= 0:
-            return self._memory[: self.size]
-        self._write()
-        assert self._file is not None
-        self._file.flush()
-        return Stored(self._file, self.size)
+        if self.size <= self._most:
+            self._blocks = [np.concatenate(self._blocks)]
+            return self._blocks[0]
+        file = self._write()
+        file.flush()
+        return Stored(file, self.size)
 
-    def _write(self, *parts: FloatArray) -> None:
+    def _write(self) -> IO[bytes]:
+        """Move the blocks to the file."""
         try:
-            if self._file is None:
-                self._file = _new_file(Spool.folder)
-            for values in parts:
+            self._file = self._file or _new_file(Spool.folder)
+            for values in self._blocks:
                 self._file.write(values.data)
         except OSError as error:
             found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
             needed = "set TMPDIR to a folder on a larger disk"
             raise Unusable("too-large", f"{found} ({error.strerror}); {needed}") from error
-        self._memory = np.empty(0)
+        self._blocks.clear()
+        return self._file
 
 
 def _new_file(folder: Path | None) -> IO[bytes]:
@@ -151,7 +147,7 @@ def in_unit(
     All samples are taken, or those of a half-open range.
     """
     start, stop = part or (0, samples.size)
-    spool = Spool(stop - start)
+    spool = Spool()
     for _, values in blocks(samples, start, stop):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):

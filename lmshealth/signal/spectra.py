@@ -289,7 +289,7 @@ def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
 
 
 def transform_detrended(x: FloatArray, n_ordinates: int) -> ComplexArray:
-    """Transform samples without their mean and linear trend: the first ordinates, but the zeroth."""
+    """Transform samples without mean and linear trend: the first ordinates, but the zeroth."""
     time = np.arange(x.size) - (x.size - 1) / 2
     x = x - x[0]  # a channel without a signal has a transform of exactly zero
     x -= x.mean()

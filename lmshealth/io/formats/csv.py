@@ -271,7 +271,6 @@ class _SegmentStream:
 
 
 def _head(text: Text, encoding: str) -> list[str]:
-    """Read the first lines."""
     head: list[str] = []
     while text.position < _HEAD_BYTES and len(head) < _HEAD_LINES and (line := text.line()):
         head.append(line.removeprefix(_BOM).decode(encoding, "replace"))
@@ -280,7 +279,6 @@ def _head(text: Text, encoding: str) -> list[str]:
 
 @cache
 def _is_old_pandas() -> bool:
-    """Return whether pandas is older than 3.1."""
     major, minor = version("pandas").split(".")[:2]
     return (int(major), int(minor)) < (3, 1)
 
@@ -339,7 +337,6 @@ def _numbers(
 def _spooled(
     read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, float]
 ) -> dict[str, Samples]:
-    """Read the rows block by block."""
     n_rows = n_blank = 0
     since = {name: SinceFirst(unit) for name, unit in times.items()}
     taken = {name: Spool() for name in places}
@@ -388,7 +385,6 @@ _BINARY = (GZIP, b"PAR1", b"\x89HDF")
 
 
 def _is_text(head: bytes) -> bool:
-    """Return whether a file may begin so."""
     return (
         encoding_of(head).startswith(("utf-16", "utf-32")) or b"\0" not in head
     ) and not head.startswith(_BINARY)

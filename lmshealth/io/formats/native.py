@@ -53,7 +53,7 @@ def _load_hdf5(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
         metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
         check_size(8 * sum(dataset.size for dataset in chosen.values()), path.stat().st_size)
-        taken = {name: Spool(dataset.size) for name, dataset in chosen.items()}
+        taken = {name: Spool() for name in chosen}
         for name, dataset in chosen.items():
             # In parts of whole chunks: each is unpacked only once.
             chunk = dataset.chunks[0] if dataset.chunks else 1
@@ -191,7 +191,7 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         # Up to a minute at once, beyond it in blocks; nulls become NaN.
         size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
         batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
-        taken = {name: Spool(n_rows) for name in chosen}
+        taken = {name: Spool() for name in chosen}
         for batch in batches:
             for name, spool in taken.items():
                 values = batch.column(name).to_numpy(zero_copy_only=False)
@@ -390,7 +390,6 @@ def _series(name: str, values: Any) -> np.ndarray:
 
 
 def _text(name: str, values: Any) -> str:
-    """Read a single number or line of text."""
     if values.dtype.kind == "U" and values.size <= 1:
         text = str(values.item()) if values.size else ""
         if "\ufffd" in text:
