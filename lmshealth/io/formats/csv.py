@@ -293,8 +293,7 @@ def _numbers(
     """
     import pandas as pd
 
-    begin = partial(text.begin, dialect.start, dialect.delimiter, len(dialect.channels))
-    begin()
+    text.begin(dialect.start, dialect.delimiter, len(dialect.channels))
     # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas pull
     # request 66944): a spare column receives it. It also rounds the last digits of numbers.
     n_spare = int(_is_old_pandas())
@@ -309,8 +308,8 @@ def _numbers(
         names=list(range(text.n_fields + n_spare)),
         float_precision="round_trip" if _is_old_pandas() else None,
         index_col=False,
-        # A block is small enough as a whole.
-        low_memory=False,
+        skipinitialspace=True,
+        low_memory=False,  # a block is small enough as a whole
         # Time stamps place the other rows; without them an empty row is a missing sample.
         skip_blank_lines=bool(times),
         chunksize=max(1, min(_ROWS, _FIELDS // text.n_fields)),
@@ -319,13 +318,7 @@ def _numbers(
         # A row longer than the header is a warning in pandas and a loss of data here.
         warnings.simplefilter("error", pd.errors.ParserWarning)
         try:
-            numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places, {})
-        except (ValueError, pd.errors.ParserWarning):
-            # Half as fast, but accepts blanks and locates the fault.
-            begin()
-        try:
-            return _spooled(partial(read, skipinitialspace=True), text, places, times)
+            return _spooled(read, text, places, times)
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
@@ -353,7 +346,7 @@ def _spooled(
                 n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
             for name, place in places.items():
                 values = table[place]
-                is_number = values.dtype.kind in "fiu"
+                is_number = values.dtype.kind in "fiu" or values.empty
                 if not is_number and name not in times:
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
                 numbers = values.to_numpy() if is_number else since[name](parse_moments(values))

@@ -138,13 +138,14 @@ def confirm(path: Path) -> Format:
         head = stream.read(_HEAD)
     if not head:
         raise Unusable("empty", "0 bytes; copy the file again")
+    name = "" if form is None else form.name
     try:
         if form is not None and form.sniff(head):
             return form
     except Exception as error:
         if form in FORMATS:
             raise
-        detail = f"the plug-in for {form.name} fails ({type(error).__name__}: {error}); update it"
+        detail = f"the plug-in for {name} fails ({type(error).__name__}: {error}); update it"
         raise Unusable("format", detail) from error
     if foreign := describe(head, path):
         raise Unusable("format", foreign)
@@ -155,7 +156,7 @@ def confirm(path: Path) -> Format:
         step = "rename text to .csv, save other arrays as columns of HDF5 or Parquet"
         raise Unusable("format", f"{found}; needed one of {', '.join(known)}; {step}")
     if actual is None:
-        raise corrupt(f"does not start as {form.name} does")
-    found = f"the suffix is that of {form.name}" if form else found
+        raise corrupt(f"does not start as {name} does")
+    found = f"the suffix is that of {name}" if name else found
     step = f"rename the file to {actual.suffixes[0]}"
     raise Unusable("format", f"{found}, the content is {actual.name}; {step}")
