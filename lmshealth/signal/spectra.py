@@ -308,12 +308,7 @@ def as_acceleration(
     if channel.kind != "displacement":
         return x, 0
     lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
-    # In place: each intermediate array would be as large as the segment.
-    difference: FloatArray = x[2 * lag :] + x[: -2 * lag]
-    difference -= x[lag:-lag]
-    difference -= x[lag:-lag]
-    difference *= sample_rate**2
-    return difference, lag
+    return (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2, lag
 
 
 def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:

@@ -41,10 +41,8 @@ _START = (
     "from lmshealth.io.formats.isolation import serve; serve()"
 )
 _SETTING = "LMSHEALTH_MAX_SECONDS"
-# Threads of linear algebra take memory, and none is needed. What a column has freed is used for the
-# next one (glibc): taking it from the system again costs as much as a copy.
+# Threads of linear algebra take memory, and none is needed.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
-_ENVIRONMENT |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 25), "MALLOC_TRIM_THRESHOLD_": str(1 << 27)}
 
 
 class _Request(NamedTuple):

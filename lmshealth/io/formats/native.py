@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
+from lmshealth.io.buffers import BLOCK, Samples, Spool, as_samples
 from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
@@ -188,9 +188,8 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             for key, value in (schema.metadata or {}).items()
             if key not in _LIBRARY_KEYS
         }
-        # Up to a minute at once, beyond it in blocks; nulls become NaN.
-        size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
-        batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
+        # Nulls become NaN.
+        batches = file.iter_batches(BLOCK, columns=chosen, use_threads=False) if chosen else ()
         taken = {name: Spool() for name in chosen}
         for batch in batches:
             for name, spool in taken.items():
