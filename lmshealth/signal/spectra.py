@@ -236,7 +236,9 @@ def transform_segment(
         n = fft.prev_fast_len(n)
     if short:
         ceiling = min(ceiling, 4 * top)
-    frequency = _frequencies(n, sample_rate, ceiling)
+    # From the first to below Nyquist or the ceiling.
+    frequency = np.arange(1, (n - 1) // 2 + 1, dtype=np.float64) * (sample_rate / n)
+    frequency = frequency[frequency < ceiling]
     transforms = np.empty((frequency.size, len(channels)), dtype=complex)
     for c, (x, lag) in enumerate(parts):
         transforms[:, c] = transform_detrended(x[short - lag : n + short - lag], frequency.size)
@@ -252,13 +254,6 @@ def transform_segment(
         for one in sinusoids
     )
     return CrossSpectrum(frequency, rest[None], duration, segment.velocity, free, lines)
-
-
-def _frequencies(n: int, sample_rate: float, ceiling: float) -> FloatArray:
-    """Return the Fourier frequencies in Hz from the first to below Nyquist or the ceiling."""
-    frequency = np.arange(1, (n - 1) // 2 + 1, dtype=np.float64) * (sample_rate / n)
-    # A copy: a view would keep the whole array in memory.
-    return frequency[: np.searchsorted(frequency, ceiling)].copy()
 
 
 def _exchangeable(segments: Sequence[Segment]) -> list[list[Segment]]:
