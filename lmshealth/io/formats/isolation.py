@@ -30,7 +30,7 @@ import msgspec
 from lmshealth._private.interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
-from lmshealth.io.buffers import Spool, Stored, as_samples
+from lmshealth.io.buffers import Samples, Spool, Stored, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
@@ -161,8 +161,7 @@ class _Reader:
         if isinstance(answer, _Refused):
             raise Unusable(answer.reason, answer.detail)
         files = {name: Path(request.folder, str(number)) for name, number in answer[0].items()}
-        stored = {k: Stored(own.open("rb"), own.stat().st_size // 8) for k, own in files.items()}
-        return Content({name: as_samples(own) for name, own in stored.items()}, *answer[1:])
+        return Content({name: _taken(file) for name, file in files.items()}, *answer[1:])
 
     def _end(self, patience: float = 0.0) -> int:
         """Wait some seconds for its end, or end it; return its status, negative for a signal."""
@@ -191,6 +190,13 @@ class _Reader:
         if self.process is not None:
             self.process.returncode = 0  # so that it is not waited for
         self._lock, self.process = threading.Lock(), None
+
+
+def _taken(file: Path) -> Samples:
+    """Take the samples of a file, of which Windows deletes an open one when it is closed."""
+    flag = getattr(os, "O_TEMPORARY", 0)
+    stream = open(file, "rb", opener=lambda name, flags: os.open(name, flags | flag))  # noqa: SIM115
+    return as_samples(Stored(stream, file.stat().st_size // 8))
 
 
 def _reason(status: int, request: _Request, spent: float) -> Exception:
@@ -252,6 +258,8 @@ def _respond(request: _Request, answers: IO[bytes]) -> None:
         content = load_by(request.form, load, Path(request.path), columns, request.max_memory)
         stored: Any = {name: as_samples(own) for name, own in content.columns.items()}
         numbers = {name: int(Path(own.file.name).name) for name, own in stored.items()}
+        for own in stored.values():
+            own.file.close()
         answer = [numbers, *(getattr(content, field.name) for field in fields(content)[1:])]
     except Unusable as error:
         answer = {"reason": error.reason, "detail": error.detail}
