@@ -2,9 +2,8 @@
 
 import tempfile
 import weakref
-from collections.abc import Iterator
-from pathlib import Path
-from typing import IO, ClassVar
+from collections.abc import Callable, Iterator
+from typing import IO, ClassVar, cast
 
 import numpy as np
 
@@ -75,64 +74,62 @@ def smallest_step(values: FloatArray) -> float:
 
 
 class Spool:
-    """Collects the samples of one column in blocks.
+    """Collects the samples of one column in blocks; the number expected saves copies.
 
-    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where a
-    ``folder`` is set, in the process that reads for others, every column is a file in it.
+    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
+    ``send`` is set, in the process that reads for others, blocks go there and are not kept.
     """
 
-    folder: ClassVar[Path | None] = None
+    send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
 
-    def __init__(self) -> None:
-        self._most = MINUTE if Spool.folder is None else -1  # samples in memory
-        self._blocks = [np.empty(0)]
+    def __init__(self, expected: int = 0) -> None:
+        self.expected = expected
+        self._memory = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
         self._file: IO[bytes] | None = None
         self.size = 0
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        self.size += block.size
+        if Spool.send is not None:
+            Spool.send(self, block)
+            return
+        start, self.size = self.size, self.size + block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            self._blocks.append(np.array(block, np.float64, order="C"))
-        if self.size > self._most:
-            self._write()
+            if self.size > MINUTE:
+                self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
+                return
+            if self.size > self._memory.size:
+                grown = np.empty(max(self.size, 2 * start))
+                grown[:start] = self._memory[:start]
+                self._memory = grown
+            self._memory[start : self.size] = block
 
     def samples(self) -> Samples:
         """Return all samples."""
-        if self.size <= self._most:
-            self._blocks = [np.concatenate(self._blocks)]
-            return self._blocks[0]
-        file = self._write()
-        file.flush()
-        return Stored(file, self.size)
+        if Spool.send is not None:
+            return cast(Samples, self)  # a place for what was sent
+        if self._file is None:
+            return self._memory[: self.size]
+        self._file.flush()
+        return Stored(self._file, self.size)
 
-    def _write(self) -> IO[bytes]:
-        """Move the blocks to the file."""
+    def _write(self, *parts: FloatArray) -> None:
         try:
-            self._file = self._file or _new_file(Spool.folder)
-            for values in self._blocks:
+            if self._file is None:
+                self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
+            for values in parts:
                 self._file.write(values.data)
         except OSError as error:
             found = f"{8 * self.size} bytes of a column do not fit into {tempfile.gettempdir()}"
             needed = "set TMPDIR to a folder on a larger disk"
             raise Unusable("too-large", f"{found} ({error.strerror}); {needed}") from error
-        self._blocks.clear()
-        return self._file
+        self._memory = np.empty(0)
 
 
-def _new_file(folder: Path | None) -> IO[bytes]:
-    """Open a temporary file, which has the number of its place in a folder as its name."""
-    if folder is None:
-        return tempfile.TemporaryFile(prefix="lmshealth-")
-    return (folder / str(len(list(folder.iterdir())))).open("w+b")
-
-
-def as_samples(values: np.ndarray | Stored) -> Samples:
-    """Take a column, shape ``(n,)``: a short one into memory, a long one on disk."""
-    if isinstance(values, Stored):
-        return values if Spool.folder or values.size > MINUTE else values[:]
-    if values.size <= MINUTE and values.dtype == np.float64 and Spool.folder is None:
+def as_samples(values: np.ndarray) -> Samples:
+    """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
+    if values.size <= MINUTE and values.dtype == np.float64 and Spool.send is None:
         return values
     spool = Spool()
     spool.append(values)
@@ -147,7 +144,7 @@ def in_unit(
     All samples are taken, or those of a half-open range.
     """
     start, stop = part or (0, samples.size)
-    spool = Spool()
+    spool = Spool(stop - start)
     for _, values in blocks(samples, start, stop):
         # A damaged float may be so large that its SI value is infinite: missing, no warning.
         with np.errstate(over="ignore", invalid="ignore"):

@@ -229,7 +229,7 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
     """
     if not added.size:
         return values
-    spool = Spool()
+    spool = Spool(values.size + int(np.sum(added[:, 1] - added[:, 0])))
     taken = at = 0
     for start, stop in added.tolist():
         following = taken + start - at

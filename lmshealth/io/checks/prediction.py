@@ -146,7 +146,7 @@ def filled(values: Samples, missing: IntArray, breaks: IntArray) -> tuple[Sample
 
 def _replaced(values: Samples, where: IntArray, what: FloatArray) -> Samples:
     """Return samples of which those of ascending indices are replaced."""
-    spool = Spool()
+    spool = Spool(values.size)
     for at, block in blocks(values):
         part = block.copy()
         own = slice(*np.searchsorted(where, [at, at + block.size]))

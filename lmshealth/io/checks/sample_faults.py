@@ -108,7 +108,7 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
 
     None is changed, and 0 returned, unless all are then as the prediction expects.
     """
-    spool, a, squares, n = Spool(), model.filter, 0.0, 0
+    spool, a, squares, n = Spool(values.size), model.filter, 0.0, 0
     before = np.full(_ORDER, model.mean)
     for _, block in blocks(values):
         x = np.concatenate([before, block])

@@ -3,9 +3,10 @@
 Native code can end its process by a signal, loop, or allocate what a damaged header claims. One
 process per session reads such files, one after the other. It starts with the first of them, and
 ends with this one. It is no fork, which is unsafe beside threads, and does not import the module
-``__main__`` of a user. Requests and answers are lines of JSON in its standard input and output, and
-samples are bare numbers in temporary files, never pickles: a damaged file may have written into the
-memory of the sender of an answer.
+``__main__`` of a user. Requests and answers pass through its standard input and output, samples
+through a temporary file that both processes map, so that no shared memory of the system is needed.
+Both are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
+the sender of an answer.
 """
 
 import atexit
@@ -18,19 +19,19 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import fields
 from importlib import import_module
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Any, NamedTuple
+from typing import IO, Annotated, Any, NamedTuple
 
 import msgspec
+import numpy as np
 
 from lmshealth._private.interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool, Stored, as_samples
+from lmshealth.io.buffers import Spool
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
@@ -38,11 +39,15 @@ from lmshealth.io.refusal import Unusable
 
 _START = (
     "import sys; sys.path[:] = sys.argv[1:]; "
-    "from lmshealth.io.formats.isolation import serve; serve()"
+    "from lmshealth.io.formats.isolation import serve; serve(sys.path.pop())"
 )
+# Bytes of samples that are handed over at once: they stay in the processor's cache.
+_WINDOW = 1 << 21
 _SETTING = "LMSHEALTH_MAX_SECONDS"
-# Threads of linear algebra take memory, and none is needed.
+# Threads of linear algebra take memory, and none is needed. What a column has freed is used for the
+# next one (glibc): taking it from the system again costs as much as a copy.
 _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+_ENVIRONMENT |= {"MALLOC_MMAP_THRESHOLD_": str(1 << 25), "MALLOC_TRIM_THRESHOLD_": str(1 << 27)}
 
 
 class _Request(NamedTuple):
@@ -56,25 +61,40 @@ class _Request(NamedTuple):
     seconds: float
     memory: float
     library: str  # imported before these count
-    folder: str = ""  # of the files of samples
 
 
-# Fields of a `Content`, with the number of the file of each column.
-_Content = tuple[
-    dict[str, int],
-    dict[str, str],
-    tuple[str, ...],
-    tuple[Refusal, ...],
-    tuple[str, ...],
-    dict[str, int],
-]
+class _Samples(msgspec.Struct, tag=True):
+    """Samples of a column that are in the window until a byte confirms that they are taken."""
+
+    column: int  # its number
+    dtype: str
+    size: Annotated[int, msgspec.Meta(ge=0)]
+    expected: int  # of the whole column
 
 
-class _Refused(msgspec.Struct):
-    """The answer otherwise."""
+class _Content(msgspec.Struct, tag=True):
+    """What a `Content` has, with the numbers of its columns: the end of an answer."""
+
+    columns: dict[str, int]
+    metadata: dict[str, str]
+    present: tuple[str, ...]
+    refused: tuple[Refusal, ...]
+    guessed: tuple[str, ...]
+    late: dict[str, int]
+
+
+# All of it but the columns.
+_PARTS = _Content.__struct_fields__[1:]
+
+
+class _Refused(msgspec.Struct, tag=True):
+    """The end of an answer otherwise."""
 
     reason: str
     detail: str
+
+
+_Answer = _Samples | _Content | _Refused
 
 
 class _Ended(Exception):
@@ -119,6 +139,7 @@ class _Reader:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
+        self._window = np.empty(0, np.uint8)
         self.process: Any = None  # a `subprocess.Popen`
 
     def read(self, request: _Request) -> Content:
@@ -129,9 +150,8 @@ class _Reader:
                 if self.process is None:
                     self._start()
                 start = time.monotonic()
-                with TemporaryDirectory(prefix="lmshealth-", ignore_cleanup_errors=True) as folder:
-                    return self._exchange(request._replace(folder=folder))
-            except (EOFError, ValueError, TypeError, BrokenPipeError, FileNotFoundError) as error:
+                return self._exchange(request)
+            except (EOFError, ValueError, TypeError, BrokenPipeError) as error:
                 spent = time.monotonic() - start
                 raise _reason(self._end(1.0), request, spent) from error
             except BaseException as error:
@@ -142,26 +162,45 @@ class _Reader:
 
     def _start(self) -> None:
         """Start the process, and wait until it is ready."""
-        python = os.fsdecode(get_executable() or sys.executable)
-        self.process = subprocess.Popen(
-            [python, "-P", "-c", _START, *sys.path],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | _ENVIRONMENT,
-        )
-        self.process.stdout.readline()
+        # Windows keeps the file until the process has ended.
+        with TemporaryDirectory(prefix="lmshealth-", ignore_cleanup_errors=True) as folder:
+            file = os.path.join(folder, "window")
+            self._window = np.asarray(np.memmap(file, np.uint8, "w+", shape=_WINDOW))
+            python = os.fsdecode(get_executable() or sys.executable)
+            self.process = subprocess.Popen(
+                [python, "-P", "-c", _START, *sys.path, file],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                env=os.environ | _ENVIRONMENT,
+            )
+            self.process.stdout.readline()
 
     def _exchange(self, request: _Request) -> Content:
-        """Send a request and receive the content, or raise the refusal."""
-        self.process.stdin.write(json.dumps(request).encode() + b"\n")
-        self.process.stdin.flush()
-        line = self.process.stdout.readline()
-        answer: Any = msgspec.convert(json.loads(line), _Content | _Refused)
-        if isinstance(answer, _Refused):
-            raise Unusable(answer.reason, answer.detail)
-        files = {name: Path(request.folder, str(number)) for name, number in answer[0].items()}
-        return Content({name: _taken(file) for name, file in files.items()}, *answer[1:])
+        """Send a request and receive samples and content, or raise the refusal."""
+        requests, answers = self.process.stdin, self.process.stdout
+        requests.write(json.dumps(request).encode() + b"\n")
+        requests.flush()
+        spools: dict[int, Spool] = {}
+        while True:
+            answer = msgspec.convert(json.loads(answers.readline()), _Answer)
+            if isinstance(answer, _Refused):
+                raise Unusable(answer.reason, answer.detail)
+            if isinstance(answer, _Content):
+                columns = {
+                    name: spools.get(k, Spool()).samples() for name, k in answer.columns.items()
+                }
+                parts = (getattr(answer, name) for name in _PARTS)
+                return Content(columns, *parts)
+            dtype = np.dtype(answer.dtype)
+            if dtype.kind not in "fiu":
+                raise ValueError(f"samples are of type {dtype}")
+            part = np.frombuffer(self._window, dtype, answer.size)
+            if answer.column not in spools:
+                spools[answer.column] = Spool(answer.expected)
+            spools[answer.column].append(part)
+            requests.write(b"\n")
+            requests.flush()
 
     def _end(self, patience: float = 0.0) -> int:
         """Wait some seconds for its end, or end it; return its status, negative for a signal."""
@@ -192,13 +231,6 @@ class _Reader:
         self._lock, self.process = threading.Lock(), None
 
 
-def _taken(file: Path) -> Samples:
-    """Take the samples of a file, of which Windows deletes an open one when it is closed."""
-    flag = getattr(os, "O_TEMPORARY", 0)
-    stream = open(file, "rb", opener=lambda name, flags: os.open(name, flags | flag))  # noqa: SIM115
-    return as_samples(Stored(stream, file.stat().st_size // 8))
-
-
 def _reason(status: int, request: _Request, spent: float) -> Exception:
     """Find out why the process ended."""
     if spent >= request.seconds:
@@ -220,19 +252,14 @@ if hasattr(os, "register_at_fork"):
 # In the process
 
 
-def serve() -> None:
-    """Read files until standard input ends."""
+def serve(file: str) -> None:
+    """Read files until standard input ends; samples are handed over in the mapped file."""
     ignore_interrupts()
     faulthandler.disable()
-    with suppress(ImportError):
-        import resource  # not on Windows
-
-        # Each column is an open file.
-        most = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
-        resource.setrlimit(resource.RLIMIT_NOFILE, (most, most))
     answers = os.fdopen(os.dup(1), "wb")
     # What a library prints is no answer.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
+    window = np.asarray(np.memmap(file, np.uint8, "r+", shape=_WINDOW))
     answers.write(b"\n")
     answers.flush()
     while line := sys.stdin.buffer.readline():
@@ -243,28 +270,41 @@ def serve() -> None:
         # A thread that no library can hold ends the process.
         with open(os.devnull, "w") as nowhere:
             faulthandler.dump_traceback_later(request.seconds, exit=True, file=nowhere)
-            _respond(request, answers)
+            _respond(request, answers, window)
             faulthandler.cancel_dump_traceback_later()
 
 
-def _respond(request: _Request, answers: IO[bytes]) -> None:
-    """Write the samples of each column to a file, then send the content or the refusal."""
-    Spool.folder = Path(request.folder)
-    answer: Any
+def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
+    """Send the samples of each column while they are read, then the content or the refusal."""
+    numbers: dict[object, int] = {}
+
+    def write(answer: _Answer) -> None:
+        # Texts of a file may hold lone surrogates, which msgspec does not write.
+        answers.write(json.dumps(msgspec.to_builtins(answer)).encode() + b"\n")
+
+    def send(spool: Spool, block: np.ndarray) -> None:
+        number = numbers.setdefault(spool, len(numbers))
+        place = window.view(block.dtype)
+        for start in range(0, block.size, place.size):
+            part = block[start : start + place.size]
+            place[: part.size] = part
+            write(_Samples(number, block.dtype.str, part.size, spool.expected))
+            answers.flush()
+            sys.stdin.buffer.read(1)
+
+    Spool.send = send
     try:
         module, name = request.load.split(":")
         load: Load = getattr(import_module(module), name)
         columns = msgspec.convert(request.columns, ColumnMap)
-        content = load_by(request.form, load, Path(request.path), columns, request.max_memory)
-        stored: Any = {name: as_samples(own) for name, own in content.columns.items()}
-        numbers = {name: int(Path(own.file.name).name) for name, own in stored.items()}
-        for own in stored.values():
-            own.file.close()
-        answer = [numbers, *(getattr(content, field.name) for field in fields(content)[1:])]
+        path, most = Path(request.path), request.max_memory
+        content = load_by(request.form, load, path, columns, most)
+        own = {
+            name: numbers.setdefault(spool, len(numbers)) for name, spool in content.columns.items()
+        }
+        write(_Content(own, *(getattr(content, name) for name in _PARTS)))
     except Unusable as error:
-        answer = {"reason": error.reason, "detail": error.detail}
-    # Texts of a file may hold lone surrogates, which msgspec does not write.
-    answers.write(json.dumps(msgspec.to_builtins(answer)).encode() + b"\n")
+        write(_Refused(error.reason, error.detail))
     answers.flush()
 
 

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, Samples, Spool, as_samples
+from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
 from lmshealth.io.column_map import ColumnMap, role_of
 from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
@@ -53,7 +53,7 @@ def _load_hdf5(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
         metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
         check_size(8 * sum(dataset.size for dataset in chosen.values()), path.stat().st_size)
-        taken = {name: Spool() for name in chosen}
+        taken = {name: Spool(dataset.size) for name, dataset in chosen.items()}
         for name, dataset in chosen.items():
             # In parts of whole chunks: each is unpacked only once.
             chunk = dataset.chunks[0] if dataset.chunks else 1
@@ -188,9 +188,10 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             for key, value in (schema.metadata or {}).items()
             if key not in _LIBRARY_KEYS
         }
-        # Nulls become NaN.
-        batches = file.iter_batches(BLOCK, columns=chosen, use_threads=False) if chosen else ()
-        taken = {name: Spool() for name in chosen}
+        # Up to a minute at once, beyond it in blocks; nulls become NaN.
+        size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
+        batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
+        taken = {name: Spool(n_rows) for name in chosen}
         for batch in batches:
             for name, spool in taken.items():
                 values = batch.column(name).to_numpy(zero_copy_only=False)
@@ -389,6 +390,7 @@ def _series(name: str, values: Any) -> np.ndarray:
 
 
 def _text(name: str, values: Any) -> str:
+    """Read a single number or line of text."""
     if values.dtype.kind == "U" and values.size <= 1:
         text = str(values.item()) if values.size else ""
         if "\ufffd" in text:
