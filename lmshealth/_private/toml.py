@@ -104,7 +104,6 @@ def _part(field: FieldInfo) -> str:
 
 
 def _literal(value: Any) -> str:
-    """Write a value of TOML."""
     if isinstance(value, str):
         return quoted(value)
     if isinstance(value, list):
@@ -216,7 +215,6 @@ def _branches(kind: Any) -> Iterator[Any]:
 
 
 def _structs(kind: Any) -> list[Any]:
-    """List the structs among the alternatives of an annotation."""
     return [
         one for one in _branches(kind) if isinstance(one, type) and issubclass(one, msgspec.Struct)
     ]

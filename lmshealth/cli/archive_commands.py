@@ -25,7 +25,6 @@ if TYPE_CHECKING:
 
 
 def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
-    """Add argument and options of a run."""
     scheduler = click.option(
         "--scheduler",
         metavar="ADDRESS",
@@ -55,7 +54,6 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _settings(given: dict[str, Any]) -> Settings:
-    """Return the settings of a run by its options."""
     from lmshealth.batch.alerts import Alerts
     from lmshealth.batch.ingest import Settings
 
@@ -71,15 +69,15 @@ def _document(result: RunResult) -> dict[str, Any]:
     return {**head, **{name: getattr(result, name) for name in names}, "machines": result.statuses}
 
 
-def _write_pdfs(result: RunResult) -> None:
-    from lmshealth.report.rendering import write_pdfs
-
-    write_pdfs(result.pages)
-
-
-def _errors(result: RunResult) -> list[str]:
+def _finish(result: RunResult, pdf: bool, prefix: str = "") -> None:
+    """Print what failed, and write the pages as PDF where that is asked for."""
     failed = (*result.failed.items(), *result.unsent.items())
-    return [*result.notes, *(f"{name}: {why}" for name, why in failed)]
+    errors = [*result.notes, *(f"{name}: {why}" for name, why in failed)]
+    terminal.print_errors(prefix + error for error in errors)
+    if pdf:
+        from lmshealth.report.rendering import write_pdfs
+
+        write_pdfs(result.pages)
 
 
 @options.command(
@@ -120,9 +118,7 @@ def run(
         if rest := len(result.changes[TERMINAL_ROWS:]):
             terminal.print_line(f"{rest} more changes; changes.csv lists all.")
         terminal.print_line(f"Report: {result.index}")
-    terminal.print_errors(_errors(result))
-    if pdf:
-        _write_pdfs(result)
+    _finish(result, pdf)
     some = result.n_refused or result.n_unlisted or result.n_unread or result.failed
     ctx.exit(options.SOME_REFUSED if some else 0)
 
@@ -162,9 +158,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             )
             for change in result.changes:
                 terminal.print_line(f"{now}{change}")
-        terminal.print_errors(now + error for error in _errors(result))
-        if pdf:
-            _write_pdfs(result)
+        _finish(result, pdf, now)
 
 
 @options.command(
@@ -188,7 +182,5 @@ def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
         result = write_pages(opened, out, Settings(workers=workers), progress)
     terminal.print_line(f"Report: {result.index}")
-    terminal.print_errors(_errors(result))
-    if pdf:
-        _write_pdfs(result)
+    _finish(result, pdf)
     ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)

@@ -282,7 +282,6 @@ def _check_outputs(given: dict[str, Any]) -> None:
 
 
 def _save(path: Path, found: LogEstimates) -> None:
-    """Write the skeleton of a stage description."""
     modes, specs = found.modes, []
     for k, search in enumerate(searches(modes.frequency.tolist())):
         frequency, damping = float(modes.frequency[k]), float(modes.damping_ratio[k])

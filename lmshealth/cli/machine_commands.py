@@ -89,7 +89,6 @@ def track(table: Path, **given: Any) -> None:
 
 
 def _reading(given: dict[str, Any]) -> dict[str, Any]:
-    """Return the options of `read_machines`."""
     names = {"cross_terms": "cov", "maintenance": "maintenance", "latest": "latest"}
     return {name: given[option] for name, option in names.items()}
 

@@ -32,7 +32,6 @@ _MOST_EPOCHS, _MOST_WORKERS = 1_000_000, 1_000
 
 
 def _processors() -> int:
-    """Return the number of processors that this process may use."""
     from loky import cpu_count  # late: --help needs no workers
 
     return int(cpu_count())

@@ -39,7 +39,6 @@ def lost() -> OSError | None:
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:
-    """Handle an error of encoding."""
     assert isinstance(error, UnicodeEncodeError)
     return "".join(map(_spelled, error.object[error.start : error.end])), error.end
 

@@ -57,12 +57,8 @@ def start_log(context: click.Context, handler: logging.Handler) -> None:
     context.call_on_close(lambda: logger.removeHandler(handler))
 
 
-def _columns() -> int | None:
-    """Return the width of standard output; None for a pipe or a file."""
-    return _width(sys.stdout)
-
-
 def _width(stream: TextIO) -> int | None:
+    """Return the width of a terminal in columns; None for a pipe or a file."""
     return max(shutil.get_terminal_size().columns, _NARROWEST) if stream.isatty() else None
 
 
@@ -93,14 +89,14 @@ def print_errors(errors: Iterable[str]) -> None:
 
 def print_line(text: str, *, err: bool = False) -> None:
     """Print a line that a terminal gets in parts which fit, and a pipe whole."""
-    width = _width(sys.stderr) if err else _columns()
+    width = _width(sys.stderr if err else sys.stdout)
     lines = _wrapped(streams.readable(text), width) if width else [text]
     click.echo(plain("\n".join(lines)), err=err)
 
 
 def print_text(text: str, mark: str = "") -> None:
     """Print text in lines that fit, indented below the mark."""
-    terminal = _columns()
+    terminal = _width(sys.stdout)
     width = min((terminal or _WIDTH + 2) - 2, _WIDEST)
     indent = " " * len(mark)
     lines = _wrapped(streams.readable(mark + text), width, indent, fold=terminal is not None)
@@ -168,7 +164,7 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
         )
         for place, name in enumerate(rows[0])
     ]
-    width = _columns() or _UNLIMITED
+    width = _width(sys.stdout) or _UNLIMITED
     widths = _fitting(columns, width - 2 * len(columns))
     if widths is None:
         _print_records(columns, width)

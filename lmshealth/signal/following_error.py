@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.signal import detrend, periodogram
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadLog
@@ -18,7 +19,6 @@ from lmshealth.signal.segments import (
     select_channels,
     select_segments,
 )
-from lmshealth.signal.spectra import transform_detrended
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -104,15 +104,11 @@ def loop_error(log: Log) -> float | None:
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
     """Return the mean square of a segment in the band of the loop."""
-    n, (low, high) = values.size, constants.LOOP_BAND
-    frequency = np.fft.rfftfreq(n, 1 / sample_rate)
-    inside = np.flatnonzero((frequency >= low) & (frequency <= high))
-    x = transform_detrended(values, min(int(inside[-1]) + 1, n // 2))
-    x = np.append(x, x[-1].conj())  # the first ordinate above Nyquist, if n is odd
-    # Hann's window, whose squares have the mean 3/8, prevents leakage of drift below the band and
-    # of lines above it.
-    windowed = x[inside - 1] / 2 - (x[inside - 2] + x[inside]) / 4
-    return float(np.sum(np.abs(windowed) ** 2) * 2 / (3 / 8 * n**2))
+    # The window prevents leakage of drift below the band and of lines above it.
+    frequency, density = periodogram(values, sample_rate, "hann", detrend=detrend)
+    low, high = constants.LOOP_BAND
+    inside = (frequency >= low) & (frequency <= high)
+    return float(np.sum(density[inside]) * sample_rate / values.size)
 
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:

@@ -20,7 +20,6 @@ _TAPERS = 7
 # Frequencies tested per ordinate: between two of them a line loses little of its coherence.
 _PER_ORDINATE = 4
 _REACH = _TAPERS * _PER_ORDINATE // 2
-_BLOCK = 1 << 14
 # Ordinates of the window around a line, distance up to which weaker lines are searched, and most
 # lines of a window.
 _WINDOW, _VICINITY, _MOST_LINES = 128, 32, 40
@@ -114,12 +113,9 @@ def _search(
     evidence, power = np.zeros((2, octave.stop - octave.start))
     for part in octave.each(read):
         transform = fft.rfft(part, _PER_ORDINATE * (octave.n + 1))
-        for first in range(octave.start, octave.stop, _BLOCK):
-            stop = min(first + _BLOCK, octave.stop)
-            ratio, squared = _line_test(transform, octave.n, first, stop)
-            here = slice(first - octave.start, stop - octave.start)
-            evidence[here] += _noise_evidence(ratio)
-            power[here] += squared
+        ratio, squared = _line_test(transform, octave.n, octave.start, octave.stop)
+        evidence += _noise_evidence(ratio)
+        power += squared
     threshold = float(gamma.isf(p_value, sum(map(len, octave.blocks))))
     passed = np.flatnonzero(evidence > threshold)
     centres: list[int] = []

@@ -85,15 +85,6 @@ def expected_orders(
     return sorted(one for one in found if band[0] <= one[0] <= band[1])
 
 
-@dataclass(frozen=True, slots=True)
-class _Detection:
-    """A line at one velocity, with the resolution of its frequency in Hz."""
-
-    line: Line
-    velocity: float
-    resolution: float
-
-
 def find_lines_by_velocity(
     log: Log,
     channels: Sequence[Channel],
@@ -121,10 +112,9 @@ def find_lines_by_velocity(
             for frequency, amplitude in found.tolist():
                 kind = _kind(frequency, fundamentals, resolution)
                 line = Line(frequency, amplitude, "m/s²", kind, channel.name)
-                detections.append(_Detection(line, velocity, resolution))
-        known = [s.line for s in detections if s.line.kind != "unknown"]
-        unknown = [s for s in detections if s.line.kind == "unknown"]
-        lines += _without_duplicates([*known, *_orders(unknown)], 1.5 * _ordinate(log, segments))
+                detections.append((line, velocity, resolution))
+        named = _with_orders(detections)
+        lines += _without_duplicates(named, 1.5 * _ordinate(log, segments))
     return tuple(sorted(lines, key=lambda line: (line.frequency, line.channel)))
 
 
@@ -167,21 +157,24 @@ def _kind(frequency: float, fundamentals: list[tuple[float, str]], resolution: f
     return kind
 
 
-def _orders(unknown: Sequence[_Detection]) -> list[Line]:
-    """Name the lines that have the same wavelength at another velocity."""
+def _with_orders(detections: Sequence[tuple[Line, float, float]]) -> list[Line]:
+    """Name the unknown lines that have the same wavelength at another velocity.
+
+    Each line has its velocity in m/s and the resolution of its frequency in Hz.
+    """
     named = []
-    for one in unknown:
-        kind = "unknown"
-        for other in unknown:
-            slow, fast = sorted((one.velocity, other.velocity))
-            if not (slow > 0 and fast > constants.OTHER_VELOCITY * slow):
+    for line, velocity, resolution in detections:
+        kind = line.kind
+        for other, at, width in detections:
+            slow, fast = sorted((velocity, at))
+            is_other = slow > 0 and fast > constants.OTHER_VELOCITY * slow
+            if line.kind != "unknown" or other.kind != "unknown" or not is_other:
                 continue
-            expected = one.line.frequency * other.velocity / one.velocity
             # The resolution of the first scales with the ratio of velocities.
-            tolerance = other.resolution + one.resolution * other.velocity / one.velocity
-            if abs(other.line.frequency - expected) < tolerance:
-                kind = f"order of {1e3 * one.velocity / one.line.frequency:.3g} mm"
-        named.append(replace(one.line, kind=kind))
+            ratio = at / velocity
+            if abs(other.frequency - line.frequency * ratio) < width + resolution * ratio:
+                kind = f"order of {1e3 * velocity / line.frequency:.3g} mm"
+        named.append(replace(line, kind=kind))
     return named
 
 

@@ -281,7 +281,6 @@ class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind",
         return np.asarray(np.exp(-self._loss(theta, np.maximum(travel, 0))))
 
     def _loss(self, theta: FloatArray, travel: FloatArray) -> FloatArray:
-        """Return -ln health."""
         life, n, slow = theta.T[:, :, None]
         with np.errstate(over="ignore"):
             return np.asarray(slow * travel / life + (travel / life) ** n)

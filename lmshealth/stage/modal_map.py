@@ -34,8 +34,7 @@ class ModalMap:
 
     def inside(self, x: FloatArray) -> BoolArray:
         """Return which points, shape ``(n_points, n_parameters)``, lie inside the grid."""
-        each = np.moveaxis((x >= self.low) & (x <= self.high), -1, 0)
-        return np.asarray(reduce(np.logical_and, each))  # np.all is slow over so short an axis
+        return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
 
     def ln_frequency(self, x: FloatArray) -> FloatArray:
         """Evaluate ln of frequency in Hz, ``(n_points, n_modes)``.
@@ -44,29 +43,6 @@ class ModalMap:
         the grid: there is no extrapolation.
         """
         return _evaluate(self.coefficients, self._unit(x))
-
-    def alone(self, point: FloatArray) -> tuple[FloatArray, ...]:
-        """Return the series over each parameter with all others at a point ``(n_parameters,)``.
-
-        Chebyshev coefficients of shape ``(d + 1, n_modes)`` each.
-        """
-        found, ends = [], _bases(self._unit(point[None]), self.coefficients.shape[:-1])
-        for j in range(len(self.parameters)):
-            series = np.moveaxis(self.coefficients, j, -2)
-            for k, basis in enumerate(ends):
-                if k != j:
-                    series = np.tensordot(basis[0], series, 1)
-            found.append(series)
-        return tuple(found)
-
-    def ln_frequency_alone(self, x: FloatArray, alone: tuple[FloatArray, ...]) -> FloatArray:
-        """Evaluate `ln_frequency`, then the series of each parameter by `alone`, at points.
-
-        Shape ``(1 + n_parameters, n_points, n_modes)``; the basis of each parameter is shared.
-        """
-        bases = _bases(self._unit(x), self.coefficients.shape[:-1])
-        whole = _product(bases) @ self.coefficients.reshape(-1, len(self.modes))
-        return np.stack([whole, *(b @ own for b, own in zip(bases, alone, strict=True))])
 
     def gradient(self, x: FloatArray) -> FloatArray:
         """Differentiate ln frequency by the ln parameters, ``(n_points, n_modes, n_parameters)``.
@@ -163,7 +139,7 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
     sizes, miss = _choose_sizes(unit, np.log(values), [axis.size for axis in axes])
-    basis = _product(_bases(unit, sizes))
+    basis = _basis(unit, sizes)
     coefficients = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
     coefficients = coefficients.reshape(*sizes, len(modes))
     return ModalMap(parameters, modes, low, high, coefficients, miss)
@@ -172,19 +148,17 @@ def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMa
 def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
     """Sum a tensor Chebyshev series at points ``(n_points, n_parameters)`` from -1 to 1."""
     *sizes, n_modes = coefficients.shape
-    return np.asarray(_product(_bases(unit, sizes)) @ coefficients.reshape(-1, n_modes))
+    return np.asarray(_basis(unit, sizes) @ coefficients.reshape(-1, n_modes))
 
 
-def _bases(unit: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
-    """Return the polynomials of each parameter at points, ``(n_points, size)`` each."""
-    return [chebvander(x, size - 1) for x, size in zip(unit.T, sizes, strict=True)]
+def _basis(unit: FloatArray, sizes: Sequence[int]) -> FloatArray:
+    """Return the products of the polynomials of all parameters at points, ``(n_points, n)``."""
 
-
-def _product(bases: list[FloatArray]) -> FloatArray:
     def product(a: FloatArray, b: FloatArray) -> FloatArray:
         return (a[:, :, None] * b[:, None]).reshape(len(a), a.shape[1] * b.shape[1])
 
-    return reduce(product, bases)
+    each = (chebvander(x, size - 1) for x, size in zip(unit.T, sizes, strict=True))
+    return reduce(product, each)
 
 
 def _choose_sizes(
@@ -199,7 +173,7 @@ def _choose_sizes(
     for degree in range(1, min(max(grid) - 1, _MAX_DEGREE) + 1):
         # One less than the axis permits keeps fits without a point well posed.
         sizes = [min(degree + 1, n - 1) for n in grid]
-        span = np.linalg.qr(_product(_bases(unit, sizes)))[0]
+        span = np.linalg.qr(_basis(unit, sizes))[0]
         residual = values - span @ (span.T @ values)
         rest = 1 - np.sum(span**2, axis=1)
         error = np.abs(residual / rest[:, None])[interior].max(axis=0)

@@ -132,11 +132,6 @@ class _OneSidedTest:
         std = self.std(duration, n_logs, n_baseline)
         return float(ndtr(self.size / std + ndtri(self.false_alarm)))
 
-    def smallest_loss(self, duration: float, n_logs: int) -> float:
-        """Return the fraction lost that is detected with the required power."""
-        gap = ndtri(self.required) - ndtri(self.false_alarm)
-        return float(-np.expm1(-self.std(duration, n_logs) * gap))
-
     def effort(self, duration: float) -> Effort:
         """Return what logs of one duration detect."""
         if duration < self.information.least_duration:
@@ -149,15 +144,11 @@ class _OneSidedTest:
             hindrance = "baseline" if best >= self.required else "parameters"
         n_logs, many = None if hindrance else counts[place], self.information.n_baseline
         noise = self.information.drift_variance(duration, many)
-        return Effort(
-            duration,
-            n_logs,
-            hindrance,
-            self.power(duration, 1),
-            self.smallest_loss(duration, 1),
-            self.smallest_loss(duration, many),
-            float(self.information.std(noise)[self.index]),
-        )
+        value_std = float(self.information.std(noise)[self.index])
+        gap = float(ndtri(self.required) - ndtri(self.false_alarm))
+        power = self.power(duration, 1)
+        one, more = (float(-np.expm1(-self.std(duration, n) * gap)) for n in (1, many))
+        return Effort(duration, n_logs, hindrance, power, one, more, value_std)
 
 
 def _index(stage: Stage, parameter: str, loss: float) -> int:

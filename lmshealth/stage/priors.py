@@ -191,12 +191,6 @@ class JointPrior:
         return np.asarray(np.clip(np.column_stack(columns), self.low, self.high))
 
     @property
-    def support(self) -> tuple[FloatArray, FloatArray]:
-        """Bounds of the ln parameters of non-zero density, each ``(n_parameters,)``."""
-        low, high = self.quantile(np.array([[0.0], [1.0]]))
-        return low, high
-
-    @property
     def variance(self) -> FloatArray:
         """Variances of the ln parameters, shape ``(n_parameters,)``."""
         levels = (np.arange(_N_LEVELS) + 0.5) / _N_LEVELS

@@ -466,7 +466,6 @@ def _signal(prefix: str, one: _Column, why: str) -> Guess:
 
 
 def _lines(label: str, content: Content, guesses: list[Guess], rate: float | None) -> Iterator[str]:
-    """Write the column map."""
     yield f"# Column map proposed by `lmshealth init` from {label}."
     yield "# Check every line: what the file does not state is a guess, with its reason."
     yield "# All keys: lmshealth/io/README.md, Column maps."

@@ -79,7 +79,7 @@ def test_names_in_a_wide_table_are_not_torn(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The last column gives way; folders are left out unless two logs have one name."""
-    monkeypatch.setattr(terminal, "_columns", lambda: 80)
+    monkeypatch.setattr(terminal, "_width", lambda stream: 80)
     row = {"log": "far/away/on/a/disk/log-0001.h5", "channel": "acc_pitch", "mode": "roll",
            "reason": "not-excited", "detail": "no " * 40}  # fmt: skip
     print_refused([row])
@@ -99,7 +99,7 @@ def test_a_table_is_as_wide_as_its_terminal_and_never_cut(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, columns: int | None
 ) -> None:
     """In a pipe every row is one line; on a terminal only texts are wrapped, numbers stay whole."""
-    monkeypatch.setattr(terminal, "_columns", lambda: columns)
+    monkeypatch.setattr(terminal, "_width", lambda stream: columns)
     row = {"mode": "roll", "detail": "no resonance " * 30, "loss, 5 logs": "1 234 567.8"}
     terminal.print_table("Title", [row, row | {"mode": "pitch"}], 2)
     out = capsys.readouterr().out
@@ -128,7 +128,7 @@ def test_nothing_is_wider_than_the_terminal(
     n_texts: int,
 ) -> None:
     """Texts are wrapped, or a row has a line for each cell; numbers are whole, nothing is cut."""
-    monkeypatch.setattr(terminal, "_columns", lambda: columns)
+    monkeypatch.setattr(terminal, "_width", lambda stream: columns)
     terminal.print_table(f"Title of {LONG}", [row, row], n_texts)
     print_text(f"Text about {LONG} and 加速度計 " * 3, "! ")
     terminal.print_line(f"Report: {LONG}")

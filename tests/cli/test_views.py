@@ -328,7 +328,7 @@ def test_plans_are_one_table_each_with_reasons(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A number of logs or what hinders, dashes for what is not known, what stands for what."""
-    monkeypatch.setattr(terminal, "_columns", lambda: 80)
+    monkeypatch.setattr(terminal, "_width", lambda stream: 80)
     asked = {
         "parameter": "p", "loss": 0.05, "power": 0.9, "false_alarm": 0.01, "n_baseline": 7,
         "seconds_for_one_log": 42,
@@ -532,7 +532,7 @@ def test_many_machines_have_a_row_each(
     make: Callable[..., Assessment], printed: Printed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Twenty rows, the most urgent first, the rest counted; nothing runs off the terminal."""
-    monkeypatch.setattr(terminal, "_columns", lambda: 80)
+    monkeypatch.setattr(terminal, "_width", lambda stream: 80)
     good, bad = make("good", wear_km=400000, floor=0.98), make("worst")
     fleet = [replace(good, judgement=replace(good.judgement, stage=f"M{k}")) for k in range(21)]
     print_fleet([*fleet, bad])

@@ -13,8 +13,8 @@ from scipy.stats import norm
 from lmshealth.errors import BadQuestion, BadStage, OutsideMap
 from lmshealth.stage.check import check_stage
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage, load_stage
+from lmshealth.stage.identifiability import ambient_bound
 from lmshealth.stage.planning import Plan, plan
 from studies.harness.data.cramer_rao import long_record_law
 from tests.lives import DAMPING, FOOT, FREQUENCY, PRELOAD, SENSITIVITY, make_stage

@@ -11,9 +11,8 @@ from pathlib import Path
 import numpy as np
 from scipy import stats
 
-from lmshealth.stage.cramer_rao import ambient_bound
 from lmshealth.stage.description import Stage
-from lmshealth.stage.identifiability import identifiability_of
+from lmshealth.stage.identifiability import ambient_bound, identifiability_of
 from lmshealth.stage.planning import plan
 from studies.health.detectability import FALSE_ALARM, POWER, called, stage_with
 from tests.claims import Claims

@@ -137,7 +137,6 @@ def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | No
 
 
 def _agree(one: float, other: float) -> bool:
-    """Return whether two sample rates agree."""
     return abs(one / other - 1) <= constants.AGREEMENT
 
 

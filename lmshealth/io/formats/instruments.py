@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError, iterparse
+from xml.etree.ElementTree import ParseError, iterparse
 
 import numpy as np
 
@@ -69,19 +69,16 @@ def _records(path: Path, names: list[str]) -> Iterator[list[float]]:
     try:
         for _, element in iterparse(path):  # noqa: S314 (expat bounds entities)
             if element.tag == "dataSignal":
-                names.append(_name(element))
+                # Its description, else its path in the control.
+                own = element.attrib
+                described = own.get("description", "").removesuffix("(64 bit)").strip()
+                names.append(described or own.get("name", own.get("key", "")))
             if element.tag == "rec":
                 keys = "time", *(f"f{k}" for k in range(1, len(names) + 1))
                 yield [float(element.attrib.get(key, "nan")) for key in keys]
             element.clear()
     except (ParseError, ValueError) as error:
         raise corrupt(f"the trace cannot be read: {error}") from error
-
-
-def _name(element: Element) -> str:
-    """Return the name of a signal: its description, else its path in the control."""
-    described = element.attrib.get("description", "").removesuffix("(64 bit)").strip()
-    return described or element.attrib.get("name", element.attrib.get("key", ""))
 
 
 def _is_trace(head: bytes) -> bool:

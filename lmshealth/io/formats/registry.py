@@ -138,35 +138,25 @@ def confirm(path: Path) -> Format:
         head = stream.read(_HEAD)
     if not head:
         raise Unusable("empty", "0 bytes; copy the file again")
-    if form is None:
-        raise _unknown(path, head)
+    name = "" if form is None else form.name
     try:
-        fits = form.sniff(head)
+        if form is not None and form.sniff(head):
+            return form
     except Exception as error:
         if form in FORMATS:
             raise
-        detail = f"the plug-in for {form.name} fails ({type(error).__name__}: {error}); update it"
+        detail = f"the plug-in for {name} fails ({type(error).__name__}: {error}); update it"
         raise Unusable("format", detail) from error
-    if fits:
-        return form
     if foreign := describe(head, path):
         raise Unusable("format", foreign)
     actual = next((other for other in FORMATS if other.sniff(head)), None)
-    if actual is None:
-        raise corrupt(f"does not start as {form.name} does")
-    found = f"the suffix is that of {form.name}, the content is {actual.name}"
-    raise Unusable("format", f"{found}; rename the file to {actual.suffixes[0]}")
-
-
-def _unknown(path: Path, head: bytes) -> Unusable:
-    """Return the refusal of a file with an unknown suffix."""
-    if foreign := describe(head, path):
-        return Unusable("format", foreign)
     found = f"unknown suffix {path.suffix!r}"
-    actual = next((other for other in FORMATS if other.sniff(head)), CSV)
-    if actual is not CSV:
-        step = f"rename the file to {actual.suffixes[0]}"
-        return Unusable("format", f"{found}, the content is {actual.name}; {step}")
-    known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
-    step = "rename text to .csv, save other arrays as columns of HDF5 or Parquet"
-    return Unusable("format", f"{found}; needed one of {', '.join(known)}; {step}")
+    if form is None and actual in (None, CSV):
+        known = (*SUFFIXES, *TEXT_SUFFIXES, *(s for own in plug_ins() for s in own.suffixes))
+        step = "rename text to .csv, save other arrays as columns of HDF5 or Parquet"
+        raise Unusable("format", f"{found}; needed one of {', '.join(known)}; {step}")
+    if actual is None:
+        raise corrupt(f"does not start as {name} does")
+    found = f"the suffix is that of {name}" if name else found
+    step = f"rename the file to {actual.suffixes[0]}"
+    raise Unusable("format", f"{found}, the content is {actual.name}; {step}")

@@ -13,7 +13,7 @@ from lmshealth.modal.deterministic.likelihood import (
     pole_columns,
     unit_level,
 )
-from lmshealth.stage.cramer_rao import NOISE_STD, fourier_frequencies, marginal_covariance
+from lmshealth.stage.identifiability import NOISE_STD, fourier_frequencies, marginal_covariance
 
 # Steps of the differences by which several modes' densities are differentiated, in ln.
 _STEP = 1e-5
