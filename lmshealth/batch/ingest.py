@@ -198,8 +198,8 @@ def ingest(
     progress("identifying", len(cached), len(tasks))
     left = [task for task in tasks if task.name not in known]
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
-    options = {"stages": tuple(stages), "how": how, "limit": settings.seconds_per_log}
-    identify = partial(_identify_logs, **options)
+    options: dict[str, Any] = {"stages": tuple(stages), "how": how}
+    identify = partial(_identify_logs, limit=settings.seconds_per_log, **options)
     done = 0
     for part in _identified(left, identify, resources, fetch):
         store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
