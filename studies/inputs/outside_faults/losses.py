@@ -165,6 +165,13 @@ def outputs(folder: Path) -> dict[str, bytes]:
     return {path.name: path.read_bytes() for path in own if path.name != "changes.csv"}
 
 
+def rows_of(file: sqlite3.Connection, kind: str) -> str:
+    """Return table and condition of the values of a kind, which had tables of their own before."""
+    query = "SELECT name FROM sqlite_master WHERE type = 'table'"
+    names = {name.split("_")[0]: name for (name,) in file.execute(query)}
+    return names[kind] if kind in names else f"{names['values']} WHERE kind = '{kind}'"
+
+
 def flip_value(store: Path, rng: random.Random) -> None:
     """Change one digit, letter or byte of a value that a run reads."""
     with closing(sqlite3.connect(store)) as file, file:
@@ -241,15 +248,15 @@ def flipped_digest(program: Program, folder: Path, *, flips: bool = True) -> See
     time.sleep(UNCHANGED_S)
     analyse(program, folder)
     with closing(sqlite3.connect(folder / "out" / "lmshealth.sqlite")) as file, file:
-        names = file.execute("SELECT name FROM sqlite_master WHERE type = 'table'").fetchall()
-        table = next(name for (name,) in names if name.startswith("hashed_"))
+        rows = rows_of(file, "hashed")
+        table = rows.split()[0]
         *_, column = (row[1] for row in file.execute(f"PRAGMA table_info({table})"))
-        (value,) = file.execute(f"SELECT {column} FROM {table}").fetchone()
+        (value,) = file.execute(f"SELECT {column} FROM {rows}").fetchone()
         zero, one = (b"0", b"1") if isinstance(value, bytes) else ("0", "1")
         if flips:
             other = value[:-1] + (one if value[-1:] == zero else zero)
-            file.execute(f"UPDATE {table} SET {column} = ?", (other,))
-        file.execute(f"DELETE FROM {table.replace('hashed', 'identified')}")
+            file.execute(rows.replace(table, f"UPDATE {table} SET {column} = ?", 1), (other,))
+        file.execute(f"DELETE FROM {rows_of(file, 'identified')}")
     ends = [analyse(program, folder).returncode for _ in range(2)]
     return Seen(ends == [0, 0], f"exit {ends}")
 

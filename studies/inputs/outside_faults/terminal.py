@@ -15,6 +15,7 @@ import numpy as np
 from scipy.signal import lfilter
 
 from studies.inputs.outside_faults.case import Case, Program, Seen, is_traceback, last_line
+from studies.inputs.outside_faults.losses import rows_of
 
 KIND = "terminal"
 RATE = 1000.0  # of the logs, Hz
@@ -117,13 +118,8 @@ def _identified(out: Path) -> bool:
 
     try:
         with sqlite3.connect(out / "lmshealth.sqlite") as store:
-            # The name of the table ends with the version of its columns.
-            query = (
-                "SELECT name FROM sqlite_master WHERE name LIKE 'identified%' AND type = 'table'"
-            )
-            names = [name for (name,) in store.execute(query)]
-            return any(store.execute(f"SELECT 1 FROM {name}").fetchone() for name in names)
-    except sqlite3.Error:
+            return bool(store.execute(f"SELECT 1 FROM {rows_of(store, 'identified')}").fetchone())
+    except (sqlite3.Error, KeyError):
         return False
 
 
