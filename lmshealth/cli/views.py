@@ -416,8 +416,9 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
 
 
 def _verdict(one: Summary) -> str:
-    """Return the verdict of a machine with its probability, if its last log is not too old."""
-    return headline(one) if one.unknown else one.verdict + in_brackets(one.probability)
+    """Return the verdict of a machine with its probability, and whether its last log is too old."""
+    found = one.verdict + in_brackets(one.probability)
+    return f"{headline(one)}; at the last log {found}" if one.unknown else found
 
 
 def _parameter(one: ParameterHealth) -> str:
