@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import fields, is_dataclass, replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, date, datetime, timedelta
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -23,11 +23,11 @@ from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import Verdict
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.status import coming_states, make_status
+from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
-from lmshealth.report.machine_page import make_page
+from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage
@@ -421,7 +421,7 @@ def write_report(
     refused: Sequence[Refusal],
     *,
     earlier: Mapping[str, Summary] | None = None,
-    generated: datetime | None = None,
+    today: date | None = None,
 ) -> list[Path]:
     """Write all pages as a run does; return those of the machines, most urgent first, and index."""
     names = file_names(one.judgement.stage for one in assessments)
@@ -430,9 +430,11 @@ def write_report(
         identity = one.judgement.stage
         before = (earlier or {}).get(identity)
         summary = summarise(one, one.service(), names[identity])
-        states = coming_states(make_status(one, summary))
-        page = make_page(one, summary, before=before, states=states, generated=generated)
-        write_text(folder / summary.file, page)
+        day = today or summary.recorded_at.date()
+        status = make_status(replace(one, today=day), summary)
+        page = make_page(one, summary, before=before)
+        summary = on_day(summary, status, day)
+        write_text(folder / summary.file, date_page(page, summary, status))
         summaries.append(summary)
-    index = write_index(folder, summaries, refused, generated=generated)
+    index = write_index(folder, summaries, refused, today=today)
     return [*(folder / one.file for one in by_urgency(summaries)), index]

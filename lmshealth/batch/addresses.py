@@ -68,6 +68,6 @@ def notify() -> None:
     # All are tried, so that each is named.
     if not all([messenger.add(address) for address in addresses]):  # noqa: C419
         sys.exit(f"apprise does not know an address in {constants.NOTIFY}")
-    body = "\n".join(change["text"] for change in changes)
+    body = "\n".join(f"{change['text']} ({change['severity']})" for change in changes)
     if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):
         sys.exit(f"apprise could not deliver to every address in {constants.NOTIFY}")

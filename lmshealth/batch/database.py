@@ -251,7 +251,9 @@ _COST = (
 
 
 def next_step(error: Exception, address: str) -> str:
-    """Return what to do about a database that is damaged or cannot be written to, else nothing."""
+    """Return what to do about a missing driver, or a damaged or read-only file, else nothing."""
+    if isinstance(error, ImportError):
+        return 'a PostgreSQL store needs an extra: pip install "lmshealth[postgres]"'
     if (origin := getattr(error, "orig", None)) is None:
         return ""
     file = make_url(address).database

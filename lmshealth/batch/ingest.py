@@ -434,13 +434,14 @@ def identify_log(
         log = read(task.path, name=task.name, **how)
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
-        require_identity(log)
+        require_identity(log, odometer=False)
         stage, asked = log.metadata.stage, log.metadata.description
         described = _matching(stages, log.metadata)
         if described is None:
             by = _none_of(stages)
             raise BadLog(task.name, "no-stage", _unmatched(log.metadata, stages))
         by = described.digest
+        require_identity(log, odometer=described.description.life.clock == "odometer")
         reading = read_modes(log, described, progress=_within(limit, task.name))
         modes, band = reading.modes, shown_band(described)
         spectra = summarise(reading.spectra, reading.fitted, modes, band, WATERFALL_BINS)

@@ -7,19 +7,20 @@ import threading
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from datetime import datetime
 from functools import partial
 from pathlib import Path
 
-from lmshealth._private.files import replacing
+from lmshealth._private.files import replacing, write_text
 from lmshealth._private.serialize import pack, unpack
 from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch.assess import LogRows, reason_if_failed
 from lmshealth.batch.dashboard import points
 from lmshealth.batch.store import unpack_or_none
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.status import Status, coming_states, make_status
+from lmshealth.machine.status import Status, judge_at, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
-from lmshealth.report.machine_page import make_page
+from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT
 
@@ -46,7 +47,7 @@ class MachineRecord:
 class MachineOutput:
     """Page, tables (packed CSV) and status of a machine, and logs that its life excludes."""
 
-    page: str  # HTML
+    page: str  # HTML, to be completed on each day: `Judging.write`
     summary: Summary
     tables: dict[str, bytes]
     excluded: tuple[str, ...]
@@ -63,7 +64,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING:
-        page = make_page(found, summary, before=record.before, states=coming_states(status))
+        page = make_page(found, summary, before=record.before)
     rows = machine_tables(found) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
     for name in logs[0].tables if logs else ():
@@ -76,6 +77,24 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         status=status,
         points=tuple(points(rows)),
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Judging:
+    """When statuses are judged, and beside which of the run before."""
+
+    moment: datetime
+    silent_days: float | None
+    before: Mapping[str, Status]  # by machine
+
+    def write(self, output: MachineOutput, path: Path) -> Summary:
+        """Write the page of a machine as of the day; return its summary of that day."""
+        before = self.before.get(output.status.stage)
+        today = self.moment.date()
+        status = judge_at(before, output.status, self.moment, self.silent_days)
+        summary = on_day(output.summary, status, today)
+        write_text(path, date_page(output.page, summary, status))
+        return summary
 
 
 def output_or_reason(record: MachineRecord) -> MachineOutput | str | None:

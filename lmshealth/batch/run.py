@@ -4,13 +4,13 @@ from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, date, datetime, time
+from datetime import UTC, datetime, time
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
 import msgspec
 
-from lmshealth._private.files import remove_abandoned, write_text
+from lmshealth._private.files import remove_abandoned
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
@@ -18,7 +18,13 @@ from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, pack
 from lmshealth.batch.cache import Cached, Progress, Resources
 from lmshealth.batch.dashboard import put_points, put_status
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
-from lmshealth.batch.outputs import MachineOutput, MachineRecord, output_or_reason, write_tables
+from lmshealth.batch.outputs import (
+    Judging,
+    MachineOutput,
+    MachineRecord,
+    output_or_reason,
+    write_tables,
+)
 from lmshealth.batch.store import Store, default_url, unpack_or_none
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -118,17 +124,17 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        done, made, tables, excluded = _report(usable, refused, resources, out)
-        moment = _moment(settings.today)
+        judging = _judging(store, settings)
+        done, made, tables, excluded = _report(usable, refused, resources, out, judging)
         with store.alone():  # a run that ends before its tables are written has announced nothing
-            statuses, changes, notes = announce(store, made, moment, settings.alerts, scope)
-            put_status(store, statuses, changes, moment)
+            statuses, changes, notes = announce(store, made, judging.moment, settings.alerts, scope)
+            put_status(store, statuses, changes, judging.moment)
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
-            write_index(out, done.rows, refused)
+            write_index(out, done.rows, refused, today=judging.moment.date())
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
@@ -165,6 +171,7 @@ def report(
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
+    judging = _judging(store, settings)
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
@@ -173,24 +180,31 @@ def report(
             if isinstance(output, str):
                 failed[record.machine] = output
             elif output is not None:
-                write_text(out / record.file, output.page)
-                rows[record.machine] = output.summary
+                rows[record.machine] = judging.write(output, out / record.file)
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         raise store.unfilled("no assessment that this version of lmshealth can read")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     return RunResult(
-        index=write_index(out, ranked, store.refused(one.refused for one in present)),
+        index=write_index(
+            out,
+            ranked,
+            store.refused(one.refused for one in present),
+            today=judging.moment.date(),
+        ),
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
     )
 
 
-def _moment(today: date | None) -> datetime:
-    """Return the moment at which statuses are judged: the end of a day, by default now (UTC)."""
-    return datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
+def _judging(store: Store, settings: Settings = Settings()) -> Judging:
+    """Return when pages and statuses are judged: at the end of a day, by default now (UTC)."""
+    today = settings.today
+    moment = datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
+    before = {stage: one.status for stage, one in store.announced().items()}
+    return Judging(moment, settings.alerts.silent_days, before)
 
 
 def _prepare(out: Path) -> None:
@@ -250,6 +264,7 @@ def _report(
     refused: Sequence[Refusal],
     resources: Resources,
     out: Path,
+    judging: Judging,
 ) -> tuple[RunResult, dict[str, Status], dict[str, dict[str, bytes]], set[str]]:
     """Write pages; return the result without counts, statuses, packed tables, and excluded logs.
 
@@ -269,7 +284,7 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources, out):
+        for name, output in _outputs(left, keys, files, resources):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -277,7 +292,7 @@ def _report(
             tables[name] = output.tables
             excluded.update(output.excluded)
             made[name] = output.status
-            rows[name] = output.summary
+            rows[name] = judging.write(output, out / files[name])
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
@@ -296,9 +311,8 @@ def _outputs(
     keys: Mapping[str, str],
     files: Mapping[str, str],
     resources: Resources,
-    out: Path,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
-    """Write the pages of machines; those of unchanged results are taken from the store.
+    """Yield the outputs of machines; those of unchanged results are taken from the store.
 
     A machine whose assessment is missing, or cannot be decoded, is left out.
     """
@@ -308,7 +322,7 @@ def _outputs(
         # The rows of its logs, which are large, follow from their names and keys.
         record = _record(name, keys[name], files[name], store)
         key = fingerprint(VERSION, record, machine.logs)
-        if output := _kept_output(name, key, store, out / files[name]):
+        if output := _kept_output(name, key, store):
             yield name, output
         else:
             missing[name] = machine, key
@@ -333,21 +347,18 @@ def _outputs(
         name = record.machine
         left.remove(name)
         if isinstance(drawn, MachineOutput):
-            write_text(out / record.file, drawn.page)
             put_points(store, name, drawn.points)
             store.put_part(name, missing[name][1], pack(drawn))
         if drawn is not None:
             yield name, drawn
     for name in left:  # drawn by other runs
-        if output := _kept_output(name, missing[name][1], store, out / files[name]):
+        if output := _kept_output(name, missing[name][1], store):
             yield name, output
 
 
-def _kept_output(name: str, key: str, store: Store, page: Path) -> MachineOutput | None:
-    """Fetch the output of a machine from the store, and write its page; None if it is not there."""
+def _kept_output(name: str, key: str, store: Store) -> MachineOutput | None:
+    """Fetch the output of a machine from the store; None if it is not there."""
     found: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
-    if found is not None:
-        write_text(page, found.page)
     return found
 
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import closing
-from datetime import datetime
+from datetime import date, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -169,18 +169,22 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 @options.out_option(type=options.FOLDER, help="Folder of the pages.")
 @options.WORKERS
 @options.PDF
+@options.TODAY
 @click.pass_context
-def report(ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool) -> None:
+def report(
+    ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool, today: date | None
+) -> None:
     """Write the pages of all machines in a store, without their logs.
 
-    The pages are those that `run` wrote last for each machine, byte for byte.
+    They are those that `run` writes on the same day, byte for byte.
     """
     from lmshealth.batch.ingest import Settings
     from lmshealth.batch.run import report as write_pages
     from lmshealth.batch.store import Store
 
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
-        result = write_pages(opened, out, Settings(workers=workers), progress)
+        settings = Settings(workers=workers, today=today)
+        result = write_pages(opened, out, settings, progress)
     terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)
     ctx.exit(options.SOME_REFUSED if result.failed or result.notes else 0)

@@ -115,7 +115,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
         write_text(map_file, text)
         terminal.print_notes([f"{map_file}: column map, tried on {len(found)} logs"])
         _propose_manifest(sheet, found)
-        band = _propose_stage(stage, first[0])
+        odometer = any(row["travel_km"] is not None for row in found)
+        band = _propose_stage(stage, first[0], odometer)
         terminal.print_notes(_next_steps(first[0], map_file, band))
     _exit(ctx, found, lost)
 
@@ -148,16 +149,17 @@ def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[
     return steps
 
 
-def _propose_stage(path: Path, log: Log) -> tuple[int, int] | None:
+def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | None:
     """Write a description of the modes of a log, where it has some; few channels are quick.
 
+    Its clock is the time if no log has an odometer.
     Return a band in Hz around the clear ones.
     """
     used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
             modes = read_modes(log, channels=used, progress=report).modes
-        _save(path, LogEstimates(log.name, log.digest, log.metadata, modes))
+        _save(path, LogEstimates(log.name, log.digest, log.metadata, modes), odometer=odometer)
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])
         return None
@@ -281,7 +283,7 @@ def _check_outputs(given: dict[str, Any]) -> None:
             raise click.BadParameter(f"{path} {why}", param_hint=f"--{option}")
 
 
-def _save(path: Path, found: LogEstimates) -> None:
+def _save(path: Path, found: LogEstimates, *, odometer: bool = True) -> None:
     modes, specs = found.modes, []
     for k, search in enumerate(searches(modes.frequency.tolist())):
         frequency, damping = float(modes.frequency[k]), float(modes.damping_ratio[k])
@@ -289,7 +291,8 @@ def _save(path: Path, found: LogEstimates) -> None:
         spec = ModeSpec(modes.names[k], frequency, damping, snr=snr, search=search)
         comment = f"± {modes.frequency_std[k]:.2g}, clearest in {modes.channels[k]}"
         specs.append((spec, comment))
-    write_skeleton(path, f"identified in {found.log}", found.metadata.stage, specs)
+    source = f"identified in {found.log}"
+    write_skeleton(path, source, found.metadata.stage, specs, odometer=odometer)
     terminal.print_notes([f"{path}: description of {len(specs)} modes, ready to edit"])
 
 

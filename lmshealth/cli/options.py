@@ -241,7 +241,7 @@ _SILENT_DAYS = click.option(
     "--silent-days",
     type=Finite(0, _MOST_DAYS, min_open=True),
     metavar="N",
-    help="Report a machine without a log for more than N days.",
+    help="A machine is unknown after N days without a log; default five of its own intervals.",
 )
 _ALERT_COMMAND = click.option(
     "--alert-command",

@@ -38,7 +38,7 @@ from lmshealth.report.text import (
     travel_left,
     whole_km,
 )
-from lmshealth.report.wording import next_step
+from lmshealth.report.wording import headline, next_step, service_on_day
 from lmshealth.tracking.track import Track
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
@@ -390,7 +390,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     """Print the results of a run, most urgent first: a few machines in full, many in a table."""
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
-            print_text(f"{one.identity}: {one.verdict}{in_brackets(one.probability)}. {one.why}")
+            print_text(f"{one.identity}: {_verdict(one)}. {one.why}")
             if to_do := next_step(one.step):
                 print_text(f"  {to_do}")
             for parameter in one.health:
@@ -401,10 +401,10 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     shown = [
         {
             "stage": one.identity,
-            "verdict": one.verdict + in_brackets(one.probability),
+            "verdict": _verdict(one),
             "health": "\n".join(map(_parameter, one.health)),
             "remaining life": _travel_left(one.life),
-            "service": service_text(one.service),
+            "service": service_on_day(one),
         }
         for one in summaries[: constants.TERMINAL_ROWS]
     ]
@@ -413,6 +413,12 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     print_table(title, shown, 5)
     if rest := len(summaries) - len(shown):
         print_line(f"{count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
+
+
+def _verdict(one: Summary) -> str:
+    """Return the verdict of a machine with its probability, and whether its last log is too old."""
+    found = one.verdict + in_brackets(one.probability)
+    return f"{headline(one)}; at the last log {found}" if one.unknown else found
 
 
 def _parameter(one: ParameterHealth) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple, cast
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -138,10 +138,14 @@ def content_digest(path: str | Path, *, name: str | None = None) -> str:
         raise BadLog(label, "missing-file", f"cannot be opened: {why}") from error
 
 
-def require_identity(log: Log) -> None:
-    """Require the metadata that tracking needs; `BadLog` (``metadata``) names the missing keys."""
+def require_identity(log: Log, *, odometer: bool = True) -> None:
+    """Require the metadata that tracking needs; `BadLog` (``metadata``) names the missing keys.
+
+    Without ``odometer`` a log needs none: its description counts days.
+    """
     own = log.metadata
-    given = {"stage": own.stage, "recorded_at": own.recorded_at, "travel_km": own.travel}
+    given: dict[str, Any] = {"stage": own.stage, "recorded_at": own.recorded_at}
+    given |= {"travel_km": own.travel} if odometer else {}
     if absent := [key for key, value in given.items() if value is None]:
         needed = "needed in the file's metadata or in manifest.csv"
         raise BadLog(log.name, "metadata", f"{', '.join(absent)} not given; {needed}")

@@ -38,6 +38,7 @@ from lmshealth.life.verdict import (
     judge,
     undeclared_events,
 )
+from lmshealth.machine.constants import DRIFT_SIGMA
 from lmshealth.machine.service import Service, decide
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
@@ -99,6 +100,28 @@ class Assessment:
         return tuple(dict.fromkeys(event.mode for event in alarms))
 
     @property
+    def drifted(self) -> dict[str, tuple[float, float]]:
+        """Modes whose drift no scatter explains: change of ln f and its standard deviations.
+
+        Only while the baseline has too few logs for a verdict: later ones allow for wander. An
+        estimate of the last log that the filter has left out counts too, before the next confirms
+        it.
+        """
+        track, history = self.track, self.history
+        n_logs = len(history.logs) - history.baseline
+        if track is None or self.alarmed or n_logs >= self.stage.description.baseline.logs:
+            return {}
+        drift, variance = track.drift[-1].copy(), np.diagonal(track.drift_cov[-1]).copy()
+        for mode in (mode for epoch, mode in track.outliers if epoch == len(track.logs) - 1):
+            k, column = track.modes.index(mode), history.columns(mode)[0]
+            drift[k] = history.ln_frequency[-1, column] - track.ln_frequency[-2, k]
+            variance[k] = history.cov[-1, column, column] + track.ln_frequency_std[-2, k] ** 2
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratios = np.abs(drift) / np.sqrt(variance)
+        found = zip(track.modes, drift.tolist(), ratios.tolist(), strict=True)
+        return {mode: (size, n_std) for mode, size, n_std in found if DRIFT_SIGMA < n_std < np.inf}
+
+    @property
     def compared(self) -> LogEstimates | None:
         """The first log of the baseline, beside which the last is shown; None if it is the last."""
         latest, before = self.latest, self.at_baseline
@@ -119,7 +142,7 @@ class Assessment:
         """
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
-            return (0 if self.alarmed else 1), 0.0, 0.0, identity
+            return (0 if self.alarmed or self.drifted else 1), 0.0, 0.0, identity
         if verdict == OUTSIDE_MAP:
             return 1, 0.0, 0.0, identity
         if self.prognosis is None:

@@ -25,6 +25,16 @@ SERVICE_LEAD_DAYS = 30
 """Days before the service date from which a machine has the state ``MAINTENANCE_REQUIRED``: time to
 plan a service."""
 
+SILENT_INTERVALS = 5
+"""A machine is silent when its last log is older than the time in which its last so many intervals
+between days with a log passed: five intervals of logs on working days contain a weekend, so that a
+long weekend is no silence. ``--silent-days`` replaces it."""
+
+DRIFT_SIGMA = 6.0
+"""Drift in standard deviations that is reported where no verdict is possible yet: three times what
+is expected where the reported errors are too small by a factor of two, as of a first log that
+shares a cause with no other."""
+
 JSON_SCHEMA = 2
 """Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,
 and what alerts get. It changes when a key or a value changes its meaning or is removed."""

@@ -1,8 +1,8 @@
-"""Next step for a machine: a function of its verdict, its service and its age, by one table."""
+"""Next step for a machine: a function of verdict, service, age and day, by one table."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date
 from typing import Literal
 
@@ -14,21 +14,34 @@ from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import Service
 
-Step = Literal["inspect", "find-cause", "none", "record", "service-now", "confirm", "plan", "later"]
-"""What to do: inspect the machine, find what moved a mode, nothing, record logs, service it now,
-confirm a service date by further logs, plan the service, or nothing within the horizon."""
+Step = Literal[
+    "inspect", "find-cause", "check-drift", "log-now", "none", "record",
+    "service-now", "overdue", "confirm", "schedule", "plan", "later",
+]  # fmt: skip
+"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, record
+a log that is late, nothing, record logs, service it now, service it after its date, confirm a
+service date by further logs, plan the service of a sound or of a worn machine, or nothing within
+the horizon."""
 
-# First case that applies to verdict, kind of service and age. A verdict is ``alarm`` (or a step),
-# ``outside``, ``open`` (none), ``healthy`` or ``loss``; "" stands for any value.
-CASES: tuple[tuple[Step, str, str, str], ...] = (
-    ("inspect", "alarm", "", ""),
-    ("find-cause", "outside", "", ""),
-    ("none", "healthy", "unknown", ""),
-    ("record", "", "unknown", ""),
-    ("service-now", "", "now", ""),
-    ("confirm", "healthy", "by", "young"),
-    ("plan", "", "by", ""),
-    ("later", "", "later", ""),
+# First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
+# step), ``outside``, ``drift`` (large, without a verdict), ``open`` (none), ``healthy`` or
+# ``loss``. A day is ``overdue`` after that of the service, else ``late`` where a log is. "" is any.
+CASES: tuple[tuple[Step, str, str, str, str], ...] = (
+    ("inspect", "alarm", "", "", ""),
+    ("find-cause", "outside", "", "", ""),
+    ("check-drift", "drift", "", "", ""),
+    ("log-now", "", "unknown", "", "late"),
+    ("none", "healthy", "unknown", "", ""),
+    ("record", "", "unknown", "", ""),
+    ("service-now", "", "now", "", ""),
+    ("log-now", "healthy", "by", "young", "overdue"),
+    ("overdue", "", "by", "", "overdue"),
+    ("log-now", "healthy", "", "", "late"),
+    ("confirm", "healthy", "by", "young", ""),
+    ("schedule", "healthy", "by", "", ""),
+    ("plan", "", "by", "", ""),
+    ("log-now", "", "later", "", "late"),
+    ("later", "", "later", "", ""),
 )
 
 
@@ -44,27 +57,33 @@ class NextStep:
     by: date | None = None  # day of the service
     log_every: float = np.inf  # days from one log to the next
     horizon: float = np.nan  # travel in m beyond which nothing is claimed
+    case: tuple[str, str, str] = ("open", "unknown", "young")  # verdict, service and age
+
+    def on(self, day: str) -> NextStep:
+        """Return the step on an ``overdue`` or ``late`` day, or on another (``""``)."""
+        return replace(self, kind=step_of(*self.case, day))
 
 
 def next_step(assessment: Assessment, service: Service) -> NextStep:
-    """Choose the next step by `CASES`."""
+    """Choose the next step at the last log by `CASES`."""
     prognosis = assessment.prognosis
     kind = "unknown" if prognosis is None else service.kind
     n_logs = len(assessment.history.logs) - assessment.history.baseline
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
-    step = step_of(_class_of(assessment), kind, age)
-    if prognosis is None or step in ("inspect", "find-cause", "none", "record"):
-        return NextStep(step)
+    case = _class_of(assessment), kind, age
+    step = step_of(*case)
+    if prognosis is None:
+        return NextStep(step, case=case)
     first = first_limit(prognosis)
     name = first[0] if first else prognosis.parameters[0]
     words = {spec.name: spec.word for spec in assessment.stage.parameters}
     every = service.inspect_every / float(np.median(prognosis.usage))
-    return NextStep(step, name, words.get(name, ""), service.by, every, prognosis.horizon)
+    return NextStep(step, name, words.get(name, ""), service.by, every, prognosis.horizon, case)
 
 
-def step_of(verdict: str, service: str, age: str) -> Step:
+def step_of(verdict: str, service: str, age: str, day: str = "") -> Step:
     """Return the step of the first case that applies."""
-    given = verdict, service, age
+    given = verdict, service, age, day
     return next(
         step
         for step, *case in CASES
@@ -77,6 +96,8 @@ def _class_of(assessment: Assessment) -> str:
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
         return "alarm"
+    if assessment.drifted:
+        return "drift"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     return known.get(verdict, "loss")
 

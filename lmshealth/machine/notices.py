@@ -39,6 +39,13 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             flag, "caution", names, what, "Its meaning is in the column flags of modes.csv."
         )
     track = assessment.track
+    for mode, (size, n_std) in assessment.drifted.items():
+        n_logs = len(assessment.history.logs) - assessment.history.baseline
+        moved = f"{100 * np.expm1(size):+.2f}".replace("-", "−")
+        what = f"{spell(mode).capitalize()} has moved by {moved} % in {n_logs} logs, "
+        what += f"{n_std:.0f} standard deviations: no scatter explains it."
+        to_do = "Record a log at once; check work, payload, sensor and servo tuning since then."
+        yield Notice("large-drift", "serious", mode, what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
         widened = track.widening[-1]

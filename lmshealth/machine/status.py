@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from datetime import date, datetime, timedelta
+from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -13,24 +15,52 @@ from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undec
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.notices import notices
-from lmshealth.machine.summary import Summary, prognosis_rows
+from lmshealth.machine.summary import Summary, days_between, prognosis_rows
 
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
 """State by NAMUR NE 107, as OPC 10000-100 names the values of ``DeviceHealthEnumeration``."""
+
+
+Severity = Literal["serious", "caution", "note"]
+
+CHANGES: dict[str, tuple[Severity, str]] = {
+    "alarm": ("serious", "a mode has an undeclared alarm"),
+    "verdict": ("serious", "the verdict is a loss, `step` or `outside-map`"),
+    "limit-reached": ("serious", "a limit is reached with probability 0.5 or more"),
+    "large-drift": ("serious", "a drift that no scatter explains, before a verdict is possible"),
+    "unreliable": ("caution", "a serious warning beside a verdict, or `unexplained-drifts`"),
+    "service-due": ("caution", "the service date has passed or is within 30 days"),
+    "inspection-overdue": ("caution", "`inspect_by` has passed"),
+    "silent": ("caution", "no log for long"),
+    "no-log-since-maintenance": ("note", "no log after the last work"),
+    "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
+    "recovered": ("note", "a verdict, a silence, an alarm or a late log has ended"),
+}
+"""Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
+kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
+
+# Conditions that begin once per baseline: their dates and probabilities move with each log. Others
+# begin anew after they have ended, which is a change too.
+_ONCE = ("limit-reached", "large-drift", "unreliable", "service-due")
+_ENDING = ("inspection-overdue", "no-log-since-maintenance")
+
+UNKNOWN = "unknown"
+"""Verdict on a machine that was sound at its last log, which is too old to rely on."""
 
 
 class Change(msgspec.Struct, frozen=True):
     """Change of a machine from one run to the next: a row of ``changes.csv``."""
 
     stage: str
-    what: str  # alarm, verdict, silent or recovered
+    what: str  # of `CHANGES`, up to a comma
     before: str
     now: str
     recorded_at: datetime  # of the last log
+    severity: Severity = "caution"
 
     def __str__(self) -> str:
         states = " → ".join(state for state in (self.before, self.now) if state)
-        return f"{self.stage}: {self.what} {states}"
+        return f"{self.stage}: {self.what} {states}".rstrip()
 
 
 class Status(msgspec.Struct, frozen=True, kw_only=True):
@@ -44,12 +74,17 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     baseline_at: datetime
     device_health: DeviceHealth = msgspec.field(name="DeviceHealth", default="NORMAL")
     conditions: dict[str, DeviceHealth] = {}  # `conditions`; the first one is `device_health`
-    silent: bool = False  # no log for longer than ``--silent-days``
-    verdict: str
+    silent: bool = False  # no log for longer than `silent_after_days`
+    silent_after_days: float | None = None  # ``--silent-days``, or by the own intervals
+    days_without_log: int = 0
+    unknown_since: date | None = None  # day of the last log, if the verdict is `UNKNOWN`
+    verdict: str  # on the day of the run
+    verdict_at_last_log: str = ""
     probability: float | None
     why: str
     alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
-    announced: tuple[str, ...] = ()  # modes whose alarm was a change since the baseline
+    # Modes whose alarm, and conditions whose begin was a change since the baseline.
+    announced: tuple[str, ...] = ()
     warnings: dict[str, str]  # code and severity of what was noticed
     infers_health: bool  # whether the description has a parameter
     probability_limit_reached: float | None  # now; None where no limit is determined
@@ -72,7 +107,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
 
     Evidence of damage comes before missing logs, which must not hide it.
     """
-    verdict, by, inspect = status.verdict, status.service_by, status.inspect_by
+    verdict, by, inspect = _at_last_log(status), status.service_by, status.inspect_by
     judged = verdict not in NO_HEALTH
     serious = {code for code, severity in status.warnings.items() if severity == "serious"}
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
@@ -82,27 +117,43 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("OFF_SPEC", "alarm", status.alarms and not judged),
         ("OFF_SPEC", "step", verdict == "step"),
         ("OFF_SPEC", OUTSIDE_MAP, verdict == OUTSIDE_MAP),
+        ("OFF_SPEC", "large-drift", "large-drift" in serious),
         ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
         ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
         ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
         ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
-        ("CHECK_FUNCTION", "silent", status.silent),
+        ("CHECK_FUNCTION", "silent", status.silent or today > _last_day(status)),
     ]
     return {code: state for state, code, applies in found if applies}
 
 
-def coming_states(status: Status) -> dict[date, dict[str, DeviceHealth]]:
-    """Return the conditions on the day of the last log, and on later days that change the state.
+def _at_last_log(status: Status) -> str:
+    """Return the verdict at the last log; statuses of earlier versions have no other."""
+    return status.verdict_at_last_log or status.verdict
+
+
+def _last_day(status: Status) -> date:
+    """Return the last day on which a machine without a further log is not silent."""
+    try:
+        return (status.recorded_at + timedelta(days=status.silent_after_days or np.inf)).date()
+    except OverflowError:
+        return date.max
+
+
+def coming_states(status: Status, today: date) -> dict[date, dict[str, DeviceHealth]]:
+    """Return the conditions on a day, and on later days that change the state.
 
     Without a further log; the first of each day's conditions is the state.
     """
-    days = [status.recorded_at.date()]
+    days = [today]
     if status.service_by:
         days.append(status.service_by - timedelta(days=constants.SERVICE_LEAD_DAYS))
     if status.inspect_by:
         days.append(status.inspect_by + timedelta(days=1))
+    if (last := _last_day(status)) < date.max:
+        days.append(last + timedelta(days=1))
     states: dict[date, dict[str, DeviceHealth]] = {}
     for day in sorted(one for one in days if one >= days[0]):
         found = conditions(status, day)
@@ -132,7 +183,9 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         description=assessment.stage.name,
         recorded_at=summary.recorded_at,
         baseline_at=summary.baseline_at,
+        silent_after_days=_silent_after(assessment.history.recorded_at),
         verdict=summary.verdict,
+        verdict_at_last_log=summary.verdict,
         probability=_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
@@ -148,15 +201,65 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
     return _judged(made, assessment.today or summary.recorded_at.date())
 
 
+def _silent_after(moments: Sequence[datetime]) -> float | None:
+    """Return the days without a log after which a machine is silent, by its own intervals.
+
+    None with logs of a single day. Several logs of one day are a single one here.
+    """
+    n = constants.SILENT_INTERVALS
+    days = sorted({one.date() for one in moments})[-n - 1 :]
+    return n * (days[-1] - days[0]).days / (len(days) - 1) if len(days) > 1 else None
+
+
 def _judged(status: Status, today: date) -> Status:
-    """Set the conditions of a status on a day, and its state by NE 107."""
-    found = conditions(status, today)
+    """Set on a day the conditions of a status, its state by NE 107 and its verdict."""
+    found, verdict = conditions(status, today), _at_last_log(status)
     state: DeviceHealth = next(iter(found.values()), "NORMAL")
-    return msgspec.structs.replace(status, conditions=found, device_health=state)
+    unknown = "silent" in found and verdict in ("healthy", "no-alarm")
+    return msgspec.structs.replace(
+        status,
+        conditions=found,
+        device_health=state,
+        days_without_log=days_between(status.recorded_at, today),
+        silent="silent" in found,
+        unknown_since=status.recorded_at.date() if unknown else None,
+        verdict=UNKNOWN if unknown else verdict,
+        verdict_at_last_log=verdict,
+        probability=None if unknown else status.probability,
+    )
 
 
 def _or_none(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None
+
+
+def judge_at(
+    before: Status | None, now: Status, moment: datetime, silent_days: float | None
+) -> Status:
+    """Judge a status at a moment, beside that of the run before; None if the machine is new.
+
+    A silence lasts until the next log, also where the clock is set back. Without ``silent_days`` it
+    begins by the intervals of the machine's own logs.
+    """
+    silent = before is not None and before.silent and before.recorded_at == now.recorded_at
+    after = silent_days or now.silent_after_days
+    silent = silent or bool(after and moment - now.recorded_at > timedelta(days=after))
+    # A status of an earlier schema is written again in this one.
+    now = msgspec.structs.replace(
+        now, schema=constants.JSON_SCHEMA, silent=silent, silent_after_days=after
+    )
+    return _judged(now, moment.date())
+
+
+def on_day(summary: Summary, status: Status, today: date) -> Summary:
+    """Return a summary as of a day, by the status on that day: state, urgency and next step."""
+    service, found = summary.service, summary
+    late = "late" if {"silent", "inspection-overdue"} & status.conditions.keys() else ""
+    is_past = service.kind == "by" and service.by is not None and service.by < today
+    if status.unknown_since:
+        urgency = min(summary.urgency, (1, 0.0, 0.0, summary.identity))
+        found = replace(summary, state="open", urgency=urgency, unknown=True)
+    return replace(found, today=today, step=summary.step.on("overdue" if is_past else late))
 
 
 def compare(
@@ -164,39 +267,53 @@ def compare(
 ) -> tuple[Status, list[Change]]:
     """Judge a status at a moment, and list its changes since the run before; None if it is new.
 
-    An alarm of a mode is a change once per baseline. The silence of a machine is one once, and
-    lasts until its next log, also where the clock is set back; without ``silent_days`` none begins.
+    An alarm of a mode, and a condition that moves with each log, is a change once per baseline.
     """
-    silent = before is not None and before.silent and before.recorded_at == now.recorded_at
-    if silent_days is not None:
-        silent = silent or moment - now.recorded_at > timedelta(days=silent_days)
+    now = judge_at(before, now, moment, silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
-    announced = tuple(dict.fromkeys((*known, *now.alarms)))
-    # A status of an earlier schema is written again in this one.
-    now = msgspec.structs.replace(
-        now, schema=constants.JSON_SCHEMA, silent=silent, announced=announced
-    )
-    now = _judged(now, moment.date())
-    changes = [("alarm", "", mode) for mode in announced if mode not in known]
-    changes += _transitions(before, now, moment)
-    return now, [Change(now.stage, *one, now.recorded_at) for one in changes]
+    once = [code for code in now.conditions if code in _ONCE]
+    now = msgspec.structs.replace(now, announced=tuple(dict.fromkeys((*known, *now.alarms, *once))))
+    changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
+    changes += [(code, "", _detail(code, now)) for code in once if code not in known]
+    changes += _transitions(before, now)
+    severity = partial(_severity, now=now)
+    return now, [Change(now.stage, *one, now.recorded_at, severity(one[0])) for one in changes]
 
 
-def _transitions(
-    before: Status | None, now: Status, moment: datetime
-) -> Iterator[tuple[str, str, str]]:
-    """Yield changes of verdict, silence and alarms; of a new machine only what is bad."""
-    was = before.verdict if before else ""
+def _severity(what: str, now: Status) -> Severity:
+    """Return the severity of a change; of a verdict by what it is now."""
+    calm = what == "verdict" and not _is_loss(_at_last_log(now))
+    return CHANGES["verdict, no loss" if calm else what][0]
+
+
+def _detail(code: str, now: Status) -> str:
+    """Return the date or the probability behind a condition; empty for those without."""
+    found = {"service-due": now.service_by, "inspection-overdue": now.inspect_by}
+    if (day := found.get(code)) is not None:
+        return f"by {day.isoformat()}"
+    reached = now.probability_limit_reached
+    return f"probability {reached:.2f}" if code == "limit-reached" and reached else ""
+
+
+def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str, str]]:
+    """Yield changes of verdict, silence and late logs; of a new machine only what is bad."""
+    was, verdict = _at_last_log(before) if before else "", _at_last_log(now)
     last = (before or now).recorded_at.date().isoformat()
-    if was != now.verdict and ((before and now.infers_health) or _is_loss(now.verdict)):
-        recovered = _is_loss(was) and now.verdict == "healthy"
-        yield "recovered" if recovered else "verdict", was, now.verdict
+    if was != verdict and ((before and now.infers_health) or _is_loss(verdict)):
+        recovered = _is_loss(was) and verdict == "healthy"
+        yield "recovered" if recovered else "verdict", was, verdict
     elif before and before.alarms and not now.alarms:
         yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
     if now.silent and not (before and before.silent):
-        yield "silent", f"last log of {last}", f"no log for {(moment - now.recorded_at).days} days"
+        yield "silent", f"last log of {last}", f"no log for {now.days_without_log} days"
     elif before and before.silent and not now.silent:
         yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
+    earlier = before.conditions if before else {}
+    for code in _ENDING:
+        if code in now.conditions and code not in earlier:
+            yield code, "", _detail(code, now)
+        elif code in earlier and code not in now.conditions and not (before and before.silent):
+            yield "recovered", code, f"log of {now.recorded_at.date().isoformat()}"
 
 
 def _is_loss(verdict: str) -> bool:

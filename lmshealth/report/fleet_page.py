@@ -4,7 +4,7 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from datetime import date, datetime, timedelta
+from datetime import date, timedelta
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,7 @@ from lmshealth.machine.summary import Summary
 from lmshealth.report import constants
 from lmshealth.report.rendering import read, render
 from lmshealth.report.text import number
-from lmshealth.report.wording import headline
+from lmshealth.report.wording import headline, service_on_day, verdict_text
 
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
@@ -60,28 +60,33 @@ def write_index(
     summaries: Iterable[Summary],
     refused: Sequence[Refusal],
     *,
-    generated: datetime | None = None,
+    today: date | None = None,
 ) -> Path:
     """Write ``index.html`` and ``how-to-read.html``; the order of the summaries is of no effect.
 
-    ``refused`` are logs that belong to no machine; ``generated`` is printed on the page.
+    ``refused`` are logs that belong to no machine; ``today`` is the day of the page, by default
+    that of the newest log.
     """
     ranked = by_urgency(summaries)
     script = read("index.js") if len(ranked) > constants.MANY_MACHINES else ""
     newest = max((one.recorded_at.date() for one in ranked), default=date.min)
+    today = today or newest
     by_reason = [
         (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])
         for reason, count in Counter(one.reason for one in refused).most_common()
     ]
     text = render(
         "index.html.j2",
-        generated,
         rows=ranked,
         headline=headline,
+        verdict_text=verdict_text,
+        due=service_on_day,
+        silent=sum(one.unknown for one in ranked),
+        today=today,
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
         states=Counter(one.state for one in ranked),
         kinds=Counter(one.service.kind for one in ranked),
-        months=_months(ranked, newest) if script else [],
+        months=_months(ranked, today) if script else [],
         lives=_lives(ranked) if script else [],
         newest=newest,
         refused=by_reason,
@@ -104,14 +109,14 @@ def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     return [(label, places[k]) for k, label in enumerate(labels)] if left else []
 
 
-def _months(summaries: Sequence[Summary], newest: date) -> list[Month]:
+def _months(summaries: Sequence[Summary], today: date) -> list[Month]:
     """Count the services due now and in each month of a year; empty without any."""
     due = [one.service.by for one in summaries if one.service.by is not None]
-    newest = min(newest, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
-    # Due now: everything due on or before the day of the newest log.
-    counts = Counter(day.replace(day=1) for day in due if day > newest)
-    months = [Month("now", "", newest + timedelta(days=1), sum(day <= newest for day in due))]
-    begin = newest.replace(day=1)
+    today = min(today, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
+    # Due now: everything due on or before this day.
+    counts = Counter(day.replace(day=1) for day in due if day > today)
+    months = [Month("now", "", today + timedelta(days=1), sum(day <= today for day in due))]
+    begin = today.replace(day=1)
     for k in range(constants.CALENDAR_MONTHS):
         year = f"{begin:%Y}" if k == 0 or begin.month == 1 else ""
         after = (begin + timedelta(days=31)).replace(day=1)

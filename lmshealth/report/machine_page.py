@@ -6,7 +6,7 @@ This module collects results and figures; wording and markup are in ``templates/
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from datetime import date, datetime
+from datetime import date
 from functools import partial
 from itertools import combinations
 from operator import attrgetter
@@ -16,15 +16,18 @@ import numpy as np
 
 from lmshealth._private.names import spell
 from lmshealth.io.log import Refusal
+from lmshealth.life.constants import LONE_NAMED
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS
 from lmshealth.machine.next_step import first_limit
 from lmshealth.machine.notices import chi_square_band, notices
 from lmshealth.machine.service import Service, day_after, probability_before
+from lmshealth.machine.status import Status, coming_states
 from lmshealth.machine.summary import Summary, limit_of
 from lmshealth.report import constants, figures, wording
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
@@ -39,6 +42,7 @@ from lmshealth.tracking.track import Effect, Track
 
 Item = TypeVar("Item")
 
+_MARK = "<!--day-->"  # no other comment is in a page: everything else is escaped
 _SIZES = {"waterfall": (4.5, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
@@ -47,10 +51,8 @@ def make_page(
     summary: Summary,
     *,
     before: Summary | None = None,
-    states: Mapping[date, Mapping[str, str]] | None = None,
-    generated: datetime | None = None,
 ) -> str:
-    """Make the page of one machine (HTML).
+    """Make the page of one machine (HTML), with marks that `date_page` replaces.
 
     Parameters
     ----------
@@ -58,10 +60,6 @@ def make_page(
         Results of the machine, and what `summarise` makes of them.
     before : Summary, optional
         Summary of the machine in its previous report.
-    states : mapping, optional
-        States by NAMUR NE 107 of its conditions, from each day on until the next.
-    generated : datetime, optional
-        Printed as the time at which the page was written.
     """
     service = summary.service
     highest = max((one.high for one in summary.health), default=1.0)
@@ -69,13 +67,12 @@ def make_page(
         "assessment": assessment,
         "notices": notices(assessment),
         "summary": summary,
-        "states": states or {},
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
         "postponed": list(_postponed(assessment.prognosis, service)),
         "first_limit": first_limit(assessment.prognosis),
         "before": before,
-        "headline": wording.headline(summary),
-        "to_do": wording.next_step(summary.step),
+        "mark": _MARK,
+        "outside": list(_outside_map(assessment)),
         "news": before and [*wording.changes(before, summary)],
         **_track_content(assessment),
         **_health_content(assessment),
@@ -92,7 +89,29 @@ def make_page(
     content["picture"] = {
         key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
     }
-    return render("stage.html.j2", generated, **content)
+    return render("stage.html.j2", **content)
+
+
+def date_page(page: str, summary: Summary, status: Status) -> str:
+    """Complete what `make_page` returns by what depends on the day.
+
+    A page is drawn once and completed every day. ``summary`` is that of `on_day`, ``status`` that
+    of the same day.
+    """
+    assert summary.today is not None  # of a summary of a day
+    parts = render(
+        "day.html.j2",
+        mark=_MARK,
+        summary=summary,
+        status=status,
+        states=coming_states(status, summary.today),
+        headline=wording.headline(summary),
+        verdict=wording.verdict_text(summary),
+        to_do=wording.next_step(summary.step),
+        due=wording.service_on_day(summary),
+    ).split(_MARK)
+    pieces = page.split(_MARK)[1:]  # the page begins with a mark
+    return "".join(part + piece for part, piece in zip(parts, pieces, strict=True))
 
 
 def latest_modes(track: Track, stage: Stage, mac: Mapping[str, float]) -> list[dict[str, Any]]:
@@ -120,6 +139,21 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
     low, high = chi_square_band(np.array(dof, dtype=float)).tolist()
     side = "above" if value > high else "below" if value < low else "inside"
     return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
+
+
+def _outside_map(assessment: Assessment) -> Iterator[dict[str, Any]]:
+    """Yield the modes that moved alone: change, MAC, and since which log half of it is there."""
+    health, track, mac = assessment.health, assessment.track, _mac(assessment)
+    is_verdict = assessment.judgement.verdict == OUTSIDE_MAP  # of the most probable one
+    for n, lone in enumerate(health.lone_modes if health and track else ()):
+        assert track is not None
+        if lone.probability < LONE_NAMED and not (is_verdict and n == 0):
+            continue
+        moved = track.drift[:, track.modes.index(lone.mode)] / lone.size >= 0.5
+        before = np.flatnonzero(~moved)
+        since = before[-1] + 1 if before.size else 0
+        when = track.recorded_at[since] if since < len(track.logs) else None
+        yield {"lone": lone, "since": when, "mac": mac.get(lone.mode)}
 
 
 def _postponed(

@@ -9,7 +9,6 @@ import warnings
 from base64 import b64encode
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, redirect_stdout
-from datetime import datetime
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -21,11 +20,11 @@ from lmshealth.errors import LmshealthError
 from lmshealth.report import constants, text
 
 
-def render(template: str, generated: datetime | None = None, /, **content: Any) -> str:
-    """Render a template with the values of its names, and a time to print unless it is None."""
+def render(template: str, /, **content: Any) -> str:
+    """Render a template with the values of its names."""
     version = metadata.version("lmshealth")
     page = _environment().get_template(template)
-    return str(page.render(content, generated=generated, version=version))
+    return str(page.render(content, version=version))
 
 
 def read(name: str) -> str:

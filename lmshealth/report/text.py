@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from datetime import datetime
+from datetime import date, datetime
 from string import Formatter
 from typing import TYPE_CHECKING, Any, get_args
 
@@ -46,6 +46,11 @@ def law(kind: str) -> str:
 def moment(when: datetime) -> str:
     """Format date, time and zone."""
     return when.strftime("%Y-%m-%d %H:%M %Z").strip()
+
+
+def age(last: date, today: date) -> str:
+    """Return for how long there has been no log on a day."""
+    return f"no log for {count((today - last).days, 'day')}"
 
 
 def day(when: datetime) -> str:

@@ -9,6 +9,7 @@ from lmshealth.machine.next_step import NextStep
 from lmshealth.machine.summary import Summary
 from lmshealth.report.text import (
     GAP,
+    age,
     count,
     day,
     in_brackets,
@@ -16,6 +17,7 @@ from lmshealth.report.text import (
     km,
     percent,
     probability,
+    service_text,
     travel_left,
 )
 
@@ -35,11 +37,31 @@ def verdict_text(summary: Summary) -> str:
 
 
 def headline(summary: Summary) -> str:
-    """Return the verdict in words, or the alarm when there is no verdict."""
+    """Return the verdict in words, or the alarm when there is no verdict.
+
+    A verdict whose last log is too old is that of then: the machine is unknown since.
+    """
+    if summary.unknown:
+        since = summary.recorded_at.date()
+        return f"Unknown since {since.isoformat()}: {age(since, summary.today or since)}"
+    if summary.verdict == "healthy" and summary.step.kind in ("service-now", "overdue"):
+        return "Healthy at the last log, but the service is due"
     if summary.alarmed:
         return f"Alarm: unexplained change of {' and '.join(map(spell, summary.alarmed))}"
     words = verdict_text(summary)
     return words[0].upper() + words[1:]
+
+
+def service_on_day(summary: Summary) -> str:
+    """Return when to service a machine, as of the day of its summary, in a few words."""
+    by = summary.service.by
+    if summary.service.kind == "by" and by and summary.today and by < summary.today:
+        return f"overdue since {by.isoformat()}"
+    if summary.service.kind == "later" and summary.unknown:
+        return "unknown without a log"
+    if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
+        return "open until the cause is found"
+    return service_text(summary.service)
 
 
 # Work that restores a parameter; of any other: work on it.
@@ -53,12 +75,17 @@ _STEPS = {
     "inspect": _INSPECT,
     "find-cause": "Find out what moved the mode: its sensor, cables, payload or attachments; then "
     "record a log.",
+    "check-drift": "Record a log at once: a mode has moved by more than logs scatter. If it stays, "
+    "look for work, payload, sensor or tuning as the cause.",
+    "log-now": "Record a log now: without one nothing is known of this machine.",
     "none": "",
     "record": "Record further logs; the reasons are below.",
     "service-now": "Do {work} now, before the machine travels on, and record logs for a new "
     "baseline.",
+    "overdue": "Do {work} now: its date, {by}, has passed. Record logs for a new baseline.",
     "confirm": "Record {often}, and order nothing yet: with so few logs the service before {by} "
     "rests on the prior of the laws.",
+    "schedule": "No work is needed yet. Plan {work} for {by} at the latest; until then {often}.",
     "plan": "Order and plan {work} before {by}; until then {often}.",
     "later": "No service is needed within {horizon}; record {often}.",
 }

@@ -493,12 +493,18 @@ def searches(frequencies: Sequence[float]) -> list[float]:
 
 
 def write_skeleton(
-    path: Path, source: str, stage: str | None, modes: Sequence[tuple[ModeSpec, str]]
+    path: Path,
+    source: str,
+    stage: str | None,
+    modes: Sequence[tuple[ModeSpec, str]],
+    *,
+    odometer: bool = True,
 ) -> None:
     """Write a description of modes, each with a comment, that `load_stage` reads as it is.
 
-    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. A file that
-    exists is replaced. `BadStage` if there is no mode, `BadTable` if it cannot be written.
+    ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. Without an
+    odometer in the logs the clock is the time. A file that exists is replaced. `BadStage` if there
+    is no mode, `BadTable` if it cannot be written.
     """
     if not modes:
         raise BadStage(f"{path} is not written: a description needs at least one mode; none found")
@@ -507,5 +513,5 @@ def write_skeleton(
     layout = (Path(__file__).parent / "descriptions" / "skeleton.toml.j2").read_text("utf-8")
     template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
     machines = glob.escape(stage) if stage else "*"
-    given = {"name": path.stem, "source": source, "stage": machines, "modes": modes}
-    write_text(path, template.render(given, quoted=quoted))
+    given = {"name": path.stem, "source": source, "stage": machines, "odometer": odometer}
+    write_text(path, template.render(given, modes=modes, quoted=quoted))

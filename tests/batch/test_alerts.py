@@ -54,6 +54,7 @@ class Nights:
         monkeypatch.setattr(running, "datetime", Clock)
         monkeypatch.setattr(ingest, "identify_log", self.identify)
         monkeypatch.setattr(outputs, "make_page", lambda *_, **__: "")
+        monkeypatch.setattr(outputs, "date_page", lambda *_: "")
 
     def identify(
         self, task: Any, stages: tuple[Stage, ...], how: dict[str, Any], limit: float
@@ -243,10 +244,12 @@ class Apprise:
     (command,) = Alerts(notify=True).channels().values()
     here = Path(alerting.__file__).parents[2]
     monkeypatch.setenv("PYTHONPATH", f"{here}{os.pathsep}{tmp_path}")
-    content = b'{"changes": [{"text": "A: alarm roll"}]}'
+    content = b'{"changes": [{"text": "A: alarm roll", "severity": "serious"}]}'
     monkeypatch.setenv("LMSHEALTH_NOTIFY", " mailto://me:secret@host \n mailto://you ")
     assert run_command(command, content) == ""
-    sent = "['mailto://me:secret@host', 'mailto://you'] lmshealth: 1 changes A: alarm roll"
+    sent = (
+        "['mailto://me:secret@host', 'mailto://you'] lmshealth: 1 changes A: alarm roll (serious)"
+    )
     assert (tmp_path / "sent").read_text() == sent
     for addresses in ("mailto://refuse:secret@host", "wrong:secret"):
         monkeypatch.setenv("LMSHEALTH_NOTIFY", addresses)

@@ -23,7 +23,9 @@ pytestmark = pytest.mark.slow
 pytest.importorskip("apprise", reason="the extra notify is not installed")
 
 SECRET = "s3cr3t-word"
-CONTENT = b'{"changes": [{"text": "A: alarm roll"}, {"text": "B: silent"}]}'
+CONTENT = json.dumps(
+    {"changes": [{"text": text, "severity": "serious"} for text in ("A: alarm roll", "B: silent")]}
+).encode()
 
 
 class Keeper(BaseHTTPRequestHandler):
@@ -71,7 +73,7 @@ def test_a_server_receives_a_message(port: int, monkeypatch: pytest.MonkeyPatch)
     ((path, headers, body),) = Keeper.received
     assert path.rstrip("/") == "/hook" and headers["Authorization"].startswith("Basic ")
     assert body["title"] == "lmshealth: 2 changes"
-    assert body["message"] == "A: alarm roll\nB: silent"
+    assert body["message"] == "A: alarm roll (serious)\nB: silent (serious)"
 
 
 @pytest.mark.parametrize("broken", ["json", "mail", "refuses", "unknown"])

@@ -8,6 +8,7 @@ import re
 import signal
 import socket
 import sqlite3
+import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -837,3 +838,11 @@ def test_every_query_of_the_dashboard_has_rows(url: str, tmp_path: Path) -> None
     found = [rows_of(url, query) for query in queries()]
     assert len(found) == 7 and all(found)
     assert [{"time", "metric", "median"} <= rows[0].keys() for rows in found].count(True) == 3
+
+
+def test_a_missing_driver_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A store in PostgreSQL without psycopg states the command that installs it."""
+    monkeypatch.setitem(sys.modules, "psycopg", None)
+    with pytest.raises(StoreError, match=r'pip install "lmshealth\[postgres\]"$') as caught:
+        Store("postgresql://me:secret@host/fleet")
+    assert "psycopg" in str(caught.value) and "secret" not in str(caught.value)

@@ -1063,6 +1063,27 @@ def test_init_proposes_what_modes_needs(tmp_path: Path) -> None:
     assert call("init", logs[0], "--out", str(tmp_path), "--overwrite").exit_code == 0
 
 
+def test_what_init_proposes_without_an_odometer_can_be_run(tmp_path: Path) -> None:
+    """Logs whose files state no travel take the time for it, and no log is refused for that."""
+    logs = [tmp_path / f"2026-07-{day:02d}.txt" for day in (1, 2)]
+    for day, path in enumerate(logs):
+        rows = [f"{k / 500:.3f};{v + day / 1e3:.6f}" for k, v in enumerate(_noise())]
+        path.write_text("\n".join(["time [s];acc [g]", *rows]) + "\n")
+    assert call("init", *map(str, logs), "--out", str(tmp_path)).exit_code == 0
+    sheet, stage = tmp_path / "manifest.csv", tmp_path / "my-stage.toml"
+    assert all(line.split(",")[3] == "" for line in sheet.read_text().splitlines()[1:])
+
+    def refused() -> list[str]:
+        out = tmp_path / "out"
+        call("run", tmp_path, "--columns", tmp_path / "map.toml", "--stage", stage, "--out", out)
+        with (out / "refused.csv").open() as stream:
+            return [row["detail"] for row in csv.DictReader(stream) if not row["mode"]]
+
+    assert not [detail for detail in refused() if "travel" in detail]
+    stage.write_text(stage.read_text().replace('clock = "days"', 'clock = "odometer"'))
+    assert len([detail for detail in refused() if "travel" in detail]) == len(logs)
+
+
 def test_init_names_no_log_out_of_the_folder(tmp_path: Path) -> None:
     """A manifest of logs that lie elsewhere is not written, with the reason."""
     rows = "\n".join(f"{v:.6f}" for v in _noise())

@@ -164,6 +164,8 @@ def test_require_identity(make):
     log = read_log(make(meta={"stage": None, "travel_km": None}))
     with pytest.raises(BadLog, match="stage, travel_km not given"):
         require_identity(log)
+    with pytest.raises(BadLog, match="stage not given"):
+        require_identity(log, odometer=False)
 
 
 def test_overrides(make):

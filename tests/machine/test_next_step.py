@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from datetime import date
+from itertools import product
 from typing import get_args
 
 import numpy as np
@@ -18,34 +19,51 @@ __all__ = ["make"]
 
 
 @pytest.mark.parametrize(
-    ("verdict", "service", "age", "expected"),
+    ("verdict", "service", "age", "day", "expected"),
     [
-        ("alarm", "by", "old", "inspect"),
-        ("outside", "now", "old", "find-cause"),
-        ("healthy", "unknown", "young", "none"),
-        ("open", "unknown", "young", "record"),
-        ("loss", "unknown", "old", "record"),
-        ("loss", "now", "old", "service-now"),
-        ("healthy", "now", "young", "service-now"),
-        ("healthy", "by", "young", "confirm"),
-        ("healthy", "by", "old", "plan"),
-        ("loss", "by", "young", "plan"),
-        ("healthy", "later", "old", "later"),
+        ("drift", "unknown", "young", "", "check-drift"),
+        ("drift", "unknown", "young", "late", "check-drift"),
+        ("healthy", "unknown", "old", "late", "log-now"),
+        ("open", "unknown", "young", "late", "log-now"),
+        ("healthy", "by", "old", "late", "log-now"),
+        ("healthy", "by", "young", "overdue", "log-now"),
+        ("healthy", "by", "old", "overdue", "overdue"),
+        ("loss", "by", "young", "late", "plan"),
+        ("loss", "by", "young", "overdue", "overdue"),
+        ("loss", "now", "old", "late", "service-now"),
+        ("alarm", "by", "old", "overdue", "inspect"),
+        ("healthy", "later", "old", "late", "log-now"),
+        ("alarm", "by", "old", "", "inspect"),
+        ("outside", "now", "old", "", "find-cause"),
+        ("healthy", "unknown", "young", "", "none"),
+        ("open", "unknown", "young", "", "record"),
+        ("loss", "unknown", "old", "", "record"),
+        ("loss", "now", "old", "", "service-now"),
+        ("healthy", "now", "young", "", "service-now"),
+        ("healthy", "by", "young", "", "confirm"),
+        ("healthy", "by", "old", "", "schedule"),
+        ("loss", "by", "young", "", "plan"),
+        ("healthy", "later", "old", "", "later"),
     ],
 )
 def test_the_step_follows_from_verdict_service_and_age(
-    verdict: str, service: str, age: str, expected: Step
+    verdict: str, service: str, age: str, day: str, expected: Step
 ) -> None:
     """The first case that applies decides: alarms before services, young machines before plans."""
-    assert step_of(verdict, service, age) == expected
+    assert step_of(verdict, service, age, day) == expected
+    assert NextStep("none", case=(verdict, service, age)).on(day).kind == expected
 
 
 def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
     """No combination is without a case, and no step without words."""
-    for verdict in ("alarm", "outside", "open", "healthy", "loss"):
-        for service in ("now", "by", "later", "unknown"):
-            for age in ("young", "old"):
-                assert step_of(verdict, service, age) in get_args(Step)
+    verdicts = ("alarm", "outside", "drift", "open", "healthy", "loss")
+    services, ages, days = (
+        ("now", "by", "later", "unknown"),
+        ("young", "old"),
+        ("", "late", "overdue"),
+    )
+    for case in product(verdicts, services, ages, days):
+        assert step_of(*case) in get_args(Step)
     assert {case[0] for case in CASES} == set(get_args(Step))
     for kind in get_args(Step):
         sentence = wording.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
@@ -62,7 +80,9 @@ def test_a_healthy_young_machine_orders_no_service(
     service = replace(assessment.service(), kind="by", by=date(2027, 3, 1))
     n_logs = len(healthy.history.logs) - healthy.history.baseline
     monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs - 1)
-    assert next_step(healthy, service).kind == "plan"
+    # Not "plan", whose sentence orders work beside the headline "Healthy".
+    assert next_step(healthy, service).kind == "schedule"
+    assert "Order" not in wording.next_step(next_step(healthy, service))
     monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs)
     found = next_step(healthy, service)
     assert found.kind == "confirm"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,10 +13,14 @@ from msgspec import structs
 from lmshealth._private.tables import TABLES
 from lmshealth.io.log import Refusal
 from lmshealth.life.posterior.fit import LoneMode
+from lmshealth.machine.assessment import assess
 from lmshealth.machine.notices import notices
+from lmshealth.machine.status import make_status
 from lmshealth.machine.summary import summarise
+from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables
 from tests.assessments import Assessment, Maker, make, nothing
+from tests.lives import FREQUENCY, MODES, make_reading, make_stage
 
 __all__ = ["make"]
 
@@ -111,3 +116,39 @@ def test_warnings_about_channels_are_noticed(
     found = {one.code: one for one in notices(replace(good, refused=(row, *good.refused)))}
     assert (found[reason].severity if reason in found else None) == severity
     assert reason not in found or found[reason].where == channel
+
+
+def few_logs(n: int, drift: float, seed: int, scale: float = 1.0) -> list[LogEstimates]:
+    """Return logs of errors of 5e-4 of ln f, the last one with pitch off by a drift."""
+    rng, logs = np.random.default_rng(seed), []
+    for day in range(n):
+        values = np.log(FREQUENCY) + scale * 5e-4 * rng.standard_normal(len(MODES))
+        values[1] += drift if day == n - 1 else 0.0
+        log = make_reading(f"{day}", float(day), 1e5 * day, dict(zip(MODES, values, strict=True)))
+        cov = np.diag([2.5e-7] * len(MODES) + [1e-3] * len(MODES))
+        logs.append(replace(log, modes=replace(log.modes, cov=cov)))
+    return logs
+
+
+@pytest.mark.parametrize("n", [2, 3, 4])
+def test_a_drift_that_no_scatter_explains_is_stated_at_once(tmp_path: Path, n: int) -> None:
+    """Before a verdict is possible, also of an estimate that the filter has left out as a jump."""
+    stage = make_stage(tmp_path, parameters=(), tail="")
+    found = assess(few_logs(n, 0.014, 1), stage)
+    assert found.judgement.verdict == "not-enough-data" and list(found.drifted) == ["pitch"]
+    (notice,) = (one for one in notices(found) if one.code == "large-drift")
+    assert (notice.severity, notice.where) == ("serious", "pitch")
+    assert "Pitch has moved by +1." in notice.what and f"in {n} logs, 1" in notice.what
+    summary = summarise(found, found.service())
+    assert summary.step.kind == "check-drift" and summary.urgency[0] == 0
+    status = make_status(found, summary)
+    assert (status.device_health, [*status.conditions]) == ("OFF_SPEC", ["large-drift"])
+    # With enough logs the filter has learned how they scatter: alarms decide.
+    assert assess(few_logs(5, 0.014, 1), stage).drifted == {}
+
+
+def test_scatter_is_no_large_drift(tmp_path: Path) -> None:
+    """Errors twice as large as reported give none in 60 machines of two to four logs."""
+    stage = make_stage(tmp_path, parameters=(), tail="")
+    logs = [few_logs(2 + seed % 3, 0.0, seed, scale=2.0) for seed in range(60)]
+    assert not [found for found in (assess(one, stage) for one in logs) if found.drifted]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from datetime import UTC, date, datetime, timedelta
+from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -14,6 +15,7 @@ from lmshealth._private.serialize import pack, unpack
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import (
+    CHANGES,
     Status,
     coming_states,
     compare,
@@ -103,13 +105,17 @@ def test_every_result_has_a_namur_state(given: dict[str, Any], state: str, codes
 def test_states_to_come_are_those_of_their_days() -> None:
     """A later day is listed where it changes the state, and no day before the last log."""
     sound = status(inspect_by=date(2027, 7, 1))
-    coming = coming_states(sound)
+    coming = coming_states(sound, LAST.date())
     lead = date(2027, 6, 1) - timedelta(days=30)
     assert [*coming] == [LAST.date(), lead]
     assert coming[LAST.date()] == {} and coming[lead] == {"service-due": "MAINTENANCE_REQUIRED"}
     assert all(found == conditions(sound, day) for day, found in coming.items())
     worn = status(verdict="preload", service_by=date(2026, 1, 1))
-    assert [*coming_states(worn)] == [LAST.date()]
+    assert [*coming_states(worn, LAST.date())] == [LAST.date()]
+    later = LAST.date() + timedelta(days=9)
+    quiet = coming_states(status(silent_after_days=5.0), LAST.date())
+    assert quiet[LAST.date() + timedelta(days=6)] == {"silent": "CHECK_FUNCTION"}
+    assert [*coming_states(status(silent_after_days=5.0), later)] == [later, lead]
 
 
 @pytest.mark.parametrize(
@@ -153,6 +159,92 @@ def test_changes_since_the_last_run(
     _, found = compare(was, status(**now), LAST + timedelta(days=5), 7.0)
     assert [(one.what, one.before, one.now) for one in found] == expected
     assert all((one.stage, one.recorded_at) == ("M7-Y", LAST) for one in found)
+
+
+@pytest.mark.parametrize(
+    ("code", "now", "text"),
+    [
+        ("limit-reached", {"probability_limit_reached": 0.7}, "limit-reached probability 0.70"),
+        ("service-due", {"service_by": date(2026, 12, 1)}, "service-due by 2026-12-01"),
+        (
+            "inspection-overdue",
+            {"inspect_by": date(2026, 11, 24)},
+            "inspection-overdue by 2026-11-24",
+        ),
+        ("large-drift", OPEN | {"warnings": {"large-drift": "serious"}}, "large-drift"),
+        ("unreliable", {"warnings": {"laws-do-not-fit": "serious"}}, "unreliable"),
+        ("no-log-since-maintenance", {"warnings": {"no-log-since": "caution"}}, "no-log-since-m"),
+        ("silent", {"silent_after_days": 3.0}, "silent last log of 2026-11-20 → no log for 5 days"),
+        ("verdict", {"verdict": "preload"}, "verdict healthy → preload"),
+    ],
+)
+def test_each_change_of_state_is_announced_once(code: str, now: dict[str, Any], text: str) -> None:
+    """It is a change with its severity, of a known machine and of a new one, and never again."""
+    moment = LAST + timedelta(days=5)
+    bad = status(**now)
+    first, _ = compare(None, status(**(OPEN if code == "large-drift" else {})), moment, None)
+    for before in (first, None):
+        found, changes = compare(before, bad, moment, None)
+        if before is None and code == "verdict":
+            text = "verdict preload"
+        own = [one for one in changes if one.what == code]
+        assert [(one.severity, str(one).startswith(f"M7-Y: {text}")) for one in own] == [
+            (CHANGES[code][0], True)
+        ]
+        assert changes == own
+        again, changes = compare(found, bad, moment, None)
+        assert changes == [] and again == found
+
+
+def test_what_moves_with_each_log_is_announced_once_per_baseline() -> None:
+    """A service date that comes and goes is one change; a log that is late again is another one."""
+    moment = LAST + timedelta(days=5)
+    due, sound = status(service_by=TODAY), status()
+    found, changes = compare(sound, due, moment, None)
+    assert [one.what for one in changes] == ["service-due"]
+    found, changes = compare(found, sound, moment, None)
+    assert changes == []
+    assert compare(found, due, moment, None)[1] == []
+    served = msgspec.structs.replace(due, baseline_at=LAST)
+    assert [one.what for one in compare(found, served, moment, None)[1]] == ["service-due"]
+    late = status(inspect_by=TODAY - timedelta(days=1))
+    found = compare(sound, late, moment, None)[0]
+    found, changes = compare(found, sound, moment, None)
+    assert [str(one) for one in changes] == [
+        "M7-Y: recovered inspection-overdue → log of 2026-11-20"
+    ]
+    assert [one.what for one in compare(found, late, moment, None)[1]] == ["inspection-overdue"]
+
+
+def test_the_table_of_changes_is_that_of_the_readme(root: Path) -> None:
+    """Kinds, severities and meanings stand in one place, and the README has them."""
+    text = (root / "lmshealth/report/README.md").read_text(encoding="utf-8")
+    rows = [f"| {what} | {severity} | {text} |" for what, (severity, text) in CHANGES.items()]
+    assert "\n".join(rows) in text
+
+
+def test_severities_of_verdicts_are_those_of_what_they_are_now() -> None:
+    """A loss is serious, what is no loss any more a note; every kind has a severity."""
+    moment = LAST + timedelta(days=5)
+    lost, sound, none = status(verdict="preload"), status(), status(**OPEN)
+    pairs = ((sound, lost), (lost, none), (lost, sound), (sound, none))
+    severities = [compare(*pair, moment, None)[1][0].severity for pair in pairs]
+    assert severities == ["serious", "note", "note", "note"]
+
+
+def test_a_machine_is_silent_by_the_intervals_of_its_own_logs(make: Maker) -> None:
+    """Five intervals between days with a log, the last ones; a single day gives no interval."""
+    assessment = make()
+    moments = [LAST + timedelta(days=k) for k in (0, 0.1, 0.2, 30, 31, 33, 34, 35, 38)]
+
+    def limit(recorded_at: list[datetime]) -> float | None:
+        history = replace(assessment.history, recorded_at=tuple(recorded_at))
+        found = replace(assessment, history=history)
+        return make_status(found, summarise(found, found.service())).silent_after_days
+
+    assert limit(moments) == pytest.approx(8.0)
+    assert limit(moments[:4]) == pytest.approx(150.0)
+    assert limit(moments[:3]) is None
 
 
 def test_a_status_of_an_earlier_schema_is_read_and_written_in_this_one() -> None:

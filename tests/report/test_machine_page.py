@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import date, timedelta
 from itertools import pairwise
 from pathlib import Path
 
@@ -17,18 +17,19 @@ from lmshealth import examples
 from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior
+from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.machine.service import Service, probability_before
-from lmshealth.machine.status import coming_states, make_status
+from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import summarise as summarise_machine
 from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.report import figures as plots
 from lmshealth.report.fleet_page import write_index
-from lmshealth.report.machine_page import make_page
+from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.report.text import GAP, plain
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
@@ -90,7 +91,11 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
         day = (by + timedelta(7 * int(weeks[0]))).isoformat()
         shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]
         assert shown == pytest.approx(100 * float(risk.at_most[-1]), abs=1.5)
-    assert first.index("Loss of") < first.index("Health now") < first.index("Remaining life")
+    assert (
+        first.index("Loss of")
+        < first.index("Health at the last log")
+        < first.index("Remaining life")
+    )
 
 
 @pytest.mark.slow
@@ -105,7 +110,7 @@ def test_the_last_log_stands_beside_the_baseline(make: Maker, tmp_path: Path) ->
     assert re.search(rf"roll .* {mac['roll']:.3f} pitch", row) and "yaw" in row
     for part in ("first log of the baseline (log-1.h5)", "Shapes of the modes", "mode at the base"):
         assert part in text
-    assert "NAMUR NE 107 at the last log: maintenance required (M) (loss" in text
+    assert re.search(r"NAMUR NE 107 on [\d‑]+: maintenance required \(M\) \(loss", text)
     alone = words(one(tmp_path, replace(made, at_baseline=latest)))
     assert "Shapes of the modes" in alone and "MAC" not in alone
 
@@ -137,6 +142,33 @@ def test_numbers_are_those_of_the_results(make: Maker, tmp_path: Path) -> None:
     km = np.median(assessment.prognosis.remaining[:, -1]) / 1000
     shown = float(re.search(r"Median ([\d ]+) km", text)[1].replace(" ", ""))  # type: ignore[index]
     assert shown == pytest.approx(km, rel=0.01)
+
+
+@pytest.mark.usefixtures("blank")
+def test_a_mode_outside_the_map_is_helped_with(make: Maker, tmp_path: Path) -> None:
+    """Which mode, since which log half of its change is there, and what to check first."""
+    made = make()
+    track, health = made.track, made.health
+    assert track is not None and health is not None
+    drift = track.drift.copy()
+    drift[:, 1] = np.where(np.arange(len(track.logs)) < 25, -0.004, -0.021)
+    moved = replace(
+        made,
+        track=replace(track, drift=drift),
+        health=replace(health, lone_modes=(LoneMode("pitch", -0.02, 0.001, 0.4),)),
+        judgement=replace(made.judgement, verdict="outside-map"),
+    )
+    text = words(one(tmp_path, moved))
+    help_text = text[
+        text.index("cause outside the map Pitch") : text.index("Since the last report")
+    ]
+    assert "has moved by −1.98" in help_text
+    assert f"since the log of {track.recorded_at[25].date()}" in help_text
+    assert help_text.index("What was done") < help_text.index("Sensor and cables")
+    assert "What to check" in text and 'href="#outside"' in one(tmp_path, moved).source
+    # A mode that is neither the verdict nor probable needs no help.
+    lost = replace(moved, judgement=made.judgement)
+    assert "cause outside the map Pitch" not in words(one(tmp_path, lost))
 
 
 @pytest.mark.usefixtures("blank")
@@ -316,15 +348,14 @@ def test_files_never_collide(make: Maker, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_same_input_same_bytes(make: Maker, tmp_path: Path) -> None:
-    """Pages are reproducible to the byte in any order, and print a time only if given."""
+    """Pages are reproducible to the byte in any order, and have the day that they are given."""
     stages = [make(), nothing(make("M8-Y"))]
     first = write_report(tmp_path / "a", stages, ())
     second = write_report(tmp_path / "b", stages[::-1], ())
     assert [p.name for p in first] == [p.name for p in second]
     assert [p.read_bytes() for p in first] == [p.read_bytes() for p in second]
-    when = datetime(2027, 1, 2, 3, 4, tzinfo=UTC)
-    index = write_report(tmp_path / "c", stages[1:], (), generated=when)[-1]
-    assert "written 2027-01-02 03:04 UTC" in index.read_text(encoding="utf-8")
+    for page in write_report(tmp_path / "c", stages[1:], (), today=date(2027, 1, 2)):
+        assert "Written on 2027-01-02, last log 2026-10-12" in page.read_text(encoding="utf-8")
 
 
 @pytest.mark.usefixtures("blank")
@@ -337,8 +368,9 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
         for stage, path in zip(stages, pages, strict=True)
     ]
     for stage, row, path in zip(stages, rows, pages, strict=True):
-        states = coming_states(make_status(stage, row))
-        assert make_page(stage, row, states=states) == path.read_text(encoding="utf-8")
+        status, today = make_status(stage, row), row.recorded_at.date()
+        page = date_page(make_page(stage, row), on_day(row, status, today), status)
+        assert page == path.read_text(encoding="utf-8")
     again = write_index(tmp_path, rows[::-1], ())
     assert again.read_bytes() == index.read_bytes()
 

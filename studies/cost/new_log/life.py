@@ -60,7 +60,7 @@ def assess_and_report(
     with processes(workers) as pool:
         resources = Resources(store, pool, progress)
         assert not assess_all(machines, resources)
-        result, *_ = running._report(machines, (), resources, out)
+        result, *_ = running._report(machines, (), resources, out, running._judging(store))
     assert not result.failed
 
 
