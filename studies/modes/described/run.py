@@ -37,16 +37,18 @@ REVISION = "544b6b30"
 QUICK = {"4 channels": 2, "mains in the band of a mode": 2}
 # Most errors over the bound; ranges of errors over what is published; most processor time over that
 # of the code before.
-OVER_BOUND = {
-    "8 channels, unequal, sloped, coherent floors": 1.3,
-    "8 channels, 6 modes, two harmonics": 1.25,
-    "16 channels, 6 modes, two harmonics": 1.25,
-}
+_FLOORS = "8 channels, unequal, sloped, coherent floors"
+OVER_BOUND = {_FLOORS: 1.3} | {f"{n} channels, 6 modes, two harmonics": 1.25 for n in (8, 16)}
 MOST_OVER_BOUND, SCORES, NARROWER = 1.15, (0.85, 1.15), 1.5
 NOT_MET = {
     "none missing or wrong: pair 1 % apart": "the description is off by 0.4 % for each mode, with "
     "which the order of two that are 1 % apart is not always that of the description; where the "
     "data do not separate them both are refused",
+    f"none missing or wrong: {_FLOORS}": "one mode of 48 is refused",
+    f"bounded time: {_FLOORS}": "one record of 16, that of the mode that is refused",
+    "near the bound: 8 channels, 6 modes, two harmonics": "probably modes in the band of the "
+    "harmonic that wanders, which the bound does not have, and flanks that are known from the "
+    "search only",
 }
 
 
@@ -139,9 +141,7 @@ def verdicts(result: Row) -> dict[str, bool]:
         checks[f"as published: {kind}"] = (
             z - 2 * z_error <= SCORES[1] and z + 2 * z_error >= SCORES[0]
         )
-        checks[f"no record takes five times the median: {kind}"] = row["cpu_s"][1] < (
-            5 * row["cpu_s"][0]
-        )
+        checks[f"bounded time: {kind}"] = row["cpu_s"][1] < 5 * row["cpu_s"][0]
         checks[f"none missing or wrong: {kind}"] = row["named"] == row["modes"] and not row["wrong"]
     if result["before"]:
         was = result["before"].values()
