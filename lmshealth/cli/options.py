@@ -188,7 +188,7 @@ MOST_MEMORY = click.option(
 )
 SECONDS_PER_LOG = click.option(
     "--seconds-per-log",
-    type=Finite(0, min_open=True),
+    type=Finite(0, 1e6, min_open=True),
     default=LOG_SECONDS,
     show_default=True,
     metavar="S",
