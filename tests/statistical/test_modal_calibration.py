@@ -17,6 +17,7 @@ from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
 from lmshealth.signal import segments, spectra
 from lmshealth.signal.spectra import CrossSpectrum
+from tests.bands import with_mean
 from tests.claims import Claims
 from tests.signals import (
     Mode,
@@ -100,7 +101,7 @@ def test_intervals_from_means_over_parts_cover(
 
     def once(parts: Iterator[CrossSpectrum]) -> CrossSpectrum:
         whole = mean(parts)
-        return replace(whole, transforms=np.sqrt(whole.powers())[None] + 0j)
+        return replace(whole, transforms=with_mean(whole.matrix))
 
     monkeypatch.setattr(spectra, "_mean", once)
     wide = _deviations(_long_records(rng, claims.part.control))
