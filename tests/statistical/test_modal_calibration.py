@@ -104,7 +104,7 @@ def test_intervals_from_means_over_parts_cover(
         return replace(whole, transforms=with_mean(whole.matrix))
 
     monkeypatch.setattr(spectra, "_mean", once)
-    wide = _deviations(_long_records(rng, claims.part.control))
+    wide = _deviations(_long_records(rng, 2 * claims.part.control))
     for name, own in zip(claims.part.claims, wide.T, strict=True):
         claims.control(name, covered(own))
 
