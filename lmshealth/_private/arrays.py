@@ -1,4 +1,4 @@
-"""Types of arrays, and checks of the arrays and dates of frozen results."""
+"""Types of arrays, checks of those of frozen results, and what several folders compute alike."""
 
 from collections.abc import Callable
 from datetime import datetime
@@ -77,3 +77,26 @@ def diagonal(matrices: FloatArray) -> FloatArray:
     """Return the diagonals of ``(..., n, n)`` matrices as a writeable view."""
     view: FloatArray = np.einsum("...ii->...i", matrices)
     return view
+
+
+def pivots(matrix: FloatArray, most: int, *, least: float = -np.inf) -> list[int]:
+    """Return the pivots of a Cholesky decomposition of a covariance, ``(n, n)``, largest first.
+
+    At most so many; those whose variance, given the pivots before, is below ``least`` are none.
+    """
+    order: list[int] = []
+    while len(order) < min(most, len(matrix)):
+        left = np.diagonal(matrix).copy()
+        left[order] = -np.inf
+        # The first of equals, whatever their rounding.
+        best = int(np.argmax(left >= left.max() - 1e-9))
+        if left[best] < least:
+            break
+        order.append(best)
+        matrix = matrix - np.outer(matrix[:, best], matrix[best]) / max(left[best], 1e-300)
+    return order
+
+
+def finite_or_none(value: float) -> float | None:
+    """Return a number, or None where it is not finite."""
+    return float(value) if np.isfinite(value) else None

@@ -5,7 +5,7 @@ A column map translates the names of one export, a layout states how a program w
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from datetime import datetime
 from functools import cached_property
@@ -357,14 +357,7 @@ def column_map(given: ColumnsGiven | None) -> ColumnMap:
         return given
     if not isinstance(given, Mapping):
         return load_columns(given)
-    try:
-        columns = ColumnMap(**asdict(convert(given, _MapFile)))
-        _check(columns)
-    except (ValidationError, ValueError) as error:
-        raise BadTable(f"column map: {error}") from error
-    except Unusable as error:
-        raise BadTable(f"column map: {error.detail}") from error
-    return columns
+    return _checked(lambda: convert(given, _MapFile), "column map")
 
 
 def load_columns(path: str | Path) -> ColumnMap:
@@ -373,13 +366,18 @@ def load_columns(path: str | Path) -> ColumnMap:
     `BadTable` if the file cannot be read, has unknown keys, or names columns, units or metadata
     that are not in the log contract.
     """
+    return _checked(lambda: decode(read_table(Path(path)), _MapFile), f"column map {path}")
+
+
+def _checked(read: Callable[[], _MapFile], name: str) -> ColumnMap:
+    """Return a column map that agrees with the log contract; `BadTable` for another."""
     try:
-        columns = ColumnMap(**asdict(decode(read_table(Path(path)), _MapFile)))
+        columns = ColumnMap(**asdict(read()))
         _check(columns)
-    except (OSError, ValueError) as error:
-        raise BadTable(f"column map {path}: {error}") from error
+    except (OSError, ValidationError, ValueError) as error:
+        raise BadTable(f"{name}: {error}") from error
     except Unusable as error:
-        raise BadTable(f"column map {path}: {error.detail}") from error
+        raise BadTable(f"{name}: {error.detail}") from error
     return columns
 
 

@@ -11,6 +11,7 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 
+from lmshealth._private.arrays import finite_or_none
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
@@ -173,7 +174,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
     health = [
         {
             **{"parameter": one.name, "q05": one.low, "median": one.median, "q95": one.high},
-            **{"limit": one.limit, "probability_below_limit": _or_none(one.below_limit)},
+            **{"limit": one.limit, "probability_below_limit": finite_or_none(one.below_limit)},
         }
         for one in shown
     ]
@@ -186,7 +187,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         silent_after_days=_silent_after(assessment.history.recorded_at),
         verdict=summary.verdict,
         verdict_at_last_log=summary.verdict,
-        probability=_or_none(summary.probability),
+        probability=finite_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
         warnings={one.code: one.severity for one in reversed(notices(assessment))},
@@ -227,10 +228,6 @@ def _judged(status: Status, today: date) -> Status:
         verdict_at_last_log=verdict,
         probability=None if unknown else status.probability,
     )
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
 
 
 def judge_at(

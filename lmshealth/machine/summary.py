@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.names import spell
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.life.fleet_prior import Calibration
@@ -242,8 +242,12 @@ def prognosis_rows(
     fleet = life.calibration
     of_any = (
         *(service.kind, service.by, service.risk, service.inspect_by),
-        *(_or_none(service.inspect_every / _KM), service.earliest_end),
-        *((_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives) if fleet else [None] * 3),
+        *(finite_or_none(service.inspect_every / _KM), service.earliest_end),
+        *(
+            (finite_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives)
+            if fleet
+            else [None] * 3
+        ),
     )
     rows = []
     for j, one in enumerate(life.limits):
@@ -263,7 +267,3 @@ def prognosis_rows(
             row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None

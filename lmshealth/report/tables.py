@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal
 from lmshealth.io.metadata import COVARIATES
@@ -133,18 +134,16 @@ def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:
         return [], []
     amplitude, phase = np.abs(shapes.shapes), np.angle(shapes.shapes, deg=True)
     for i, complexity in enumerate(shapes.complexity):
-        row = TABLES["shapes"].row(log, shapes.names[i], _or_none(complexity))
+        row = TABLES["shapes"].row(log, shapes.names[i], finite_or_none(complexity))
         for part, values in (("amplitude", amplitude[i]), ("phase_deg", phase[i])):
             pairs = zip(shapes.channels, values, strict=True)
-            row |= {f"{part}_{channel}": _or_none(value) for channel, value in pairs}
+            row |= {f"{part}_{channel}": finite_or_none(value) for channel, value in pairs}
         rows.append(row)
     names, mac = shapes.names, TABLES["mac"]
     pairs_ = combinations(range(len(names)), 2)
-    return rows, [mac.row(log, names[i], names[j], _or_none(shapes.mac[i, j])) for i, j in pairs_]
-
-
-def _or_none(value: float) -> float | None:
-    return float(value) if np.isfinite(value) else None
+    return rows, [
+        mac.row(log, names[i], names[j], finite_or_none(shapes.mac[i, j])) for i, j in pairs_
+    ]
 
 
 def _modes_cov_rows(reading: LogEstimates) -> list[Row]:

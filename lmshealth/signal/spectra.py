@@ -19,7 +19,8 @@ from lmshealth.signal.tone_removal import remove_sinusoids
 
 # Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
-# Longer segments lose a few samples at their end for a fast transform.
+# Samples that fit into the processor's cache. Longer segments lose a few at their end for a fast
+# transform.
 _LONG = 1 << 14
 # Only segments of at least this many samples are averaged: the parts of a long segment.
 _LEAST_PART = MINUTE // 2
@@ -284,12 +285,25 @@ def _mean(spectra: Iterator[CrossSpectrum]) -> CrossSpectrum:
 
 
 def transform_detrended(x: FloatArray, n_ordinates: int) -> ComplexArray:
-    """Transform samples without mean and linear trend: the first ordinates, but the zeroth."""
-    time = np.arange(x.size) - (x.size - 1) / 2
+    """Transform samples without their mean and linear trend: the first ordinates, but the zeroth.
+
+    Of a long segment the transforms of every m-th sample, which fit into the processor's cache, are
+    combined by Horner's rule.
+    """
+    n, centre = x.size, (x.size - 1) / 2
+    turn = np.exp(-2j * np.pi / n * np.arange(1, n_ordinates + 1))
+    most = max(1, n // max(_LONG, 2 * n_ordinates))
+    m = max(m for m in range(1, most + 1) if n % m == 0)
     x = x - x[0]  # a channel without a signal has a transform of exactly zero
-    x -= x.mean()
-    x -= time * (time @ x / (time @ time))
-    return np.array(fft.rfft(x)[1 : n_ordinates + 1])
+    parts = fft.rfft(x.reshape(-1, m), axis=0)[1 : n_ordinates + 1]
+    transform: ComplexArray = parts[:, -1]
+    for k in range(m - 2, -1, -1):
+        transform = transform * turn + parts[:, k]
+    blocks = ((first, x[first : first + _LONG]) for first in range(0, n, _LONG))
+    moment = sum(float((np.arange(own.size) + (first - centre)) @ own) for first, own in blocks)
+    # Σ k exp(-iθk) = n / (exp(-iθ) - 1)
+    transform = transform - moment / ((n**2 - 1) / 12) / (turn - 1)
+    return transform
 
 
 def as_acceleration(
@@ -303,7 +317,12 @@ def as_acceleration(
     if channel.kind != "displacement":
         return x, 0
     lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
-    return (x[2 * lag :] - 2 * x[lag:-lag] + x[: -2 * lag]) * sample_rate**2, lag
+    # In place: each intermediate array would be as large as the segment.
+    difference: FloatArray = x[2 * lag :] + x[: -2 * lag]
+    difference -= x[lag:-lag]
+    difference -= x[lag:-lag]
+    difference *= sample_rate**2
+    return difference, lag
 
 
 def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:

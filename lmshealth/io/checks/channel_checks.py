@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray, IntArray
+from lmshealth._private.arrays import FloatArray, IntArray, pivots
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
 from lmshealth.io.refusal import Unusable
@@ -104,18 +104,7 @@ def independent(columns: Sequence[Samples], ranges: _Ranges, most: int) -> list[
             part -= part.mean(axis=1, keepdims=True)
             gram += part @ part.T
     scale = np.sqrt(np.diagonal(gram).clip(np.finfo(float).tiny))
-    rest = gram / scale[:, None] / scale
-    order: list[int] = []
-    while len(order) < min(most, len(columns)):
-        left = np.diagonal(rest).copy()
-        left[order] = -np.inf
-        # The first of equals, whatever their rounding.
-        best = int(np.argmax(left >= left.max() - 1e-9))
-        if left[best] < constants.DEPENDENT:
-            break
-        order.append(best)
-        rest = rest - np.outer(rest[:, best], rest[best]) / left[best]
-    return order
+    return pivots(gram / scale[:, None] / scale, most, least=constants.DEPENDENT)
 
 
 def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[int]]:

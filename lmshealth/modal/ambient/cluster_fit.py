@@ -34,8 +34,7 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Multiplicative updates to convergence; their exponent over that for which monotonicity is proved.
 _UPDATES, _STRIDE = 25, 1.8
-# So many channels are fitted as they are. Of more, what is foreign is fitted where it is above this
-# share of the noise; least singular value of shapes that are independent.
+# So many channels are fitted as they are; of more, directions from this singular value on.
 _FEW, _INDEPENDENT = 4, 0.1
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
 _COLLAPSED = 0.1

@@ -19,7 +19,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.special import comb
 
-from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, pivots
 from lmshealth.modal import constants
 from lmshealth.modal.ambient.hints import candidates_at
 from lmshealth.modal.ambient.joint_model import (
@@ -163,15 +163,7 @@ def _informative(spectra: LogSpectra, low: float, high: float) -> list[int]:
     longest = spectra.longest.band(low, high)
     free = np.flatnonzero(longest.free)
     scale = np.sqrt(np.median(longest.powers()[free], axis=0).clip(1e-300))
-    rest = longest.sums([free])[0].real / np.outer(scale, scale)
-    chosen: list[int] = []
-    while len(chosen) < _FIRST:
-        left = np.diagonal(rest).copy()
-        left[chosen] = -np.inf
-        best = int(left.argmax())
-        chosen.append(best)
-        rest = rest - np.outer(rest[:, best], rest[best]) / max(left[best], 1e-300)
-    return sorted(chosen)
+    return sorted(pivots(longest.sums([free])[0].real / np.outer(scale, scale), _FIRST))
 
 
 def _of_all_channels(
@@ -202,7 +194,7 @@ def _of_all_channels(
     harmonics = tuple(one.along(v) for one, v in zip(harmonics, columns, strict=True))
     for one in harmonics:
         spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
-    whole = _bin(spectra, candidates, *band)
+    whole = _bin(spectra, candidates, *band) if harmonics else plain
     model = model.on(whole.of_channels(first))
     for added in batches:
         part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
