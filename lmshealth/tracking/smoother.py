@@ -6,9 +6,9 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.stage.description import Stage
+from lmshealth.tracking.filters.published_filter import smooth_states
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.published_filter import smooth_states
-from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import Track
 
 

@@ -20,11 +20,10 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.change_detection import Event
-from lmshealth.tracking.history import History, Step
-from lmshealth.tracking.published_filter import Nuisances
-from lmshealth.tracking.state_space import StateSpace
-from lmshealth.tracking.track_state import (
+from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.published_filter import Nuisances
+from lmshealth.tracking.filters.state_space import StateSpace
+from lmshealth.tracking.filters.track_state import (
     TrackState,
     degrees_of_freedom,
     initial_state,
@@ -33,6 +32,7 @@ from lmshealth.tracking.track_state import (
     unrolled,
     widening,
 )
+from lmshealth.tracking.history import History, Step
 
 # Variance of a drift below which it is rounding.
 _ROUNDING = 1e-15

@@ -22,7 +22,7 @@ from lmshealth import identify, infer_drifts, load_stage, prognose, run
 from lmshealth.batch.ingest import Settings
 from lmshealth.life.posterior import likelihood
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.track import track
 from studies.cost.archive import make_archive
 from studies.cost.workers import SPEEDUP, bare, identified

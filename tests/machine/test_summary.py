@@ -14,7 +14,7 @@ from lmshealth.machine.summary import Summary, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
 from lmshealth.report.wording import headline as headline_of
 from lmshealth.report.wording import next_step
-from lmshealth.tracking.change_detection import Event
+from lmshealth.tracking.filters.change_detection import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
 
 __all__ = ["make"]

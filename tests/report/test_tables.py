@@ -32,7 +32,7 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.change_detection import Event
+from lmshealth.tracking.filters.change_detection import Event
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Effect, Track

@@ -9,9 +9,9 @@ import pytest
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.state_space import StateSpace
 from lmshealth.tracking.track import accepted_estimates, track
 from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage
 

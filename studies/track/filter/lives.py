@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking import filter_bank
 from lmshealth.tracking.constants import (
     BIAS_STD,
     DAMPING_WALK,
@@ -21,8 +20,9 @@ from lmshealth.tracking.constants import (
     SETTLING_LOGS,
     WANDER_COMMON,
 )
+from lmshealth.tracking.filters import filter_bank
+from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from studies.harness.data.histories import keep_series, make_history
 
 Array = NDArray[np.float64]

@@ -23,8 +23,8 @@ from lmshealth.tracking.constants import (
     WANDER_COMMON,
 )
 from lmshealth.tracking.covariates import Regressor
+from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import Hyperparameters, StateSpace
 from lmshealth.tracking.track import track
 from studies.harness.cost import in_turns
 from studies.harness.data.histories import make_history

@@ -15,7 +15,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, diagonal
 from lmshealth.tracking import constants
-from lmshealth.tracking.state_space import Hyperparameters, StateSpace
+from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace
 
 # Sets with less than this share of their group's best are pruned (a test bounds the error).
 _NEGLIGIBLE = float(np.log(1e-7))

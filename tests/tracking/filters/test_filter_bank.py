@@ -11,14 +11,14 @@ from scipy.special import softmax
 from lmshealth._private.arrays import BoolArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import (
+from lmshealth.tracking.filters.filter_bank import (
     FilterBank,
     initial,
     predict,
     update,
 )
+from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from tests.lives import PRELOAD, TWO, awkward_history, make_stage, rough_history
 from tests.oracles import Followed, Known, Wander, batch, filterpy_loop, kalman
 

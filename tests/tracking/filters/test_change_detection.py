@@ -13,8 +13,9 @@ from scipy import integrate, stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import constants, state_space
-from lmshealth.tracking.change_detection import (
+from lmshealth.tracking import constants
+from lmshealth.tracking.filters import state_space
+from lmshealth.tracking.filters.change_detection import (
     ChangeHypothesis,
     add_to_sums,
     loop_evidence,
@@ -23,12 +24,12 @@ from lmshealth.tracking.change_detection import (
     unexplained_loop_changes,
     worst_window,
 )
-from lmshealth.tracking.filter_bank import restart
+from lmshealth.tracking.filters.filter_bank import restart
+from lmshealth.tracking.filters.state_space import StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History, Step
-from lmshealth.tracking.state_space import StateSpace, hyperparameter_grid
 from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
-from tests.tracking.test_filter_bank import SETTINGS, one, run
+from tests.tracking.filters.test_filter_bank import SETTINGS, one, run
 
 N_LOGS, PLACE = 40, 22
 

@@ -16,9 +16,9 @@ from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import FilterBank, advance, restart
+from lmshealth.tracking.filters.filter_bank import FilterBank, advance, restart
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import Step, StepKind
-from lmshealth.tracking.state_space import StateSpace
 
 ChangeKind = StepKind | Literal["drift"]
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]

@@ -8,10 +8,8 @@ from itertools import accumulate
 
 import numpy as np
 
-from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import StateSpace
-from lmshealth.tracking.track import track
-from lmshealth.tracking.track_state import (
+from lmshealth.tracking.filters.state_space import StateSpace
+from lmshealth.tracking.filters.track_state import (
     Published,
     TrackState,
     initial_state,
@@ -19,8 +17,10 @@ from lmshealth.tracking.track_state import (
     unrolled,
     widening,
 )
+from lmshealth.tracking.history import History
+from lmshealth.tracking.track import track
 from tests.lives import since
-from tests.tracking.test_change_detection import HAPPENINGS, N_LOGS, life
+from tests.tracking.filters.test_change_detection import HAPPENINGS, N_LOGS, life
 
 
 def stepping() -> History:

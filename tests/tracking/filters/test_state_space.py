@@ -9,8 +9,8 @@ import pytest
 
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import COVARIATE_STD, LN_F_STD, LN_ZETA_STD
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.state_space import StateSpace
 from tests.lives import (
     PRELOAD,
     TWO,

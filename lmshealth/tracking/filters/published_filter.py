@@ -14,11 +14,11 @@ from filterpy.kalman import KalmanFilter, predict, update
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
-from lmshealth.tracking.filter_bank import (
+from lmshealth.tracking.filters.filter_bank import (
     FilterBank,
     Innovation,
 )
-from lmshealth.tracking.state_space import Observation, StateSpace
+from lmshealth.tracking.filters.state_space import Observation, StateSpace
 
 # Least weight of an estimate: an outlier for certain.
 _LEAST_WEIGHT = 1e-10

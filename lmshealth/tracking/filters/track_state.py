@@ -14,7 +14,7 @@ from scipy import stats
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.modal.credibility import dependence
 from lmshealth.tracking import constants
-from lmshealth.tracking.change_detection import (
+from lmshealth.tracking.filters.change_detection import (
     N_CHECKPOINTS,
     ChangeHypothesis,
     Event,
@@ -25,15 +25,14 @@ from lmshealth.tracking.change_detection import (
     weigh_changes,
     worst_window,
 )
-from lmshealth.tracking.filter_bank import (
+from lmshealth.tracking.filters.filter_bank import (
     FilterBank,
     initial,
     predict,
     restart,
     update,
 )
-from lmshealth.tracking.history import Step
-from lmshealth.tracking.published_filter import (
+from lmshealth.tracking.filters.published_filter import (
     Gaussian,
     Nuisances,
     filter_log,
@@ -41,7 +40,8 @@ from lmshealth.tracking.published_filter import (
     select_nuisances,
     undecided,
 )
-from lmshealth.tracking.state_space import StateSpace
+from lmshealth.tracking.filters.state_space import StateSpace
+from lmshealth.tracking.history import Step
 
 Item = TypeVar("Item")
 Chain = Union[tuple[Item, "Chain[Item]"], None]  # noqa: UP007, it names itself

@@ -1,0 +1,1 @@
+"""Kalman filters of a track, and the changes that they detect."""
