@@ -660,10 +660,10 @@ def test_what_the_computer_failed_at_is_tried_again(
     """A full disk or memory is no fault of a log: it is refused, and not stored."""
     logs = write_archive(tmp_path / "logs", 3)
 
-    def fail(log: Log, stage: Stage) -> ModalReading:
+    def fail(log: Log, stage: Stage, **options: Any) -> ModalReading:
         if log.name == "log-01.h5":
             raise error
-        return read_modes(log, stage)
+        return read_modes(log, stage, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(ingesting, "read_modes", fail)
