@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.names import spell
 from lmshealth._private.result import Result
 from lmshealth.errors import BadQuestion
 from lmshealth.io.log import SI_UNITS, Log
@@ -28,7 +27,18 @@ from lmshealth.machine.service import Service
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import constants
-from lmshealth.report.text import GAP, covariate, km, moment, quantiles, signed, whole_km
+from lmshealth.report.language import decimal, language, mark, tr
+from lmshealth.report.text import (
+    GAP,
+    covariate,
+    fixed,
+    km,
+    moment,
+    quantiles,
+    signed,
+    spell,
+    whole_km,
+)
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
@@ -140,6 +150,7 @@ def print_figure(
         warnings.filterwarnings("ignore", message="Glyph .* missing")
         figure = Figure(figsize=size, dpi=_DPI, layout="constrained", facecolor=paper)
         draw(figure)
+        _write_decimals(figure)
         # Directly, because `savefig` draws everything twice.
         canvas: Any
         if kind == "svg":
@@ -153,6 +164,15 @@ def print_figure(
             _fix_layout(figure)
             canvas.print_png(target, metadata={"Software": None})
     return target.getvalue()
+
+
+def _write_decimals(figure: Figure) -> None:
+    """Write the numbers at the axes with the decimal mark of the language."""
+    for axis in (own for ax in figure.axes for own in (ax.xaxis, ax.yaxis)):
+        formatter: Any = axis.get_major_formatter()
+        if language() != "en" and hasattr(formatter, "fix_minus"):
+            fix = formatter.fix_minus
+            formatter.fix_minus = lambda text, fix=fix: decimal(fix(text))
 
 
 def _fix_layout(figure: Figure) -> None:
@@ -201,8 +221,8 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
         _density(ax, draws[:, 0])
     else:
         _regions(ax, draws)
-        ax.set_ylabel(f"{_spell(parameters[1])} in % of baseline")
-    ax.set_xlabel(f"{_spell(parameters[0])} in % of baseline")
+        ax.set_ylabel(tr("{name} in % of baseline", name=_spell(parameters[1])))
+    ax.set_xlabel(tr("{name} in % of baseline", name=_spell(parameters[0])))
     return legend(ax)
 
 
@@ -211,12 +231,12 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
     informed = bool(health.publishable_parameters()[column])
-    name = "health by all logs" if informed else "mostly prior, not measured"
+    name = tr("health by all logs") if informed else tr("mostly prior, not measured")
     _bands(ax, health.travel / _KM, bands, name, informed=informed)
     if informed:  # else no values are published
         texts = [
-            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {q[2]:.1f}{GAP}%, "
-            f"90{GAP}%: {q[0]:.1f} to {q[4]:.1f}{GAP}%"
+            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {fixed(q[2], 1)}{GAP}%, "
+            f"90{GAP}%: {tr('{low} to {high}', low=fixed(q[0], 1), high=fixed(q[4], 1))}{GAP}%"
             for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
         ]
         hints(ax, health.travel / _KM, bands[2], texts)
@@ -226,7 +246,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     values += [] if limit is None else [100 * limit]
     low, high = min(values), min(max(values), 250.0)
     ax.set_ylim(max(low - 0.06 * (high - low), 0.0), high + 0.06 * (high - low))
-    ax.set_ylabel("% of baseline")
+    ax.set_ylabel(tr("% of baseline"))
     return odometer(ax)
 
 
@@ -246,9 +266,9 @@ def plot_life(
     limit = float(prognosis.limits[column]) / baseline
     now, travel = prognosis.travel / _KM, prognosis.curve_travel / _KM
     bands = 100 * prognosis.curve_quantiles[:, :, column] / baseline
-    _bands(ax, travel, bands, "law", informed=True)
+    _bands(ax, travel, bands, tr("law"), informed=True)
     _levels(ax, limit)
-    ax.axvline(now, color=INK, lw=1.2, ls=":", label="now")
+    ax.axvline(now, color=INK, lw=1.2, ls=":", label=tr("now"))
     end = now + prognosis.horizon / _KM
     low, middle, high = np.array(quantiles(prognosis.remaining[:, column])) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
@@ -257,14 +277,14 @@ def plot_life(
     shown = right >= 0.55 * end
     if shown:
         right = end
-        ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label="horizon")
+        ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label=tr("horizon"))
     left = min(float(travel.min()), now)
     ax.set_xlim(left - 0.01 * (right - left), right + 0.02 * (right - left))
     ax.set_ylim(0, max(108.0, 1.04 * float(np.max(bands[4][travel <= right], initial=0.0))))
-    ax.set_ylabel("% of baseline")
+    ax.set_ylabel(tr("% of baseline"))
     odometer(ax)
     if not shown:
-        ax.set_xlabel(f"odometer in km (horizon at {whole_km(_KM * end)}, not shown)")
+        ax.set_xlabel(tr("odometer in km (horizon at {distance}, not shown)", distance=whole_km(_KM * end)))
     return ax
 
 
@@ -292,21 +312,23 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     for k, name in enumerate(prognosis.parameters[:-1] if several else ()):
         style: Any = {"color": MUTED, "lw": 1.2, "ls": dashes[k % len(dashes)]}
         ax.plot(ahead, chance_left(left[:, k], ahead), label=_spell(name), **style)
-    label = "no limit reached" if several else f"{_spell(prognosis.parameters[0])} limit"
+    first = _spell(prognosis.parameters[0])
+    label = tr("no limit reached") if several else tr("{name} limit", name=first)
     ax.plot(ahead, chance_left(left[:, -1], ahead), color=BLUE, lw=2.2, label=label)
     some = np.linspace(0, end, 25)
     chance = chance_left(left[:, -1], some)
     pairs = zip(_KM * some, chance, strict=True)
-    hints(ax, some, chance, [f"after {whole_km(x)}: {y:.0f}{GAP}%" for x, y in pairs])
+    hints(ax, some, chance, [tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%") for x, y in pairs])
     if service is not None and service.kept_risk is not None:
-        what = "accepted risk" if service.max_risk else "risk at least cost"
-        label = f"{what} {100 * service.kept_risk:.3g} %"
+        risk = decimal(f"{100 * service.kept_risk:.3g}")
+        accepted, cheapest = tr("accepted risk {risk} %", risk=risk), tr("risk at least cost {risk} %", risk=risk)
+        label = accepted if service.max_risk else cheapest
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     grouped(ax)
-    ax.set_xlabel("travel from now in km" + (" (ends at the horizon)" if end == horizon else ""))
-    ax.set_ylabel("probability in %")
+    ax.set_xlabel(tr("travel from now in km (ends at the horizon)") if end == horizon else tr("travel from now in km"))
+    ax.set_ylabel(tr("probability in %"))
     return legend(ax)
 
 
@@ -330,9 +352,9 @@ def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, informed: b
 
 def _levels(ax: Axes, limit: float | None) -> None:
     """Draw baseline and limit."""
-    ax.axhline(100, color=GREEN, lw=1.1, ls=_DASHED, label="baseline")
+    ax.axhline(100, color=GREEN, lw=1.1, ls=_DASHED, label=tr("baseline"))
     if limit is not None:
-        name = f"limit {100 * limit:.3g} %"
+        name = tr("limit {limit} %", limit=decimal(f"{100 * limit:.3g}"))
         ax.axhline(100 * limit, color=RED, lw=1.6, ls=(0, (8, 2)), label=name)
 
 
@@ -342,10 +364,11 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     right = where[2] if np.isfinite(where[2]) else 1e9  # beyond the figure
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
-        ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label="limit reached")
-    for x, far, name in zip(where, ahead, ("Early (5 %)", "Median", "Late (95 %)"), strict=True):
+        ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label=tr("limit reached"))
+    for x, far, name in zip(where, ahead, (tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")), strict=True):
         if np.isfinite(x):
-            text = f"{name}: in {km(_KM * far)}, at {whole_km(_KM * x)}"
+            ahead_, at = km(_KM * far), whole_km(_KM * x)
+            text = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
             hints(ax, np.array([x]), np.array([level]), [text])
 
 
@@ -374,8 +397,8 @@ def _regions(ax: Axes, draws: FloatArray) -> None:
     ax.fill([], [], color=BLUE, alpha=0.55, label="50 %")
     ax.fill([], [], color=BLUE, alpha=0.2, label="90 %")
     middle = np.median(draws, axis=0)
-    ax.plot(*middle, "o", color=INK, ms=5, label="median")
-    ax.plot(100, 100, "*", color=GREEN, mec=PAPER, mew=0.5, ms=12, label="baseline", zorder=5)
+    ax.plot(*middle, "o", color=INK, ms=5, label=tr("median"))
+    ax.plot(100, 100, "*", color=GREEN, mec=PAPER, mew=0.5, ms=12, label=tr("baseline"), zorder=5)
     low, high = np.quantile(draws, [0.05, 0.95], axis=0)
     span = np.quantile(draws, [0.002, 0.998], axis=0)
     first, last = np.minimum(span[0], 100.0), np.maximum(span[1], 100.0)
@@ -384,7 +407,7 @@ def _regions(ax: Axes, draws: FloatArray) -> None:
     ax.set_ylim(first[1], last[1])
     across, up = ax.get_xaxis_transform(), ax.get_yaxis_transform()
     ax.plot([low[0], high[0]], [0.05] * 2, "|-", color=INK, lw=1.4, ms=8, transform=across)
-    name = "marginal 90 %"
+    name = tr("marginal 90 %")
     ax.plot([0.04] * 2, [low[1], high[1]], "_-", color=INK, lw=1.4, ms=8, transform=up, label=name)
 
 
@@ -400,8 +423,8 @@ def plot_log(ax: Axes, log: Log, channel: str) -> Axes:
             f, density = welch(one.values[start:stop], log.sample_rate, nperseg=segment)
             ax.plot(f[1:], density[1:], lw=0.8, label=plain_label(one.name))
     ax.set_yscale("log")
-    ax.set_xlabel("frequency in Hz")
-    ax.set_ylabel(f"PSD in ({SI_UNITS[kind]})²/Hz")
+    ax.set_xlabel(tr("frequency in Hz"))
+    ax.set_ylabel(tr("PSD in ({unit})²/Hz", unit=SI_UNITS[kind]))
     return legend(ax)
 
 
@@ -413,8 +436,8 @@ def plot_modes(ax: Axes, modes: Modes) -> Axes:
     for name, x, y in zip(modes.names, f, damping, strict=True):
         ax.annotate(_spell(name), (x, y), xytext=(4, 4), textcoords="offset points")
     ax.set_ylim(bottom=0)
-    ax.set_xlabel("natural frequency in Hz")
-    ax.set_ylabel("damping ratio in %")
+    ax.set_xlabel(tr("natural frequency in Hz"))
+    ax.set_ylabel(tr("damping ratio in %"))
     return ax
 
 
@@ -475,23 +498,23 @@ def _density(ax: Axes, draws: FloatArray) -> None:
         part = (x >= low) & (x <= high)
         ax.fill_between(x[part], density[part], color=BLUE, alpha=alpha, lw=0, label=name)
     ax.plot(x, density, color=BLUE, lw=1.6)
-    ax.axvline(float(q[2]), color=INK, lw=1.4, label="median")
-    ax.axvline(100, color=GREEN, lw=1.3, ls=_DASHED, label="baseline")
+    ax.axvline(float(q[2]), color=INK, lw=1.4, label=tr("median"))
+    ax.axvline(100, color=GREEN, lw=1.3, ls=_DASHED, label=tr("baseline"))
     ax.set_ylim(0, 1.06 * density.max())
-    ax.set_ylabel("probability density per %")
+    ax.set_ylabel(tr("probability density per %"))
 
 
 def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
     """Label the odometer axis and add the legend."""
     grouped(ax)
-    ax.set_xlabel("odometer in km")
+    ax.set_xlabel(tr("odometer in km"))
     return legend(ax, room=room)
 
 
 def grouped(ax: Axes) -> None:
     """Group the thousands at the horizontal axis, as the text of the page does."""
     ax.locator_params(axis="x", nbins=6)
-    ax.xaxis.set_major_formatter(lambda value, _: f"{value:,g}".replace(",", GAP))
+    ax.xaxis.set_major_formatter(lambda value, _: decimal(f"{value:,g}".replace(",", GAP)))
 
 
 def legend(ax: Axes, *, room: int = ROOM) -> Axes:
@@ -521,11 +544,11 @@ _WIDE = 4.0
 # Half width of a waterfall's column, at most, in median distances of logs.
 _MOST_ROOM = 0.75
 _WORDS = {
-    "step": "sudden change",
-    "regreasing": "regreasing",
-    "servo": "servo retuned",
-    "sensor": "sensor changed",
-    "reset": "guide or mount serviced",
+    "step": mark("sudden change"),
+    "regreasing": mark("regreasing"),
+    "servo": mark("servo retuned"),
+    "sensor": mark("sensor changed"),
+    "reset": mark("guide or mount serviced"),
 }
 # Height of the axes above which a label is below its line.
 _TOP = 0.88
@@ -549,7 +572,7 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
     middle = (low + high) / 2
     if high - low < 0.01 * middle:
         ax.set_ylim(0.995 * middle, 1.005 * middle)
-    ax.set_ylabel("natural frequency in Hz")
+    ax.set_ylabel(tr("natural frequency in Hz"))
     return odometer(ax)
 
 
@@ -557,12 +580,12 @@ def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     """Plot the filtered natural frequency of a mode with its 95 % band, and the steps."""
     k = track.modes.index(mode)
     _filtered(ax, track.travel, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
-    names = dict(_WORDS)  # each kind has one entry in the legend
+    names = {kind: tr(words) for kind, words in _WORDS.items()}  # each kind has one entry in the legend
     for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
         name, x = names.pop(kind, None), track.travel[first] / _KM
         ax.axvline(x, lw=1.0, label=name, zorder=1, **style)
-    ax.set_ylabel("natural frequency in Hz")
+    ax.set_ylabel(tr("natural frequency in Hz"))
     return odometer(ax)
 
 
@@ -577,7 +600,7 @@ def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> 
     # Bars of uncertain logs may exceed the figure.
     if top > 0:
         ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level[:, columns])))))
-    ax.set_ylabel("damping ratio in %")
+    ax.set_ylabel(tr("damping ratio in %"))
     return odometer(ax)
 
 
@@ -587,19 +610,23 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     seen = seen[_thinned(seen.size)]
     x, nis = track.travel[seen] / _KM, track.nis[seen]
     low, high = chi_square_band(track.nis_dof[seen])
-    ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label="95 % band")
+    ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label=tr("95 % band"))
     inside = (nis >= low) & (nis <= high)
-    ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label="inside")
+    ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label=tr("inside"))
     texts = [
-        f"{title(track, k)}\nNIS {value:.1f}; expected {a:.1f} to {b:.1f}"
+        f"{title(track, k)}\n"
+        + tr(
+            "NIS {value}; expected {low} to {high}",
+            **{"value": fixed(value, 1), "low": fixed(a, 1), "high": fixed(b, 1)},
+        )
         for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
     ]
     hints(ax, x, nis, texts)
     if not inside.all():
-        ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label="outside")
+        ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label=tr("outside"))
     if nis.size and nis.max() > 4 * high.max():
         ax.set_yscale("log")
-        ax.set_ylabel("NIS (log scale)")
+        ax.set_ylabel(tr("NIS (log scale)"))
     else:
         ax.set_ylim(bottom=0)
         ax.set_ylabel("NIS")
@@ -628,7 +655,7 @@ def plot_waterfall(
     colours: Any = {"cmap": "cividis", "vmin": low, "vmax": high}
     picture = ax.pcolormesh(x, waterfall.edges, level, rasterized=True, **colours)
     bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
-    bar.set_label("level in dB")
+    bar.set_label(tr("level in dB"))
     bar.outline.set_visible(False)
     _column_hints(ax, sides, waterfall, history)
     _waterfall_lines(ax, waterfall, history)
@@ -639,7 +666,7 @@ def plot_waterfall(
     if track is not None:
         for k in range(len(track.modes)):
             _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
-    ax.set_ylabel("frequency in Hz")
+    ax.set_ylabel(tr("frequency in Hz"))
     return odometer(ax, room=36)  # next to the colour bar
 
 
@@ -657,18 +684,22 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     if std is not None:
         reach = 196 * std
         ax.fill_between(grid, line - reach, line + reach, color=BLUE, alpha=0.18, lw=0)
-    ax.plot(grid, line, color=BLUE, lw=1.6, label="effect")
-    ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label="as measured")
-    ax.plot(x, after, "o", color=INK, ms=2.8, label="corrected")
+    ax.plot(grid, line, color=BLUE, lw=1.6, label=tr("effect"))
+    ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label=tr("as measured"))
+    ax.plot(x, after, "o", color=INK, ms=2.8, label=tr("corrected"))
     name, unit = covariate(influence.covariate)
     texts = [
-        f"{title(history, k)}\n{name} {value:.4g}{GAP}{unit}\n"
-        f"as measured {signed(a, 2)}{GAP}%, corrected {signed(b, 2)}{GAP}%"
+        f"{title(history, k)}\n{name} {decimal(f'{value:.4g}')}{GAP}{unit}\n"
+        + tr(
+            "as measured {before}, corrected {after}",
+            before=f"{signed(a, 2)}{GAP}%",
+            after=f"{signed(b, 2)}{GAP}%",
+        )
         for k, value, a, b in zip(epochs, x, before, after, strict=True)
     ]
     hints(ax, x, before, texts)
-    ax.set_xlabel(_spell(f"{name} in {unit}" if unit else name))
-    ax.set_ylabel("change of frequency in %")
+    ax.set_xlabel(plain_label(tr("{name} in {unit}", name=name, unit=unit) if unit else name))
+    ax.set_ylabel(tr("change of frequency in %"))
     return legend(ax, room=35)
 
 
@@ -680,9 +711,9 @@ def _logs(
     seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
     seen = seen[_thinned(seen.size)]
     bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
-    bars(ax, history.travel[seen], bounds, "each log, ±2σ", 3)
+    bars(ax, history.travel[seen], bounds, tr("each log, ±2σ"), 3)
     texts = [
-        f"{title(history, k)}\n{value:.2f} ± {value * std[k]:.2f}{GAP}{name}"
+        f"{title(history, k)}\n{fixed(value, 2)} ± {fixed(value * std[k], 2)}{GAP}{name}"
         for k, value in zip(seen.tolist(), bounds[1], strict=True)
     ]
     hints(ax, history.travel[seen] / _KM, bounds[1], texts)
@@ -703,7 +734,7 @@ def _filtered(
     low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
     ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
     style: Any = {"color": BLUE, "lw": 1.8, "marker": "o" if travel.size < 3 else "", "zorder": 4}
-    ax.plot(x, unit * np.exp(level), label="filtered, 95 % band", **style)
+    ax.plot(x, unit * np.exp(level), label=tr("filtered, 95 % band"), **style)
 
 
 def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
@@ -713,7 +744,7 @@ def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
         own = base[first:end][np.isfinite(base[first:end])]
         if own.size:
             x = track.travel[[first, end - 1]] / _KM
-            name = None if first > history.baselines[0] else "baseline"
+            name = None if first > history.baselines[0] else tr("baseline")
             ax.plot(x, [own[-1]] * 2, color=GREEN, lw=1.1, ls=_DASHED, label=name)
 
 
@@ -747,7 +778,7 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     texts = []
     for k, ln_f in enumerate(history.ln_frequency):
         lines = [
-            f"{spell(history.series[i].mode)} {np.exp(ln_f[i]):.2f}{GAP}Hz"
+            f"{spell(history.series[i].mode)} {fixed(np.exp(ln_f[i]), 2)}{GAP}Hz"
             for i in np.flatnonzero(np.isfinite(ln_f))
         ]
         texts.append("\n".join([title(history, k), *lines]))
@@ -764,12 +795,18 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
         own = [(line, k) for line, k in seen if line.kind == kind]
         x = history.travel[[k for _, k in own]] / _KM
         y = np.array([line.frequency for line, _ in own])
-        name = f"{'other' if kind == 'unknown' else spell(kind)} line"
-        label = _spell(name)
+        name = tr("other line") if kind == "unknown" else tr("{kind} line", kind=spell(kind))
+        label = plain_label(name)
         ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=label)
         texts = [
-            f"{title(history, k)}\n{name} at {line.frequency:.2f}{GAP}Hz, "
-            f"{line.amplitude:.2g}{GAP}{line.unit} in {line.channel}"
+            f"{title(history, k)}\n"
+            + tr(
+                "{name} at {frequency}, {amplitude} in {channel}",
+                name=name,
+                frequency=f"{fixed(line.frequency, 2)}{GAP}Hz",
+                amplitude=f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}",
+                channel=line.channel,
+            )
             for line, k in own
         ]
         hints(ax, x, y, texts)
@@ -779,7 +816,7 @@ def _on_image(ax: Axes, track: Track, k: int, moved: FloatArray | float) -> None
     """Draw the filtered line of a mode with its 95 % band, visible on every colour."""
     level, reach = track.ln_frequency[:, k] + moved, 1.96 * track.ln_frequency_std[:, k]
     x = track.travel / _KM
-    name = None if k else "tracked modes, 95 % band"
+    name = None if k else tr("tracked modes, 95 % band")
     ax.fill_between(x, np.exp(level - reach), np.exp(level + reach), fc=_WHITE, alpha=0.4, lw=0)
     ax.plot(x, np.exp(level), color=_WHITE, lw=1.0, path_effects=_halo(2.6), label=name)
     if np.isfinite(level).any():

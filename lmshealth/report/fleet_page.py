@@ -14,6 +14,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.machine.constants import RUL_LEVELS
 from lmshealth.machine.summary import Summary
 from lmshealth.report import constants
+from lmshealth.report.language import mark, tr, tr_month
 from lmshealth.report.rendering import read, render
 from lmshealth.report.text import number
 from lmshealth.report.wording import headline, service_on_day, verdict_text
@@ -21,6 +22,14 @@ from lmshealth.report.wording import headline, service_on_day, verdict_text
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
 _NAME_LENGTH = 60
+# Parts of the script that are words.
+_WORDS = (
+    mark('Collator("en"'),
+    mark("`by ${names[heads.indexOf(sorted)].toLowerCase()}, ${sorted.ariaSort}`"),
+    mark('"most urgent first"'),
+    mark('`${shown} of ${rows.length} stage${rows.length === 1 ? "" : "s"}, ${way}`'),
+    mark('"Most urgent first"'),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,6 +78,8 @@ def write_index(
     """
     ranked = by_urgency(summaries)
     script = read("index.js") if len(ranked) > constants.MANY_MACHINES else ""
+    for words in _WORDS:
+        script = script.replace(words, tr(words))
     newest = max((one.recorded_at.date() for one in ranked), default=date.min)
     today = today or newest
     by_reason = [
@@ -104,7 +115,8 @@ def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     median = len(RUL_LEVELS) // 2
     left = [one.life.any.travel[median] / 1000 for one in summaries if one.life]
     edges = [0.0, *constants.LIFE_EDGES, np.inf]
-    labels = ["passed", *(f"to {number(edge)}" for edge in edges[1:-1]), "more", "beyond"]
+    labels = [tr("passed"), *(tr("to {distance}", distance=number(edge)) for edge in edges[1:-1])]
+    labels += [tr("more"), tr("beyond")]
     places = Counter(int(np.searchsorted(edges, km)) + (km == np.inf) for km in left)
     return [(label, places[k]) for k, label in enumerate(labels)] if left else []
 
@@ -115,11 +127,11 @@ def _months(summaries: Sequence[Summary], today: date) -> list[Month]:
     today = min(today, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
     # Due now: everything due on or before this day.
     counts = Counter(day.replace(day=1) for day in due if day > today)
-    months = [Month("now", "", today + timedelta(days=1), sum(day <= today for day in due))]
+    months = [Month(tr("now"), "", today + timedelta(days=1), sum(day <= today for day in due))]
     begin = today.replace(day=1)
     for k in range(constants.CALENDAR_MONTHS):
         year = f"{begin:%Y}" if k == 0 or begin.month == 1 else ""
         after = (begin + timedelta(days=31)).replace(day=1)
-        months.append(Month(f"{begin:%b}", year, after, counts[begin]))
+        months.append(Month(tr_month(begin), year, after, counts[begin]))
         begin = after
     return months if any(month.count for month in months) else []

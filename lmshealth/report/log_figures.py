@@ -16,7 +16,6 @@ from scipy.stats import gamma
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
-from lmshealth._private.names import spell
 from lmshealth.io.log import SI_UNITS, Log, Refusal
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
 from lmshealth.modal.ambient.search import Found
@@ -28,7 +27,9 @@ from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summarise
 from lmshealth.report import figures, tables
+from lmshealth.report.language import decimal, tr
 from lmshealth.report.rendering import render
+from lmshealth.report.text import reason, spell
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
 
@@ -87,7 +88,7 @@ def modes_figure(
         plot_spectra(parts[0], summary, modes, stage, sought=reading.sought)
         plot_shapes(parts[1], shapes, stage)
 
-    return LogFigure(f"Modes of {log.name}", (width, height + below), draw, modes)
+    return LogFigure(tr("Modes of {log}", log=log.name), (width, height + below), draw, modes)
 
 
 def _without_harmonics(fit: FittedSpectrum, reading: ModalReading) -> FittedSpectrum:
@@ -163,10 +164,10 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
         own = np.array([row[k].real if k >= 0 else np.nan for k in at])
         # Shapes are known but for their sign.
         own = own * (np.sign(np.nansum(own * part.real)) or 1.0)
-        ax.barh(y, own, color=figures.MUTED, alpha=0.35, label="at the baseline, real", **style)
+        ax.barh(y, own, color=figures.MUTED, alpha=0.35, label=tr("at the baseline, real"), **style)
     style["height"] = 0.26
-    ax.barh(y, part.real, color=figures.BLUE, label="in phase (real)", **style)
-    ax.plot(part.imag, y, "D", color=figures.RED, ms=3.5, label="90° shifted (imaginary)")
+    ax.barh(y, part.real, color=figures.BLUE, label=tr("in phase (real)"), **style)
+    ax.plot(part.imag, y, "D", color=figures.RED, ms=3.5, label=tr("90° shifted (imaginary)"))
     ax.axvline(0, color=figures.MUTED, lw=0.8)
     ax.set_xlim(-1.1, 1.1)
     ax.set_xticks([-1, 0, 1])
@@ -177,7 +178,7 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
 def _name_shape(ax: Axes, shapes: ModeShapes, i: int, mac: float) -> None:
     """Write the mode above its shape, with its phase collinearity and its MAC."""
     values = {"MPC": float(shapes.complexity[i]), "MAC": mac}
-    text = ", ".join(f"{name} {value:.2f}" for name, value in values.items() if np.isfinite(value))
+    text = ", ".join(f"{name} {decimal(f'{value:.2f}')}" for name, value in values.items() if np.isfinite(value))
     ax.set_title(figures.plain_label(f"{spell(shapes.names[i])}\n{text}"), size=9)
 
 
@@ -251,15 +252,15 @@ def plot_spectra(
     ):
         if before is not None and before.spectra is not None:
             _plot_before(ax, before.spectra, before.modes, name)
-        ax.plot(middle, own, color=figures.INK, lw=0.7, label="measured")
-        ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label="fit")
+        ax.plot(middle, own, color=figures.INK, lw=0.7, label=tr("measured"))
+        ax.plot(middle, fit, color=figures.GREEN, lw=1.4, label=tr("fit"))
         if np.isfinite(fit).any():
             style: Any = {"color": figures.GREEN, "alpha": 0.2, "lw": 0}
             ax.fill_between(
-                middle, *(fit * range_), **style, label="95 % range of the data, by the fit"
+                middle, *(fit * range_), **style, label=tr("95 % range of the data, by the fit")
             )
-        label = figures.plain_label(name) + ("\n(2nd derivative)" if derived else "")
-        label += f"\n({refused[name]})" if name in refused else ""
+        label = figures.plain_label(name) + (f"\n{tr('(2nd derivative)')}" if derived else "")
+        label += f"\n({reason(refused[name])})" if name in refused else ""
         _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, own)
     for k, values in enumerate(singular):
@@ -267,7 +268,7 @@ def plot_spectra(
         shown = np.where(values > _RANK * singular[0], values, np.nan)
         panels[len(level)].plot(middle, shown, **style)
     if singular.size:
-        _name_panel(panels[len(level)], "singular values\nof all channels")
+        _name_panel(panels[len(level)], tr("singular values\nof all channels"))
     for ax in panels[: len(level) + bool(singular.size)]:
         ax.set_yscale("log")
         ax.margins(y=0.08)  # room for markers
@@ -275,8 +276,8 @@ def plot_spectra(
     for part in sought:
         _plot_search(panels, part)
     if sought:
-        _name_panel(panels[-1], "order of the\nsubspace model")
-    figure.supylabel("acceleration PSD in (m/s²)²/Hz", fontsize=10)
+        _name_panel(panels[-1], tr("order of the\nsubspace model"))
+    figure.supylabel(tr("acceleration PSD in (m/s²)²/Hz"), fontsize=10)
     _annotate(figure, panels, (summary.low, summary.high), modes, stage)
     return figure
 
@@ -288,10 +289,10 @@ def _plot_before(ax: Axes, summary: SpectraSummary, modes: Modes, channel: str) 
     own = density(summary.level[summary.channels.index(channel)])
     low = np.nanmin(own, initial=np.inf)
     style: Any = {"color": figures.MUTED, "alpha": 0.3, "lw": 0}
-    ax.fill_between(summary.centres, low, own, label="measured at the baseline", **style)
+    ax.fill_between(summary.centres, low, own, label=tr("measured at the baseline"), **style)
     for f in modes.frequency.tolist():
         if summary.low <= f <= summary.high:
-            ax.axvline(f, color=figures.MUTED, lw=1, ls="-.", label="mode at the baseline")
+            ax.axvline(f, color=figures.MUTED, lw=1, ls="-.", label=tr("mode at the baseline"))
 
 
 def _name_panel(ax: Axes, name: str) -> None:
@@ -303,13 +304,13 @@ def _plot_search(panels: Sequence[Axes], sought: Found) -> None:
     poles, ax = sought.poles, panels[-1]
     for stable, style in ((False, {"mfc": "none", "mew": 0.4}), (True, {"mew": 0})):
         own = poles.stable == stable
-        label = f"{'stable' if stable else 'other'} pole of the search"
+        label = tr("stable pole of the search") if stable else tr("other pole of the search")
         place = poles.frequency[own], poles.order[own]
         ax.plot(*place, "o", ms=2.5, color=figures.INK, label=label, **style)
     for line in sought.harmonics:
         for panel in panels:
             span: Any = {"color": figures.RED, "alpha": 0.15, "lw": 0}
-            panel.axvspan(line.low, line.high, **span, label="band of a line that wanders")
+            panel.axvspan(line.low, line.high, **span, label=tr("band of a line that wanders"))
 
 
 def _join(listed: Sequence[Refusal], rejected: Sequence[Refusal]) -> tuple[Refusal, ...]:
@@ -332,31 +333,32 @@ def response_figure(
         kinds = {channel.name: channel.kind for channel in log.channels}
         unit = f"({SI_UNITS[kinds[frf.output]]})/{SI_UNITS[kinds[frf.input]]}"
     else:
-        unit = log.unit or "unit of the file"
+        unit = log.unit or tr("unit of the file")
 
     def draw(figure: Figure) -> None:
         panels = list(figure.subplots(3, sharex=True, height_ratios=[2, 1.2, 0.8]))
         points: Any = {"color": figures.MUTED, "ms": 2.5, "lw": 0}
-        fitted: Any = {"color": figures.GREEN, "lw": 1.4, "label": "fit"}
+        fitted: Any = {"color": figures.GREEN, "lw": 1.4, "label": tr("fit")}
         x, gain = fit.ordinates.frequency, np.abs(frf.response)
-        panels[0].plot(frf.frequency, gain, "o", label="measured", **points)
+        panels[0].plot(frf.frequency, gain, "o", label=tr("measured"), **points)
         panels[0].plot(x, np.abs(fit.response), **fitted)
         panels[0].set_yscale("log")
-        panels[0].set_ylabel(f"gain in {unit}")
+        panels[0].set_ylabel(tr("gain in {unit}", unit=unit))
         _mark_lines(panels[0], modes, frf.output, frf.frequency, gain)
         panels[1].plot(frf.frequency, np.angle(frf.response, deg=True), "o", **points)
         phase = np.angle(fit.response, deg=True)
         phase[1:][np.abs(np.diff(phase)) > 180] = np.nan  # no line from -180 to 180
         panels[1].plot(x, phase, **fitted)
-        panels[1].set_ylabel("phase in °")
+        panels[1].set_ylabel(tr("phase in °"))
         panels[1].set_yticks([-180, -90, 0, 90, 180])
         panels[2].plot(frf.frequency, frf.coherence, color=figures.INK, lw=0.9)
-        panels[2].set_ylabel("coherence")
+        panels[2].set_ylabel(tr("coherence"))
         panels[2].set_ylim(0, 1.05)
         low, high = frf.frequency[[0, -1]].tolist()
         _annotate(figure, panels, (low, high), modes, stage)
 
-    title = f"Response of {frf.output} to {frf.input}, {log.name}"
+    own = {"output": frf.output, "input": frf.input, "log": log.name}
+    title = tr("Response of {output} to {input}, {log}", **own)
     return LogFigure(title, _size(4, modes), draw, modes)
 
 
@@ -409,7 +411,7 @@ def _mark_lines(
         own = [line for line in seen if (line.kind, line.channel) == (kind, channel)]
         x = np.array([line.frequency for line in own])
         y = 1.5 * np.interp(x, frequency, level)
-        name = "line of unknown origin" if kind == "unknown" else f"line: {spell(kind)}"
+        name = tr("line of unknown origin") if kind == "unknown" else tr("line: {kind}", kind=spell(kind))
         label = figures.plain_label(name)
         ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
 
@@ -419,7 +421,7 @@ def _mark_orders(panels: Sequence[Axes], summary: SpectraSummary, stage: Stage |
     band = summary.low, summary.high
     for f, name in expected_orders(stage, summary.velocities, band) if stage else ():
         style: Any = {"color": figures.RED, "ms": 9, "mew": 1.4}
-        label = figures.plain_label(f"expected: {spell(name)}")
+        label = figures.plain_label(tr("expected: {name}", name=spell(name)))
         for ax in panels:
             ax.plot(f, 0.05, "|", transform=ax.get_xaxis_transform(), label=label, **style)
 
@@ -438,25 +440,25 @@ def _annotate(
         for ax in panels:
             ax.axvspan(
                 f * np.exp(-reach), f * np.exp(reach),
-                color=figures.BLUE, alpha=0.35, lw=0, label="mode, 95 % interval",
+                color=figures.BLUE, alpha=0.35, lw=0, label=tr("mode, 95 % interval"),
             )  # fmt: skip
             ax.axvline(f, color=figures.BLUE, lw=0.6)
-        name = spell(modes.names[k] or "unnamed")
+        name = spell(modes.names[k] or tr("unnamed"))
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
     sought = {mode.name: mode.frequency_hz for mode in stage.modes} if stage else {}
     place = panels[-1].get_xaxis_transform()
     for declared in sought.values():
         style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
         if band[0] <= declared <= band[1]:
-            panels[-1].plot(declared, 0, "^", transform=place, label="declared frequency", **style)
+            panels[-1].plot(declared, 0, "^", transform=place, label=tr("declared frequency"), **style)
     for refusal in modes.refused:
         refused = refusal.frequency or sought.get(refusal.mode)
         if refused is not None and band[0] <= refused <= band[1]:
             style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
-                ax.axvline(refused, **style, label="refused, or not found")
-            labels.append((refused, f"{spell(refusal.mode)}\n{refusal.reason}", figures.RED))
-    panels[-1].set_xlabel("frequency in Hz")
+                ax.axvline(refused, **style, label=tr("refused, or not found"))
+            labels.append((refused, f"{spell(refusal.mode)}\n{reason(refusal.reason)}", figures.RED))
+    panels[-1].set_xlabel(tr("frequency in Hz"))
     panels[-1].set_xlim(*band)
     if band[1] > WIDE * band[0] > 0:
         from matplotlib.ticker import LogLocator, NullLocator, StrMethodFormatter
@@ -477,7 +479,7 @@ def _value(frequency: float, std: float) -> str:
     """Format a frequency to two digits of its standard deviation, one of a very small one."""
     digits = max(0, 1 - int(np.floor(np.log10(std))))
     digits -= digits > 3
-    return f"{frequency:.{digits}f} ± {std:.{digits}f} Hz"
+    return decimal(f"{frequency:.{digits}f} ± {std:.{digits}f} Hz")
 
 
 def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
@@ -504,7 +506,7 @@ def _notes(modes: Modes) -> list[str]:
     """Return the refusals in lines that fit."""
     lines = []
     for refusal in modes.refused:
-        what = spell(refusal.mode) or refusal.channel or "modes"
-        text = figures.plain_label(f"{what} refused, {refusal.reason}: {refusal.detail}")
+        what = spell(refusal.mode) or refusal.channel or tr("modes")
+        text = figures.plain_label(tr("{what} refused, {reason}: {detail}", what=what, reason=reason(refusal.reason), detail=refusal.detail))
         lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
     return lines

@@ -14,7 +14,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from lmshealth._private.names import spell
 from lmshealth.io.log import Refusal
 from lmshealth.life.constants import LONE_NAMED
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
@@ -31,9 +30,10 @@ from lmshealth.machine.status import Status, coming_states
 from lmshealth.machine.summary import Summary, limit_of
 from lmshealth.report import constants, figures, wording
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
+from lmshealth.report.language import tr
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import track_rows
-from lmshealth.report.text import GAP, coarse, km
+from lmshealth.report.text import GAP, coarse, km, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -269,9 +269,9 @@ def _scatter(fleet: FleetPrior | None, stage: Stage) -> Iterator[tuple[str, str,
     if fleet is None:
         return
     names = {
-        "walk": "random walk of ln frequency",
-        "factor": "factor on reported errors",
-        "deviation": "deviation of health from its law",
+        "walk": tr("random walk of ln frequency"),
+        "factor": tr("factor on reported errors"),
+        "deviation": tr("deviation of health from its law"),
     }
     described, learned = expected_scatter(scatter_prior(stage)), expected_scatter(fleet.scatter)
     yield from zip(names, names.values(), described, learned, strict=True)
@@ -281,9 +281,12 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
     low, middle, high = (float(q) for q in pace.quantile(np.array(LEVELS)))
     if law.field == "life_km":
-        return f"life {km(1e3 * middle)} ({coarse(low)} to {coarse(high)})"
+        ends = tr("{low} to {high}", low=coarse(low), high=coarse(high))
+        return tr("life {distance} ({interval})", distance=km(1e3 * middle), interval=ends)
     low, middle, high = (1e5 * rate for rate in (low, middle, high))  # % per 1,000 km
-    return f"{coarse(middle)}{GAP}% per {km(1e6)} ({coarse(low)} to {coarse(high)}{GAP}%)"
+    ends = tr("{low} to {high}", low=coarse(low), high=f"{coarse(high)}{GAP}%")
+    rate = f"{coarse(middle)}{GAP}%"
+    return tr("{rate} per {distance} ({interval})", rate=rate, distance=km(1e6), interval=ends)
 
 
 def _track_pictures(
@@ -364,7 +367,7 @@ def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
     if len(names) == 1:
         yield names, spell(names[0]), 0.0
     for i, j in combinations(range(len(names)), 2):
-        title = f"{spell(names[i])} against {spell(names[j])}"
+        title = tr("{one} against {other}", one=spell(names[i]), other=spell(names[j]))
         yield (names[i], names[j]), title, float(health.correlation[-1, i, j])
 
 

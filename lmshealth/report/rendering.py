@@ -17,7 +17,7 @@ from typing import Any
 from lmshealth._private.files import write_bytes
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import LmshealthError
-from lmshealth.report import constants, text
+from lmshealth.report import constants, language, text
 
 
 def render(template: str, /, **content: Any) -> str:
@@ -54,11 +54,36 @@ def _environment() -> Any:
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
+        extensions=["jinja2.ext.i18n"],
     )
+    pages.install_gettext_callables(_said, _counted)  # type: ignore[attr-defined]
     pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
-    pages.filters |= {"place": place, "sha256": sha256}
+    pages.filters |= {"place": place, "sha256": sha256, "translated_svg": translated_svg}
+    pages.filters |= {"sentence": language.sentence, "is_known": language.is_known}
     pages.globals |= {"covariate": text.covariate, "constants": constants, "tables": TABLES}
+    pages.globals |= {"language": language.language, "_n": _counted}
     return pages
+
+
+def _said(message: str, /, **values: Any) -> Any:
+    """Translate a message of a template, which may have marks of HTML; its values are escaped."""
+    from markupsafe import Markup
+
+    return Markup(language.tr(message)).format(**values)  # noqa: S704
+
+
+def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
+    """Translate a message of a template by number, as `_said` does."""
+    from markupsafe import Markup
+
+    return Markup(language.tr_either(one, many, n)).format(n=n, **values)  # noqa: S704
+
+
+def translated_svg(svg: str) -> str:
+    """Translate the labels of a figure that was drawn in English."""
+    if language.language() == "en":
+        return svg
+    return re.sub(r">([^<>]+)</text>", lambda found: f">{language.label(found[1])}</text>", svg)
 
 
 class PdfError(LmshealthError):

@@ -1,4 +1,7 @@
-"""Formats of numbers and names; pages, terminals and figures share them."""
+"""Formats of numbers and names; pages, terminals and figures share them.
+
+They are those of the language of `report.language`: English on terminals.
+"""
 
 from __future__ import annotations
 
@@ -10,9 +13,10 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.names import spell
+from lmshealth._private import names
 from lmshealth.machine.constants import LEVELS
 from lmshealth.report import constants
+from lmshealth.report.language import decimal, language, mark, sentence, tr, tr_day, tr_either
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
@@ -23,10 +27,47 @@ _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB"}
 
 Number = float | np.floating[Any]
 
+# Names in the shipped descriptions, and of covariates.
+_NAMES = (
+    *(mark("guide preload"), mark("mount stiffness"), mark("any limit")),
+    *(mark("roll"), mark("pitch"), mark("yaw")),
+    *(mark("temperature"), mark("payload"), mark("position")),
+)
+# Conditions of a state by NAMUR NE 107, kinds of events and of spectral lines, and labels of the
+# pictures of how-to-read.html.
+_WORDS = (
+    *(mark("limit reached"), mark("alarm"), mark("step"), mark("outside map"), mark("large drift")),
+    *(mark("unreliable"), mark("loss"), mark("service due"), mark("no verdict"), mark("silent")),
+    *(mark("no log since maintenance"), mark("inspection overdue"), mark("regreasing")),
+    *(mark("mains"), mark("reset"), mark("and"), mark("worn"), mark("epochs, 90 %")),
+    mark("each epoch by itself"),
+)
+_COUNTED = {
+    "log": (mark("{n} log"), mark("{n} logs")),
+    "stage": (mark("{n} stage"), mark("{n} stages")),
+    "day": (mark("{n} day"), mark("{n} days")),
+    "week": (mark("{n} week"), mark("{n} weeks")),
+}
+
 
 def plain(text: str) -> str:
     """Return a text with ordinary blanks, for terminals."""
     return text.replace(GAP, " ")
+
+
+def spell(name: str) -> str:
+    """Return a name with blanks instead of underscores; those that are known are translated."""
+    return tr(names.spell(name))
+
+
+def capitalize(text: str) -> str:
+    """Begin a text with a capital letter; in English the others become small."""
+    return text.capitalize() if language() == "en" else text[:1].upper() + text[1:]
+
+
+def joined(parts: Iterable[str]) -> str:
+    """Join names by the word for and."""
+    return f" {tr('and')} ".join(parts)
 
 
 def covariate(column: str) -> tuple[str, str]:
@@ -40,22 +81,38 @@ def law(kind: str) -> str:
     from lmshealth.stage.degradation_laws import AnyLaw  # late: --help needs no scipy
 
     labels = {law.__struct_config__.tag: law.label for law in get_args(AnyLaw)}
-    return str(labels.get(kind, kind))
+    return sentence(str(labels.get(kind, kind)))
+
+
+def reason(code: str) -> str:
+    """Return the code of a refusal in words; in English the code itself."""
+    return tr(code)
+
+
+def reason_and_code(code: str) -> str:
+    """Return the code of a refusal, with its words where they differ."""
+    return code if tr(code) == code else f"{tr(code)} ({code})"
+
+
+def condition(words: str) -> str:
+    """Return a condition of a state by NAMUR NE 107 in words."""
+    return tr(words)
 
 
 def moment(when: datetime) -> str:
     """Format date, time and zone."""
-    return when.strftime("%Y-%m-%d %H:%M %Z").strip()
+    return f"{tr_day(when)} {when:%H:%M %Z}".strip()
 
 
 def age(last: date, today: date) -> str:
     """Return for how long there has been no log on a day."""
-    return f"no log for {count((today - last).days, 'day')}"
+    n = (today - last).days
+    return tr_either("no log for {n} day", "no log for {n} days", n).format(n=_grouped(n))
 
 
-def day(when: datetime) -> str:
-    """Format the day of a moment."""
-    return when.date().isoformat()
+def day(when: date) -> str:
+    """Format a day, or that of a moment."""
+    return tr_day(when)
 
 
 def number(value: Number, digits: int = 3) -> str:
@@ -64,23 +121,28 @@ def number(value: Number, digits: int = 3) -> str:
         return "–"
     rounded = float(f"{value:.{digits}g}")
     if abs(rounded) < 10 ** (digits - 1):
-        return f"{rounded:.{digits}g}".replace("-", "−")
-    return f"{rounded:,.0f}".replace(",", GAP).replace("-", "−")
+        return decimal(f"{rounded:.{digits}g}".replace("-", "−"))
+    return _grouped(rounded)
+
+
+def _grouped(value: float) -> str:
+    """Format a whole number with grouped thousands."""
+    return f"{value:,.0f}".replace(",", GAP).replace("-", "−")
 
 
 def count(n: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is 1."""
-    return f"{n:,} {noun}{'' if n == 1 else 's'}".replace(",", GAP)
+    """Return a number with its noun (log, stage, day or week), in the plural unless it is 1."""
+    return tr_either(*_COUNTED[noun], n).format(n=_grouped(n))
 
 
 def fixed(value: Number, digits: int) -> str:
     """Format a number with fixed decimals; NaN is a dash."""
-    return "–" if np.isnan(value) else f"{value:.{digits}f}".replace("-", "−")
+    return "–" if np.isnan(value) else decimal(f"{value:.{digits}f}".replace("-", "−"))
 
 
 def signed(value: Number, digits: int) -> str:
     """Format a number with its sign and fixed decimals."""
-    return f"{value:+.{digits}f}".replace("-", "−")
+    return decimal(f"{value:+.{digits}f}".replace("-", "−"))
 
 
 def percent(share: Number, digits: int | None = None) -> str:
@@ -96,22 +158,22 @@ def share(value: Number, digits: int) -> str:
     return fixed(100 * value, digits)
 
 
-def yes_or_no(value: object, yes: str = "yes", no: str = "no") -> str:
+def yes_or_no(value: object, yes: str = mark("yes"), no: str = mark("no")) -> str:
     """Format a flag."""
-    return yes if value else no
+    return tr(yes if value else no)
 
 
 def interval(low: Number, high: Number) -> str:
     """Format an interval of shares in whole percent."""
-    return f"{fixed(100 * low, 0)} to {percent(high, 0)}"
+    return tr("{low} to {high}", low=fixed(100 * low, 0), high=percent(high, 0))
 
 
 def probability(value: float) -> str:
     """Format a probability in percent; draws cannot prove 0 or 1."""
     if value < constants.LEAST_PROBABILITY:
-        return f"below {percent(constants.LEAST_PROBABILITY)}"
+        return tr("below {value}", value=percent(constants.LEAST_PROBABILITY))
     if value > constants.LARGEST_PROBABILITY:
-        return f"above {percent(constants.LARGEST_PROBABILITY)}"
+        return tr("above {value}", value=percent(constants.LARGEST_PROBABILITY))
     return percent(value, 0)
 
 
@@ -127,14 +189,16 @@ def probability_range(bounds: tuple[float, float]) -> str:
     if low == high:
         return low
     if at_least < constants.LEAST_PROBABILITY:
-        return f"at most {high}"
-    return f"at least {low}" if at_most > constants.LARGEST_PROBABILITY else f"{low} to {high}"
+        return tr("at most {value}", value=high)
+    if at_most > constants.LARGEST_PROBABILITY:
+        return tr("at least {value}", value=low)
+    return tr("{low} to {high}", low=low, high=high)
 
 
 def change(ln: Number, std: Number, digits: int = 2) -> str:
     """Format a change of a logarithm and its standard deviation as a relative change in percent."""
     value, spread = 100 * float(np.expm1(ln)), 100 * float(np.exp(ln)) * float(std)
-    return f"{signed(value, digits)} ± {spread:.{digits}f}{GAP}%"
+    return f"{signed(value, digits)} ± {fixed(spread, digits)}{GAP}%"
 
 
 def coarse(value: Number) -> str:
@@ -149,29 +213,29 @@ def km(metres: Number) -> str:
 
 def whole_km(metres: Number) -> str:
     """Format a distance given in m to the kilometre."""
-    return f"{metres / _KM:,.0f}{GAP}km".replace(",", GAP).replace("-", "−")
+    return f"{_grouped(metres / _KM)}{GAP}km"
 
 
 def travel_left(metres: float, horizon: float) -> str:
     """Format a remaining travel in m; infinite stands for beyond the horizon (m)."""
     if np.isinf(metres):
-        return f"beyond {km(horizon)}"
-    return "already passed" if metres <= 0 else km(metres)
+        return tr("beyond {distance}", distance=km(horizon))
+    return tr("already passed") if metres <= 0 else km(metres)
 
 
 def time_left(days: float) -> str:
     """Format remaining days, with years from 1,000 on; infinite is beyond the horizon."""
     if np.isinf(days) or days <= 0:
-        return "already passed" if days <= 0 else "beyond"
-    years = f" ({days / 365.25:.1f} years)" if days >= 1000 else ""
-    return f"{coarse(days)}{GAP}days{years}"
+        return tr("already passed") if days <= 0 else tr("beyond")
+    years = f" ({tr('{n} years', n=fixed(days / 365.25, 1))})" if days >= 1000 else ""
+    return f"{coarse(days)}{GAP}{tr('days')}{years}"
 
 
 def service_text(service: Service) -> str:
     """Return when to service, in a few words."""
     if service.by is not None and service.kind == "by":
-        return f"by {service.by.isoformat()}"
-    return {"now": "now", "later": "no service needed yet"}.get(service.kind, "no date")
+        return tr("by {day}", day=day(service.by))
+    return {"now": tr("now"), "later": tr("no service needed yet")}.get(service.kind, tr("no date"))
 
 
 def quantiles(values: FloatArray, levels: tuple[float, ...] = LEVELS) -> tuple[float, ...]:
@@ -197,7 +261,10 @@ class _Cells(Formatter):
             return "–"
         name, *options = format_spec.split() or [""]
         function = globals().get(name)
-        return function(value, *map(_option, options)) if function else format(value, format_spec)
+        if function:
+            return function(value, *map(_option, options))
+        text = format(value, format_spec)
+        return decimal(text) if isinstance(value, float) else text
 
 
 _FORMATTER = _Cells()
@@ -218,7 +285,7 @@ def view_columns(view: str, headings: Mapping[str, str | None] | None = None) ->
     """
     split = [column.partition("{") for column in view.split("|")]
     forms = {head.strip(): (start + rest).strip() for head, start, rest in split}
-    shown = {head: (headings or {}).get(head, head) for head in forms}
+    shown = {head: (headings or {}).get(head, tr(head)) for head in forms}
     return {name: forms[head] for head, name in shown.items() if name is not None}
 
 

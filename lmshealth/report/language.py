@@ -1,0 +1,192 @@
+"""Language of pages and figures: one catalogue (gettext), numbers and dates of its locale (Babel).
+
+A thread has one language at a time, English unless `speaking` sets another. English has the formats
+of the tables: ISO dates, a decimal point.
+"""
+
+import gettext
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
+from datetime import date
+from functools import cache
+from importlib import resources
+from typing import IO, Literal, get_args
+
+Language = Literal["en", "de"]
+LANGUAGES: tuple[Language, ...] = get_args(Language)
+DOMAIN = "lmshealth"
+FACT = "fact"
+"""Context of sentences of results (`_private.names.fact`), which tables have in English."""
+
+_language: ContextVar[Language] = ContextVar("language", default="en")
+_PLACE = re.compile(r"\\\{(\w+)[^}]*\\\}")
+_NUMBER = re.compile(r"(?<![\w.])(\d+)\.(\d+)(?![\w.])")
+_DAY = re.compile(r"\b\d{4}-\d\d-\d\d\b")
+
+
+@contextmanager
+def speaking(chosen: Language) -> Iterator[None]:
+    """Write pages and figures in a language."""
+    token = _language.set(chosen)
+    try:
+        yield
+    finally:
+        _language.reset(token)
+
+
+def language() -> Language:
+    """Return the code of the present language, as HTML has it."""
+    return _language.get()
+
+
+def mark(message: str) -> str:
+    """Mark a message that is translated where it is used."""
+    return message
+
+
+def tr(message: str, /, **values: object) -> str:
+    """Translate a message, and insert values by name."""
+    found = _catalogue(language()).gettext(message) if message else ""
+    return found.format(**values) if values else found
+
+
+def tr_either(one: str, many: str, n: int) -> str:
+    """Translate the message of a number: the first one for 1 in English, the second for others."""
+    return _catalogue(language()).ngettext(one, many, n)
+
+
+def tr_day(day: date) -> str:
+    """Format a day of the calendar."""
+    if language() == "en":
+        return day.isoformat()[:10]
+    from babel.dates import format_date  # late: English needs no Babel
+
+    return format_date(day, locale=language())
+
+
+def tr_month(day: date) -> str:
+    """Return the abbreviated month of a day."""
+    if language() == "en":
+        return f"{day:%b}"
+    from babel.dates import format_date
+
+    return format_date(day, "LLL", locale=language())
+
+
+def decimal(number: str) -> str:
+    """Write a number that Python has formatted with the decimal mark of the language."""
+    return number if language() == "en" else number.replace(".", _decimal_mark(language()))
+
+
+def sentence(text: str) -> str:
+    """Translate sentences of a result, each by the template that made it; others stay as they are.
+
+    Results keep their sentences as text, which tables, stores and saved files have in English.
+    """
+    return text if language() == "en" or not text else _sentences(language(), text) or text
+
+
+def is_known(text: str) -> bool:
+    """Return whether `sentence` translates a text into the present language."""
+    return language() == "en" or not text or _sentences(language(), text) is not None
+
+
+def label(text: str) -> str:
+    """Translate a label of a figure that was drawn in English, with its numbers and names."""
+    chosen = language()
+    if (known := tr(text)) != text:
+        return known
+    for own, said in _labels(chosen):
+        if found := own.fullmatch(text):
+            values = {name: _value(chosen, one) for name, one in found.groupdict().items()}
+            return said.format(**values)
+    return _value(chosen, text)
+
+
+@cache
+def _catalogue(chosen: Language) -> gettext.NullTranslations:
+    if chosen == "en":
+        return gettext.NullTranslations()
+    with _file(chosen) as file:
+        return gettext.GNUTranslations(file)
+
+
+def _file(chosen: Language) -> IO[bytes]:
+    folder = resources.files("lmshealth") / "report" / "locale" / chosen / "LC_MESSAGES"
+    return (folder / f"{DOMAIN}.mo").open("rb")
+
+
+@cache
+def _decimal_mark(chosen: Language) -> str:
+    from babel.numbers import get_decimal_symbol
+
+    return get_decimal_symbol(chosen)
+
+
+@cache
+def _templates(chosen: Language) -> list[tuple[str, str, str]]:
+    """Return context, message and translation of all messages without a plural."""
+    from babel.messages.mofile import read_mo
+
+    with _file(chosen) as file:
+        found = [(one.context or "", one.id, one.string) for one in read_mo(file)]
+    return [one for one in found if isinstance(one[1], str) and isinstance(one[2], str)]
+
+
+@cache
+def _facts(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
+    """Return a pattern of each template of a sentence, and its translation."""
+    found = [own for own in _templates(chosen) if own[0] == FACT]
+    return [(re.compile(_pattern(template) + r"(?=\s|$)"), said) for _, template, said in found]
+
+
+@cache
+def _labels(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
+    """Return the messages with values as `_facts`, those with most text of their own first."""
+    found = [own[1:] for own in _templates(chosen) if "{" in own[1]]
+    found.sort(key=lambda own: len(re.sub(r"{\w*}", "", own[0])), reverse=True)
+    return [(re.compile(_pattern(template)), said) for template, said in found]
+
+
+def _pattern(template: str) -> str:
+    """Return the pattern of a template; a value that it has twice is the same in both places."""
+    seen = set[str]()
+
+    def place(found: re.Match[str]) -> str:
+        name = found[1]
+        again = name in seen
+        seen.add(name)
+        return f"(?P={name})" if again else f"(?P<{name}>.+?)"
+
+    return _PLACE.sub(place, re.escape(template))
+
+
+def _sentences(chosen: Language, text: str) -> str | None:
+    """Translate a text that consists of known sentences; None for another."""
+    matches = [(found, said) for own, said in _facts(chosen) if (found := own.match(text))]
+    for found, said in sorted(matches, key=lambda one: one[0].end()):
+        rest = text[found.end() :].strip()
+        further = _sentences(chosen, rest) if rest else ""
+        if further is not None:
+            values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
+            return f"{re.sub(r':[^{}]*}', '}', said).format(**values)} {further}".rstrip()
+    return None
+
+
+def _value(chosen: Language, value: str) -> str:
+    """Translate a value of a sentence: sentences, or names, numbers and days."""
+    if (known := _sentences(chosen, value)) is not None:
+        return known
+    joined = [_name(name) for name in value.split(" and ")]
+    text = f" {tr('and')} ".join(joined)
+    text = _DAY.sub(lambda found: tr_day(date.fromisoformat(found[0])), text)
+    return _NUMBER.sub(lambda found: decimal(found[0]), text)
+
+
+def _name(name: str) -> str:
+    """Translate a name, which a sentence may begin with."""
+    low = name[:1].lower() + name[1:]
+    known = tr(low)
+    return name if known == low else known if name == low else known[:1].upper() + known[1:]
