@@ -65,10 +65,19 @@ class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
         return [self.read(one, **common) for one in objects]
 
 
+class RefusalCode(msgspec.Struct, frozen=True, array_like=True):
+    """A reason in ``refused.csv``."""
+
+    what: str  # is refused: log, channel, mode, blow or row; ``warning`` where it is used
+    cause: str
+    cure: str
+
+
 class _Specification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     shared: dict[str, tuple[str, str]]
     run: dict[str, Table]
     command: dict[str, Table]
+    refusals: dict[str, RefusalCode]
 
 
 _TEXT = (resources.files(__package__) / "tables.toml").read_bytes()
@@ -79,6 +88,8 @@ RUN_TABLES: Mapping[str, Table] = _READ.run
 """Tables of a run by the name of their file, without its ending."""
 TABLES: Mapping[str, Table] = {**_READ.run, **_READ.command}
 """All tables, those of the answers of commands by their key there."""
+REFUSALS: Mapping[str, RefusalCode] = _READ.refusals
+"""Every code in the column ``reason`` of ``refused.csv``."""
 MOMENTS = sorted(
     {name for one in TABLES.values() for name, unit in one.units.items() if unit == "moment"}
 )

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.names import fact
 from lmshealth._private.result import Result
 from lmshealth._private.seeds import stream
 from lmshealth.errors import BadStage, NotEnoughData
@@ -178,8 +179,11 @@ def prognosis_of(life: LifePosterior, history: History, stage: Stage) -> Prognos
     limited = identifiable_limits(stage, life.modes)
     if not limited:
         raise NotEnoughData(
-            f"{history.stage}: the modes {', '.join(life.modes)} identify no parameter that has a "
-            "limit, however many logs there are; `lmshealth stage` lists what they identify"
+            fact(
+                "{stage}: the modes {names} identify no parameter that has a limit, however many "
+                "logs there are; `lmshealth stage` lists what they identify",
+                **{"stage": history.stage, "names": ", ".join(life.modes)},
+            )
         )
     history = with_clock(history, stage)
     seeds = stream(life.seed, _STEP).spawn(3)
@@ -379,8 +383,12 @@ def _usage(
     days, steps = np.diff(history.seconds) / SECONDS_PER_DAY, np.diff(history.travel)
     days, steps = days[days > 0], steps[days > 0]
     if days.size < 2 or steps.sum() <= 0:
-        needed = "state [usage] km_per_day"
-        raise NotEnoughData(f"{history.stage}: the odometer gives no usage; {needed}")
+        raise NotEnoughData(
+            fact(
+                "{stage}: the odometer gives no usage; state [usage] km_per_day",
+                stage=history.stage,
+            )
+        )
     total, rate = days.sum(), steps.sum() / days.sum()
     per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
     # Over less than the time between two logs the usage was never observed.

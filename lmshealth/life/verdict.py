@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray
-from lmshealth._private.names import spell
+from lmshealth._private.names import fact, spell
 from lmshealth.life import constants
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.fit import LoneMode
@@ -131,21 +131,31 @@ def judge(
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
     if not stage.parameters:
-        return (
+        return fact(
             "The stage description has no [[parameter]]: the modes are tracked, and no health "
             "parameter is inferred."
         )
     if n_logs < needed:
-        logs = "log" if n_logs == 1 else "logs"
-        return f"{n_logs} usable {logs} since the baseline began; it needs {needed}."
+        one = fact("1 usable log since the baseline began; it needs {needed}.", needed=needed)
+        return (
+            one
+            if n_logs == 1
+            else fact(
+                "{n} usable logs since the baseline began; it needs {needed}.",
+                n=n_logs,
+                needed=needed,
+            )
+        )
     if health is None:
-        return "The logs do not contain enough information for the health parameters."
+        return fact("The logs do not contain enough information for the health parameters.")
     if not health.explained:
-        p = f"{health.fit[-1]:.1g}"
-        found = f"No life of the parameters on the map explains the logs (p = {p})"
-        return f"{found}: something else moved the modes, or the map is wrong."
+        return fact(
+            "No life of the parameters on the map explains the logs (p = {p:.1g}): something else "
+            "moved the modes, or the map is wrong.",
+            p=health.fit[-1],
+        )
     if not health.publishable_parameters().any():
-        return "The data do not constrain any health parameter."
+        return fact("The data do not constrain any health parameter.")
     return ""
 
 
@@ -169,15 +179,23 @@ def doubt_of_names(
     off = off_description(stage, names, estimate[:, known], std[:, known])
     if off:
         values = "; ".join(
-            f"{one.mode} {one.declared_hz:.5g} Hz and {one.found_hz:.5g} Hz, damping "
-            f"{100 * one.declared_damping_ratio:.2g} % and {100 * one.found_damping_ratio:.2g} %"
+            fact(
+                "{mode} {declared:.5g} Hz and {found:.5g} Hz, damping {zeta:.2g} % and "
+                "{other:.2g} %",
+                mode=one.mode,
+                declared=one.declared_hz,
+                found=one.found_hz,
+                zeta=100 * one.declared_damping_ratio,
+                other=100 * one.found_damping_ratio,
+            )
             for one in off
         )
-        return (
+        return fact(
             "The names of the modes are in doubt, so that no health is published. Declared and "
-            f"found at the baseline: {values}. Plausible are differences up to "
-            f"{100 * OFF_FREQUENCY:.0f} % (damping: a factor of {OFF_DAMPING:g}): correct the "
-            "description, or describe the modes that it lacks."
+            "found at the baseline: {values}. Plausible are differences up to {most:.0f} % "
+            "(damping: a factor of {factor:g}): correct the description, or describe the modes "
+            "that it lacks.",
+            **{"values": values, "most": 100 * OFF_FREQUENCY, "factor": OFF_DAMPING},
         )
     flags = Counter(
         name
@@ -186,13 +204,18 @@ def doubt_of_names(
         if "doubtful-name" in own.split()
     )
     n_logs = len(readings) - history.baseline
-    often = [f"{name} in {k} of {n_logs} logs" for name, k in flags.items() if 2 * k > n_logs]
+    often = [
+        fact("{name} in {k} of {n} logs", name=name, k=k, n=n_logs)
+        for name, k in flags.items()
+        if 2 * k > n_logs
+    ]
     if not often:
         return ""
-    return (
+    return fact(
         "The names of the modes are in doubt, so that no health is published: another mode may "
-        f"have the name {', '.join(often)} since the baseline (flag doubtful-name). Describe the "
-        "modes that refused.csv lists as undescribed."
+        "have the name {names} since the baseline (flag doubtful-name). Describe the modes that "
+        "refused.csv lists as undescribed.",
+        names=", ".join(often),
     )
 
 
@@ -216,7 +239,12 @@ def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
         size = f"{100 * np.expm1(moved):+.2f} ± {100 * np.exp(moved) * std:.2f} %"
         when, name = track.recorded_at[event.epoch].date().isoformat(), spell(mode)
         size = size.replace("-", "−")
-        yield f"Alarm since {when}: {name} has moved by {size} since the baseline."
+        yield fact(
+            "Alarm since {day}: {name} has moved by {size} since the baseline.",
+            day=when,
+            name=name,
+            size=size,
+        )
 
 
 def _judge_step(
@@ -226,8 +254,11 @@ def _judge_step(
     latest = (event for event in jumps if event.epoch == last)
     sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in latest)
     when, moved = history.recorded_at[last].date().isoformat(), sizes.replace("-", "−")
-    why = f"The frequencies jumped before the log of {when} ({moved}), and no declared maintenance "
-    why += "explains it."
+    why = fact(
+        "The frequencies jumped before the log of {day} ({sizes}), and no declared maintenance "
+        "explains it.",
+        **{"day": when, "sizes": moved},
+    )
     if health is not None and health.publishable_parameters().any():
         why += " " + _parameter_sentences(stage, health)
     # The evidence is against all that is harmless: wander, outliers, running-in.
@@ -264,9 +295,10 @@ def lone_sentence(lone: LoneMode, stage: Stage) -> str:
     name = spell(lone.mode).capitalize()
     states = " and ".join(spell(one.name) for one in stage.parameters)
     size = f"{moved:+.1f}".replace("-", "−")
-    return (
-        f"{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check "
-        "its sensor and cables, and what the platform carries."
+    return fact(
+        "{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check "
+        "its sensor and cables, and what the platform carries.",
+        **{"name": name, "size": size, "std": std, "states": states},
     )
 
 
@@ -278,14 +310,21 @@ def _parameter_sentences(stage: Stage, health: Health) -> str:
         name = spell(parameter.name).capitalize()
         low, middle, high = quantiles[:, j]
         if not health.identifiable[-1, j]:
-            text = f"{name}: not identifiable from the tracked modes."
+            text = fact("{name}: not identifiable from the tracked modes.", name=name)
         elif not informed[j]:
-            text = f"{name}: not constrained by these logs."
+            text = fact("{name}: not constrained by these logs.", name=name)
         elif parameter.unit:
-            text = f"{name} is {middle:.4g} {parameter.unit} (90 %: {low:.4g} to {high:.4g})."
+            text = fact(
+                "{name} is {middle:.4g} {unit} (90 %: {low:.4g} to {high:.4g}).",
+                **{"name": name, "unit": parameter.unit},
+                **{"low": low, "middle": middle, "high": high},
+            )
         else:
             low, middle, high = (100 * q / parameter.baseline for q in (low, middle, high))
-            text = f"{name} is at {middle:.0f} % of its baseline value "
-            text += f"(90 %: {low:.0f} to {high:.0f} %)."
+            text = fact(
+                "{name} is at {middle:.0f} % of its baseline value (90 %: {low:.0f} to "
+                "{high:.0f} %).",
+                **{"name": name, "low": low, "middle": middle, "high": high},
+            )
         sentences.append(text)
     return " ".join(sentences)

@@ -12,6 +12,7 @@ from datetime import date
 import numpy as np
 from numpy.linalg import LinAlgError
 
+from lmshealth._private.names import fact
 from lmshealth._private.seeds import seed_of
 from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import LmshealthError, NotEnoughData
@@ -257,9 +258,10 @@ def assess_from(
     except LmshealthError as error:
         why = str(error)
     except LinAlgError as error:  # one machine must not end the run
-        why = (
-            f"{history.stage}: its logs lead to a singular matrix ({error}); please report this "
-            "with modes.csv"
+        why = fact(
+            "{stage}: its logs lead to a singular matrix ({error}); please report this with "
+            "modes.csv",
+            **{"stage": history.stage, "error": error},
         )
     notice = Notice("no-result", "serious", "", why)
     return replace(made, notices=(*made.notices, notice)), None

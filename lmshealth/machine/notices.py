@@ -6,7 +6,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.names import spell
+from lmshealth._private.names import fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, SURPRISE
 from lmshealth.life.verdict import lone_sentence
@@ -34,24 +34,33 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
         names = " and ".join(map(spell, dict.fromkeys(modes)))
-        what = f"The last log has the flag {flag} at {names}."
-        yield Notice(
-            flag, "caution", names, what, "Its meaning is in the column flags of modes.csv."
-        )
+        what = fact("The last log has the flag {flag} at {names}.", flag=flag, names=names)
+        to_do = fact("Its meaning is in the column flags of modes.csv.")
+        yield Notice(flag, "caution", names, what, to_do)
     track = assessment.track
     for mode, (size, n_std) in assessment.drifted.items():
         n_logs = len(assessment.history.logs) - assessment.history.baseline
         moved = f"{100 * np.expm1(size):+.2f}".replace("-", "−")
-        what = f"{spell(mode).capitalize()} has moved by {moved} % in {n_logs} logs, "
-        what += f"{n_std:.0f} standard deviations: no scatter explains it."
-        to_do = "Record a log at once; check work, payload, sensor and servo tuning since then."
+        what = fact(
+            "{mode} has moved by {size} % in {n} logs, {n_std:.0f} standard deviations: no scatter "
+            "explains it.",
+            **{"mode": spell(mode).capitalize(), "size": moved, "n": n_logs, "n_std": n_std},
+        )
+        to_do = fact(
+            "Record a log at once; check work, payload, sensor and servo tuning since then."
+        )
         yield Notice("large-drift", "serious", mode, what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
         widened = track.widening[-1]
-        what = f"The logs do not vary as the filter of the modes expects (p = {p})"
-        what += f"; its intervals are {widened:.1f} times as wide." if widened > 1 else "."
-        to_do = "Look for a cause that the logs do not contain: payload, temperature, tuning."
+        narrow = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
+        wide = fact(
+            "The logs do not vary as the filter of the modes expects (p = {p}); its intervals are "
+            "{factor:.1f} times as wide.",
+            **{"p": p, "factor": widened},
+        )
+        what = wide if widened > 1 else narrow
+        to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
         yield Notice("filter-inconsistent", "caution", "", what, to_do)
 
 
@@ -61,13 +70,16 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
     if health is None:
         return
     if not health.explained:
-        what = f"No life of the parameters explains the modes (p = {health.fit[-1]:.1g})."
-        to_do = "Check what else moved the modes, and the map."
+        what = fact("No life of the parameters explains the modes (p = {p:.1g}).", p=health.fit[-1])
+        to_do = fact("Check what else moved the modes, and the map.")
         yield Notice("unexplained-drifts", "serious", "", what, to_do)
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
-            what = f"The interval of {spell(name)} ends at an end of the map, which bounds it."
-            yield Notice("end-of-map", "caution", name, what, "Extend the map.")
+            what = fact(
+                "The interval of {name} ends at an end of the map, which bounds it.",
+                name=spell(name),
+            )
+            yield Notice("end-of-map", "caution", name, what, fact("Extend the map."))
 
 
 def _of_channels(assessment: Assessment) -> Iterator[Notice]:
@@ -78,9 +90,10 @@ def _of_channels(assessment: Assessment) -> Iterator[Notice]:
             found.setdefault((row.reason, row.channel), []).append(row)
     for (reason, channel), rows in found.items():
         logs = len({row.log for row in rows})
-        what = f"{channel}: {rows[-1].detail} (in {rows[-1].log}; {logs} such logs)."
+        own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": logs}
+        what = fact("{channel}: {detail} (in {log}; {n} such logs).", **own)
         repaired = not WARNINGS[reason]
-        to_do = "refused.csv lists all."
+        to_do = fact("refused.csv lists all.")
         yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
 
 
@@ -90,7 +103,10 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     if prognosis is None:
         return
     for name in prognosis.unidentifiable:
-        what = f"The limit of {spell(name)} is left out of the life: the modes do not show it."
+        what = fact(
+            "The limit of {name} is left out of the life: the modes do not show it.",
+            name=spell(name),
+        )
         yield Notice("limit-not-included", "caution", name, what)
     for lone in prognosis.modes_off:
         if lone.probability >= LONE_NAMED:
@@ -98,14 +114,24 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             yield Notice("mode-off-map", "caution", lone.mode, what)
     dof = prognosis.degrees_of_freedom
     if dof > 0 and prognosis.chi_square > chi_square_band(np.array(dof))[1]:
-        what = f"No law of degradation fits the logs (χ² {prognosis.chi_square:.0f} of {dof:.0f})."
-        to_do = "Do not rely on the remaining life, and record further logs soon."
+        what = fact(
+            "No law of degradation fits the logs (χ² {value:.0f} of {dof:.0f}).",
+            value=prognosis.chi_square,
+            dof=dof,
+        )
+        to_do = fact("Do not rely on the remaining life, and record further logs soon.")
         yield Notice("laws-do-not-fit", "serious", "", what, to_do)
     fleet = assessment.calibration
     if fleet is not None and fleet.p_value < SURPRISE:
-        what = f"{fleet.early} of the {fleet.n_lives} ended lives of this fleet ended before the "
-        what += f"travel predicted for {CALIBRATED_RISK:.0%} of them (p = {fleet.p_value:.1g})."
-        to_do = "Plan by the calibrated travel instead of the service date; add a law that fits."
+        what = fact(
+            "{early} of the {n} ended lives of this fleet ended before the travel predicted for "
+            "{share:.0%} of them (p = {p:.1g}).",
+            **{"early": fleet.early, "n": fleet.n_lives},
+            **{"share": CALIBRATED_RISK, "p": fleet.p_value},
+        )
+        to_do = fact(
+            "Plan by the calibrated travel instead of the service date; add a law that fits."
+        )
         yield Notice("fleet-ends-early", "serious", "", what, to_do)
 
 

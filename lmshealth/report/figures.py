@@ -284,7 +284,9 @@ def plot_life(
     ax.set_ylabel(tr("% of baseline"))
     odometer(ax)
     if not shown:
-        ax.set_xlabel(tr("odometer in km (horizon at {distance}, not shown)", distance=whole_km(_KM * end)))
+        ax.set_xlabel(
+            tr("odometer in km (horizon at {distance}, not shown)", distance=whole_km(_KM * end))
+        )
     return ax
 
 
@@ -318,16 +320,31 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     some = np.linspace(0, end, 25)
     chance = chance_left(left[:, -1], some)
     pairs = zip(_KM * some, chance, strict=True)
-    hints(ax, some, chance, [tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%") for x, y in pairs])
+    hints(
+        ax,
+        some,
+        chance,
+        [
+            tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%")
+            for x, y in pairs
+        ],
+    )
     if service is not None and service.kept_risk is not None:
         risk = decimal(f"{100 * service.kept_risk:.3g}")
-        accepted, cheapest = tr("accepted risk {risk} %", risk=risk), tr("risk at least cost {risk} %", risk=risk)
+        accepted, cheapest = (
+            tr("accepted risk {risk} %", risk=risk),
+            tr("risk at least cost {risk} %", risk=risk),
+        )
         label = accepted if service.max_risk else cheapest
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     grouped(ax)
-    ax.set_xlabel(tr("travel from now in km (ends at the horizon)") if end == horizon else tr("travel from now in km"))
+    ax.set_xlabel(
+        tr("travel from now in km (ends at the horizon)")
+        if end == horizon
+        else tr("travel from now in km")
+    )
     ax.set_ylabel(tr("probability in %"))
     return legend(ax)
 
@@ -364,8 +381,12 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     right = where[2] if np.isfinite(where[2]) else 1e9  # beyond the figure
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
-        ax.plot(where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label=tr("limit reached"))
-    for x, far, name in zip(where, ahead, (tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")), strict=True):
+        ax.plot(
+            where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label=tr("limit reached")
+        )
+    for x, far, name in zip(
+        where, ahead, (tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")), strict=True
+    ):
         if np.isfinite(x):
             ahead_, at = km(_KM * far), whole_km(_KM * x)
             text = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
@@ -580,7 +601,9 @@ def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     """Plot the filtered natural frequency of a mode with its 95 % band, and the steps."""
     k = track.modes.index(mode)
     _filtered(ax, track.travel, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
-    names = {kind: tr(words) for kind, words in _WORDS.items()}  # each kind has one entry in the legend
+    names = {
+        kind: tr(words) for kind, words in _WORDS.items()
+    }  # each kind has one entry in the legend
     for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
         name, x = names.pop(kind, None), track.travel[first] / _KM

@@ -46,6 +46,11 @@ def mark(message: str) -> str:
     return message
 
 
+def mark_either(one: str, many: str) -> tuple[str, str]:
+    """Mark the messages of a number, as `mark` does."""
+    return one, many
+
+
 def tr(message: str, /, **values: object) -> str:
     """Translate a message, and insert values by name."""
     found = _catalogue(language()).gettext(message) if message else ""

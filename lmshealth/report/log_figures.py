@@ -178,7 +178,9 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
 def _name_shape(ax: Axes, shapes: ModeShapes, i: int, mac: float) -> None:
     """Write the mode above its shape, with its phase collinearity and its MAC."""
     values = {"MPC": float(shapes.complexity[i]), "MAC": mac}
-    text = ", ".join(f"{name} {decimal(f'{value:.2f}')}" for name, value in values.items() if np.isfinite(value))
+    text = ", ".join(
+        f"{name} {decimal(f'{value:.2f}')}" for name, value in values.items() if np.isfinite(value)
+    )
     ax.set_title(figures.plain_label(f"{spell(shapes.names[i])}\n{text}"), size=9)
 
 
@@ -411,7 +413,11 @@ def _mark_lines(
         own = [line for line in seen if (line.kind, line.channel) == (kind, channel)]
         x = np.array([line.frequency for line in own])
         y = 1.5 * np.interp(x, frequency, level)
-        name = tr("line of unknown origin") if kind == "unknown" else tr("line: {kind}", kind=spell(kind))
+        name = (
+            tr("line of unknown origin")
+            if kind == "unknown"
+            else tr("line: {kind}", kind=spell(kind))
+        )
         label = figures.plain_label(name)
         ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
 
@@ -450,14 +456,18 @@ def _annotate(
     for declared in sought.values():
         style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
         if band[0] <= declared <= band[1]:
-            panels[-1].plot(declared, 0, "^", transform=place, label=tr("declared frequency"), **style)
+            panels[-1].plot(
+                declared, 0, "^", transform=place, label=tr("declared frequency"), **style
+            )
     for refusal in modes.refused:
         refused = refusal.frequency or sought.get(refusal.mode)
         if refused is not None and band[0] <= refused <= band[1]:
             style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
                 ax.axvline(refused, **style, label=tr("refused, or not found"))
-            labels.append((refused, f"{spell(refusal.mode)}\n{reason(refusal.reason)}", figures.RED))
+            labels.append(
+                (refused, f"{spell(refusal.mode)}\n{reason(refusal.reason)}", figures.RED)
+            )
     panels[-1].set_xlabel(tr("frequency in Hz"))
     panels[-1].set_xlim(*band)
     if band[1] > WIDE * band[0] > 0:
@@ -507,6 +517,13 @@ def _notes(modes: Modes) -> list[str]:
     lines = []
     for refusal in modes.refused:
         what = spell(refusal.mode) or refusal.channel or tr("modes")
-        text = figures.plain_label(tr("{what} refused, {reason}: {detail}", what=what, reason=reason(refusal.reason), detail=refusal.detail))
+        text = figures.plain_label(
+            tr(
+                "{what} refused, {reason}: {detail}",
+                what=what,
+                reason=reason(refusal.reason),
+                detail=refusal.detail,
+            )
+        )
         lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
     return lines

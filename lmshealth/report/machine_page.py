@@ -29,8 +29,8 @@ from lmshealth.machine.service import Service, day_after, probability_before
 from lmshealth.machine.status import Status, coming_states
 from lmshealth.machine.summary import Summary, limit_of
 from lmshealth.report import constants, figures, wording
-from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.language import tr
+from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import track_rows
 from lmshealth.report.text import GAP, coarse, km, spell

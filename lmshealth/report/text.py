@@ -12,11 +12,20 @@ from typing import TYPE_CHECKING, Any, get_args
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
 from lmshealth._private import names
+from lmshealth._private.arrays import FloatArray
 from lmshealth.machine.constants import LEVELS
 from lmshealth.report import constants
-from lmshealth.report.language import decimal, language, mark, sentence, tr, tr_day, tr_either
+from lmshealth.report.language import (
+    decimal,
+    language,
+    mark,
+    mark_either,
+    sentence,
+    tr,
+    tr_day,
+    tr_either,
+)
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
@@ -43,10 +52,10 @@ _WORDS = (
     mark("each epoch by itself"),
 )
 _COUNTED = {
-    "log": (mark("{n} log"), mark("{n} logs")),
-    "stage": (mark("{n} stage"), mark("{n} stages")),
-    "day": (mark("{n} day"), mark("{n} days")),
-    "week": (mark("{n} week"), mark("{n} weeks")),
+    "log": mark_either("{n} log", "{n} logs"),
+    "stage": mark_either("{n} stage", "{n} stages"),
+    "day": mark_either("{n} day", "{n} days"),
+    "week": mark_either("{n} week", "{n} weeks"),
 }
 
 

@@ -35,7 +35,9 @@ def verdict_text(summary: Summary) -> str:
         "step": tr("sudden change without a known cause"),
         OUTSIDE_MAP: tr("a mode moved alone, by a cause outside the map"),
     }
-    return texts.get(summary.verdict) or tr("loss of {names}", names=joined(map(spell, summary.lost)))
+    return texts.get(summary.verdict) or tr(
+        "loss of {names}", names=joined(map(spell, summary.lost))
+    )
 
 
 def headline(summary: Summary) -> str:
@@ -89,9 +91,7 @@ _STEPS = {
     "service-now": mark(
         "Do {work} now, before the machine travels on, and record logs for a new baseline."
     ),
-    "overdue": mark(
-        "Do {work} now: its date, {by}, has passed. Record logs for a new baseline."
-    ),
+    "overdue": mark("Do {work} now: its date, {by}, has passed. Record logs for a new baseline."),
     "confirm": mark(
         "Record {often}, and order nothing yet: with so few logs the service before {by} rests on "
         "the prior of the laws."

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import expit, log_expit
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.names import fact
 from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth._private.toml import within
 from lmshealth.stage import constants
@@ -91,7 +92,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     life_km: Annotated[Prior, _lognormal(8000)]
     exponent: Uniform = Uniform(0.7, 1.6)
     outer: ClassVar[float] = 1.5
-    label: ClassVar[str] = "wear of the contacts (Hertz)"
+    label: ClassVar[str] = fact("wear of the contacts (Hertz)")
     names: ClassVar[tuple[str, ...]] = ("life_m", "exponent")
 
     def __post_init__(self) -> None:
@@ -137,7 +138,7 @@ class Power(HertzWear, frozen=True, tag="power", tag_field="kind"):
     """Loss as a power of travel: h(s) = 1 - (s / s_p)^n, without a physical model."""
 
     outer: ClassVar[float] = 1.0
-    label: ClassVar[str] = "loss as a power of travel"
+    label: ClassVar[str] = fact("loss as a power of travel")
 
 
 class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
@@ -145,7 +146,7 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
 
     life_km: Annotated[Prior, _lognormal(8000)]
     floor: Annotated[Prior, msgspec.Meta(examples=[{"kind": "uniform", "low": 0.3, "high": 1.0}])]
-    label: ClassVar[str] = "loosening towards a floor"
+    label: ClassVar[str] = fact("loosening towards a floor")
     names: ClassVar[tuple[str, ...]] = ("floor", "life_m")
 
     def __post_init__(self) -> None:
@@ -190,7 +191,7 @@ class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
     """Loss proportional to travel: h(s) = 1 - r s; a negative rate is a gain."""
 
     rate_per_km: Annotated[Prior, _lognormal(5e-5)]
-    label: ClassVar[str] = "loss in proportion to travel"
+    label: ClassVar[str] = fact("loss in proportion to travel")
     names: ClassVar[tuple[str, ...]] = ("rate_per_m",)
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
@@ -221,7 +222,7 @@ class Linear(Law, frozen=True, tag="linear", tag_field="kind"):
 class Unchanging(Law, frozen=True, tag="none", tag_field="kind"):
     """No degradation: h(s) = 1."""
 
-    label: ClassVar[str] = "no change"
+    label: ClassVar[str] = fact("no change")
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
         """Return the empty coordinates as they are."""
@@ -254,7 +255,7 @@ class Accelerating(HertzWear, frozen=True, tag="accelerating", tag_field="kind",
 
     slow: Annotated[Lognormal, _lognormal(0.1)]
     exponent: Uniform = Uniform(2.0, 12.0)
-    label: ClassVar[str] = "slow loss that accelerates"
+    label: ClassVar[str] = fact("slow loss that accelerates")
     names: ClassVar[tuple[str, ...]] = ("life_m", "exponent", "slow")
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:
@@ -307,7 +308,7 @@ class Free(Law, frozen=True, tag="free", tag_field="kind", kw_only=True):
     std: Annotated[float, within(*constants.EFFECT)] = 0.15
     exponent_sigma: Annotated[float, within(*constants.SIGMA)] = 0.5
     bend_std: Annotated[float, within(*constants.EFFECT)] = 2.0
-    label: ClassVar[str] = "change of either direction without a law"
+    label: ClassVar[str] = fact("change of either direction without a law")
     names: ClassVar[tuple[str, ...]] = ("per_power", "exponent", "bend")
 
     def natural(self, y: FloatArray, now: float) -> FloatArray:

@@ -9,6 +9,7 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
+from lmshealth._private.names import fact
 from lmshealth._private.result import Result
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Notice, Refusal
@@ -440,9 +441,12 @@ def rate_notices(refused: Sequence[Refusal]) -> list[Notice]:
     logs = [one.log for one in refused if one.reason == "odd-rate"]
     if not logs:
         return []
-    what = f"{len(logs)} logs have another sample rate, which their frequencies follow: "
-    to_do = "Find out which rate is right (refused.csv has both), and correct manifest.csv."
-    return [Notice("odd-rate", "caution", logs[0], f"{what}they are left out.", to_do)]
+    what = fact(
+        "{n} logs have another sample rate, which their frequencies follow: they are left out.",
+        n=len(logs),
+    )
+    to_do = fact("Find out which rate is right (refused.csv has both), and correct manifest.csv.")
+    return [Notice("odd-rate", "caution", logs[0], what, to_do)]
 
 
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:
@@ -458,16 +462,21 @@ def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[N
     notices = []
     if ambiguous:
         names = " and ".join(ambiguous)
-        what = (
-            f"{names}: the estimates of the last {least} logs are ambiguous, so that nothing new "
+        what = fact(
+            "{names}: the estimates of the last {n} logs are ambiguous, so that nothing new is "
+            "known; logs with more channels would distinguish modes by their shapes.",
+            **{"names": names, "n": least},
         )
-        what += "is known; logs with more channels would distinguish modes by their shapes."
         notices.append(Notice("ambiguous-modes", "caution", names, what))
     for name in history.modes:
         found = np.flatnonzero(np.isfinite(history.ln_frequency[:, history.columns(name)]).any(1))
         missed = len(history.logs) - 1 - int(found.max(initial=-1))
         if missed >= least and name not in ambiguous:
-            what = f"{name}: no estimate in the last {missed} logs; nothing new is known."
-            to_do = f"refused.csv has the reasons in its rows of {name}."
+            what = fact(
+                "{name}: no estimate in the last {n} logs; nothing new is known.",
+                name=name,
+                n=missed,
+            )
+            to_do = fact("refused.csv has the reasons in its rows of {name}.", name=name)
             notices.append(Notice("mode-missing", "caution", name, what, to_do))
     return notices

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from lmshealth._private.arrays import freeze
+from lmshealth._private.names import fact
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal, expect_moment
 from lmshealth.io.manifest import find_sheets, name_of
@@ -132,9 +133,12 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
             "maintenance-unread",
             "caution",
             one.refusal.log,
-            f"{one.refusal.log} cannot be read completely ({one.refusal.detail}): work on this "
-            "machine that it lists there is not used.",
-            "Correct the row and run again.",
+            fact(
+                "{file} cannot be read completely ({detail}): work on this machine that it lists "
+                "there is not used.",
+                **{"file": one.refusal.log, "detail": one.refusal.detail},
+            ),
+            fact("Correct the row and run again."),
         )
         for one in work.unread
     ]
@@ -142,14 +146,16 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
         if action.action not in RESETS:
             continue
         before = sum(moment is not None and moment < action.recorded_at for moment in moments)
-        work_done = f"{action.action} on {action.recorded_at.date().isoformat()}"
+        done = {"work": action.action, "day": action.recorded_at.date().isoformat()}
         if before == len(moments):
-            what = f"{work_done}: no log since, so nothing is known after it."
-            notices.append(Notice("no-log-since", "caution", "", what, "Record a log."))
+            what = fact("{work} on {day}: no log since, so nothing is known after it.", **done)
+            notices.append(Notice("no-log-since", "caution", "", what, fact("Record a log.")))
         elif before:
-            what = (
-                f"{work_done} opened a new baseline: fractions are relative to the state after it, "
-                f"and {before} earlier logs only inform the effects of temperature, load and loop."
+            what = fact(
+                "{work} on {day} opened a new baseline: fractions are relative to the state after "
+                "it, and {n} earlier logs only inform the effects of temperature, load and loop.",
+                **done,
+                n=before,
             )
             notices.append(Notice("new-baseline", "note", "", what))
     return notices

@@ -14,6 +14,7 @@ import numpy as np
 from scipy import stats
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.names import fact
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import NotEnoughData
@@ -242,8 +243,11 @@ def track(history: History, stage: Stage | None = None) -> Track:
     """
     if not np.isfinite(history.ln_frequency).any():
         raise NotEnoughData(
-            f"{history.stage}: no modal estimate in {len(history.logs)} logs is of a known mode; "
-            "a mode without a name is known once three logs show it"
+            fact(
+                "{stage}: no modal estimate in {n} logs is of a known mode; a mode without a name "
+                "is known once three logs show it",
+                **{"stage": history.stage, "n": len(history.logs)},
+            )
         )
     space = StateSpace(history, stage, history.steps)
     return _published(reduce(step, range(len(history.logs)), initial_state(space)))

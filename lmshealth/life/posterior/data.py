@@ -7,6 +7,7 @@ from typing import Self
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth._private.names import fact
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
@@ -42,12 +43,14 @@ class LifeData(ReadOnly):
             raise BadStage(f"{stage.name}: no [[parameter]] to infer")
         history = condense(with_clock(history, stage), constants.MAX_LOGS)
         if not history.has_odometer:
-            missing = "not every log has travel_km, and degradation laws count by the odometer"
-            todo = (
-                "add it to manifest.csv, or to every row of the table, or state in the stage "
-                'description [life] clock = "days" with [usage] km_per_day'
+            raise NotEnoughData(
+                fact(
+                    "{stage}: not every log has travel_km, and degradation laws count by the "
+                    "odometer; add it to manifest.csv, or to every row of the table, or state in "
+                    'the stage description [life] clock = "days" with [usage] km_per_day',
+                    stage=history.stage,
+                )
             )
-            raise NotEnoughData(f"{history.stage}: {missing}; {todo}")
         observed = np.any(np.isfinite(history.ln_frequency[history.baseline :]), axis=0)
         names = [name for name in stage.informative if name in history.modes]
         columns = [i for name in names for i in history.columns(name) if observed[i]]
@@ -59,8 +62,12 @@ class LifeData(ReadOnly):
         now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
         if n_logs < min_logs or now <= 0:
             raise NotEnoughData(
-                f"{history.stage}: {n_logs} logs with a mode of the map over {now / 1000:.4g} km; "
-                f"a life needs at least {min_logs} logs and some travel"
+                fact(
+                    "{stage}: {n} logs with a mode of the map over {travel:.4g} km; a life needs "
+                    "at least {least} logs and some travel",
+                    **{"stage": history.stage, "n": n_logs},
+                    **{"travel": now / 1000, "least": min_logs},
+                )
             )
         series_of, log_of = np.nonzero(np.isfinite(ln_f.T))
         mode_of_series = np.array([modes.index(name) for name in of_series])
@@ -208,7 +215,10 @@ def clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
         before[before >= clock[k]] = clock[k] - 1.0
     if len(first) > constants.MAX_STEPS:
         raise NotEnoughData(
-            f"{history.stage}: the modes jumped {len(first)} times since the baseline; no law of "
-            "a life holds over so many; maintenance.csv can declare a new baseline"
+            fact(
+                "{stage}: the modes jumped {n} times since the baseline; no law of a life holds "
+                "over so many; maintenance.csv can declare a new baseline",
+                **{"stage": history.stage, "n": len(first)},
+            )
         )
     return clock, tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)
