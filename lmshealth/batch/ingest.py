@@ -31,6 +31,7 @@ from lmshealth.modal.identification import read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
+from lmshealth.report.language import Language
 from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 
@@ -75,6 +76,8 @@ class Settings:
         Which changes since the last run are delivered, and how.
     today : date or None
         Day whose end statuses are judged at, for runs that repeat; None for the moment of the run.
+    language : str
+        Of the pages, ``en`` or ``de``; tables, status files and messages are English.
     growing : frozenset of Path
         Files that are left to a later run.
 
@@ -100,6 +103,7 @@ class Settings:
     follow_links: bool = False
     alerts: Alerts = field(default_factory=Alerts)
     today: date | None = None
+    language: Language = "en"
     growing: frozenset[Path] = frozenset()
 
     def pool(self) -> AbstractContextManager[Pool]:

@@ -20,6 +20,7 @@ from lmshealth.batch.store import unpack_or_none
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Status, judge_at, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
+from lmshealth.report.language import Language, speaking
 from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT
@@ -41,6 +42,7 @@ class MachineRecord:
     assessment: bytes | None
     rows: bytes | None
     before: Summary | None
+    language: Language = "en"  # of its page
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,7 +65,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         return None
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
-    with _DRAWING:
+    with _DRAWING, speaking(record.language):
         page = make_page(found, summary, before=record.before)
     rows = machine_tables(found) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
@@ -86,6 +88,7 @@ class Judging:
     moment: datetime
     silent_days: float | None
     before: Mapping[str, Status]  # by machine
+    language: Language = "en"  # of the pages
 
     def write(self, output: MachineOutput, path: Path) -> Summary:
         """Write the page of a machine as of the day; return its summary of that day."""
@@ -93,7 +96,8 @@ class Judging:
         today = self.moment.date()
         status = judge_at(before, output.status, self.moment, self.silent_days)
         summary = on_day(output.summary, status, today)
-        write_text(path, date_page(output.page, summary, status))
+        with speaking(self.language):
+            write_text(path, date_page(output.page, summary, status))
         return summary
 
 

@@ -33,6 +33,7 @@ from lmshealth.io.refusal import visible
 from lmshealth.machine.status import Change, Status
 from lmshealth.machine.summary import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
+from lmshealth.report.language import Language, speaking
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -134,7 +135,8 @@ def run(
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
-            write_index(out, done.rows, refused, today=judging.moment.date())
+            with speaking(settings.language):
+                write_index(out, done.rows, refused, today=judging.moment.date())
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
@@ -175,7 +177,8 @@ def report(
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
-        records = (_record(one.machine, one.key, files[one.machine], store) for one in present)
+        own = ((one.machine, one.key, files[one.machine]) for one in present)
+        records = (_record(*one, store, settings.language) for one in own)
         for record, output in pool.map_unordered(output_or_reason, records, lambda _, why: why):
             if isinstance(output, str):
                 failed[record.machine] = output
@@ -186,13 +189,11 @@ def report(
         raise store.unfilled("no assessment that this version of lmshealth can read")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
+    refused = store.refused(one.refused for one in present)
+    with speaking(settings.language):
+        index = write_index(out, ranked, refused, today=judging.moment.date())
     return RunResult(
-        index=write_index(
-            out,
-            ranked,
-            store.refused(one.refused for one in present),
-            today=judging.moment.date(),
-        ),
+        index=index,
         rows=ranked,
         failed={one.machine: unread for one in present if one.machine not in rows} | failed,
         notes=tuple(store.notes),
@@ -204,7 +205,7 @@ def _judging(store: Store, settings: Settings = Settings()) -> Judging:
     today = settings.today
     moment = datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
     before = {stage: one.status for stage, one in store.announced().items()}
-    return Judging(moment, settings.alerts.silent_days, before)
+    return Judging(moment, settings.alerts.silent_days, before, settings.language)
 
 
 def _prepare(out: Path) -> None:
@@ -284,7 +285,7 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources):
+        for name, output in _outputs(left, keys, files, resources, judging.language):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -311,6 +312,7 @@ def _outputs(
     keys: Mapping[str, str],
     files: Mapping[str, str],
     resources: Resources,
+    language: Language,
 ) -> Iterator[tuple[str, MachineOutput | str]]:
     """Yield the outputs of machines; those of unchanged results are taken from the store.
 
@@ -320,7 +322,7 @@ def _outputs(
     for machine in machines:
         name = machine.name
         # The rows of its logs, which are large, follow from their names and keys.
-        record = _record(name, keys[name], files[name], store)
+        record = _record(name, keys[name], files[name], store, language)
         key = fingerprint(VERSION, record, machine.logs)
         if output := _kept_output(name, key, store):
             yield name, output
@@ -333,7 +335,7 @@ def _outputs(
     def job(names: Sequence[str]) -> MachineRecord:
         [name] = names
         rows = packed_rows(missing[name][0], store)
-        return _record(name, keys[name], files[name], store, rows)
+        return _record(name, keys[name], files[name], store, language, rows)
 
     drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
         output_or_reason,
@@ -363,8 +365,13 @@ def _kept_output(name: str, key: str, store: Store) -> MachineOutput | None:
 
 
 def _record(
-    machine: str, key: str, file: str, store: Store, rows: bytes | None = None
+    machine: str,
+    key: str,
+    file: str,
+    store: Store,
+    language: Language,
+    rows: bytes | None = None,
 ) -> MachineRecord:
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, rows, before)
+    return MachineRecord(machine, file, assessment, rows, before, language)

@@ -21,6 +21,7 @@ from lmshealth.report.constants import TERMINAL_ROWS
 if TYPE_CHECKING:
     from lmshealth.batch.ingest import Settings
     from lmshealth.batch.run import RunResult
+    from lmshealth.report.language import Language
     from lmshealth.stage.description import Stage
 
 
@@ -45,6 +46,7 @@ def _run_options(command: Callable[..., Any]) -> Callable[..., Any]:
         options.EPOCHS,
         options.SEED,
         options.alert_options,
+        options.LANGUAGE,
         options.PDF,
         options.format_option("table", "json"),
     )
@@ -164,26 +166,35 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 @options.command(
     "report --store sqlite:///result/lmshealth.sqlite --out pages/",
     "report --store postgresql://me@host/fleet --out pages/ --pdf",
+    "report --store sqlite:///result/lmshealth.sqlite --out seiten/ --language de",
 )
 @options.store_option(required=True, help="Store that `run` has filled.")
 @options.out_option(type=options.FOLDER, help="Folder of the pages.")
 @options.WORKERS
+@options.LANGUAGE
 @options.PDF
 @options.TODAY
 @click.pass_context
 def report(
-    ctx: click.Context, /, store: str, out: Path, workers: int, pdf: bool, today: date | None
+    ctx: click.Context,
+    /,
+    store: str,
+    out: Path,
+    workers: int,
+    language: Language,
+    pdf: bool,
+    today: date | None,
 ) -> None:
     """Write the pages of all machines in a store, without their logs.
 
-    They are those that `run` writes on the same day, byte for byte.
+    They are those that `run` writes on the same day in the same language, byte for byte.
     """
     from lmshealth.batch.ingest import Settings
     from lmshealth.batch.run import report as write_pages
     from lmshealth.batch.store import Store
 
     with terminal.progress_bars() as progress, closing(Store(store, create=False)) as opened:
-        settings = Settings(workers=workers, today=today)
+        settings = Settings(workers=workers, today=today, language=language)
         result = write_pages(opened, out, settings, progress)
     terminal.print_line(f"Report: {result.index}")
     _finish(result, pdf)

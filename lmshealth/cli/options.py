@@ -20,6 +20,7 @@ from lmshealth.errors import LmshealthError
 from lmshealth.io.column_map import ColumnMap, Layout, load_columns, load_layouts
 from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, MAX_MEMORY
 from lmshealth.io.log import MOMENTS
+from lmshealth.report.language import LANGUAGES
 from lmshealth.signal.segments import PARTS
 from lmshealth.stage.description import Stage, load_stage
 
@@ -255,6 +256,13 @@ _NOTIFY = click.option(
     is_flag=True,
     callback=_notify,
     help=f"Send the changes to the addresses of apprise in {NOTIFY}.",
+)
+LANGUAGE = click.option(
+    "--language",
+    type=click.Choice(LANGUAGES),
+    default="en",
+    show_default=True,
+    help="Language of the pages; tables and messages are English.",
 )
 PDF = click.option("--pdf", is_flag=True, help="Also write the page of each stage as PDF.")
 

@@ -31,6 +31,7 @@ from lmshealth.report.language import decimal, language, mark, tr
 from lmshealth.report.text import (
     GAP,
     covariate,
+    ends,
     fixed,
     km,
     moment,
@@ -236,7 +237,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     if informed:  # else no values are published
         texts = [
             f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {fixed(q[2], 1)}{GAP}%, "
-            f"90{GAP}%: {tr('{low} to {high}', low=fixed(q[0], 1), high=fixed(q[4], 1))}{GAP}%"
+            f"90{GAP}%: {ends(fixed(q[0], 1), fixed(q[4], 1))}{GAP}%"
             for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
         ]
         hints(ax, health.travel / _KM, bands[2], texts)

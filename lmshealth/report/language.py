@@ -180,18 +180,26 @@ def _sentences(chosen: Language, text: str) -> str | None:
     return None
 
 
-def _value(chosen: Language, value: str) -> str:
-    """Translate a value of a sentence: sentences, or names, numbers and days."""
+def _value(
+    chosen: Language, value: str, separators: tuple[str, ...] = ("; ", ", ", " and ")
+) -> str:
+    """Translate a value of a sentence: sentences, or names, numbers and days, and lists of them."""
     if (known := _sentences(chosen, value)) is not None:
         return known
-    joined = [_name(name) for name in value.split(" and ")]
-    text = f" {tr('and')} ".join(joined)
-    text = _DAY.sub(lambda found: tr_day(date.fromisoformat(found[0])), text)
+    if separators:
+        separator, *further = separators
+        parts = [_value(chosen, part, tuple(further)) for part in value.split(separator)]
+        return (f" {tr('and')} " if separator == " and " else separator).join(parts)
+    text = _DAY.sub(lambda found: tr_day(date.fromisoformat(found[0])), _name(value))
     return _NUMBER.sub(lambda found: decimal(found[0]), text)
 
 
-def _name(name: str) -> str:
-    """Translate a name, which a sentence may begin with."""
+def _name(text: str) -> str:
+    """Translate a name, which a sentence may begin with, or a name before a number."""
+    found = re.match(r"[^\d+−]+(?= [\d+−])", text)
+    name = found[0] if found else text
     low = name[:1].lower() + name[1:]
     known = tr(low)
-    return name if known == low else known if name == low else known[:1].upper() + known[1:]
+    if name != low and known != low:
+        known = known[:1].upper() + known[1:]
+    return text if known == low else known + text[len(name) :]

@@ -261,7 +261,7 @@ def plot_spectra(
             ax.fill_between(
                 middle, *(fit * range_), **style, label=tr("95 % range of the data, by the fit")
             )
-        label = figures.plain_label(name) + (f"\n{tr('(2nd derivative)')}" if derived else "")
+        label = figures.plain_label(name) + ("\n" + tr("(2nd derivative)") if derived else "")
         label += f"\n({reason(refused[name])})" if name in refused else ""
         _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, own)

@@ -33,7 +33,7 @@ from lmshealth.report.language import tr
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import track_rows
-from lmshealth.report.text import GAP, coarse, km, spell
+from lmshealth.report.text import GAP, coarse, ends, km, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -281,12 +281,12 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
     low, middle, high = (float(q) for q in pace.quantile(np.array(LEVELS)))
     if law.field == "life_km":
-        ends = tr("{low} to {high}", low=coarse(low), high=coarse(high))
-        return tr("life {distance} ({interval})", distance=km(1e3 * middle), interval=ends)
+        spread = ends(coarse(low), coarse(high))
+        return tr("life {distance} ({interval})", distance=km(1e3 * middle), interval=spread)
     low, middle, high = (1e5 * rate for rate in (low, middle, high))  # % per 1,000 km
-    ends = tr("{low} to {high}", low=coarse(low), high=f"{coarse(high)}{GAP}%")
+    spread = ends(coarse(low), f"{coarse(high)}{GAP}%")
     rate = f"{coarse(middle)}{GAP}%"
-    return tr("{rate} per {distance} ({interval})", rate=rate, distance=km(1e6), interval=ends)
+    return tr("{rate} per {distance} ({interval})", rate=rate, distance=km(1e6), interval=spread)
 
 
 def _track_pictures(

@@ -79,11 +79,14 @@ def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
     return Markup(language.tr_either(one, many, n)).format(n=n, **values)  # noqa: S704
 
 
-def translated_svg(svg: str) -> str:
-    """Translate the labels of a figure that was drawn in English."""
+def translated_svg(svg: Any) -> Any:
+    """Translate the labels of a figure (Markup) that was drawn in English."""
+    from markupsafe import Markup
+
     if language.language() == "en":
         return svg
-    return re.sub(r">([^<>]+)</text>", lambda found: f">{language.label(found[1])}</text>", svg)
+    label = language.label
+    return Markup(re.sub(r">([^<>]+)</text>", lambda found: f">{label(found[1])}</text>", svg))  # noqa: S704
 
 
 class PdfError(LmshealthError):

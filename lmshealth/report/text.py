@@ -172,9 +172,14 @@ def yes_or_no(value: object, yes: str = mark("yes"), no: str = mark("no")) -> st
     return tr(yes if value else no)
 
 
+def ends(low: str, high: str) -> str:
+    """Join the ends of an interval."""
+    return tr("{low} to {high}", low=low, high=high)
+
+
 def interval(low: Number, high: Number) -> str:
     """Format an interval of shares in whole percent."""
-    return tr("{low} to {high}", low=fixed(100 * low, 0), high=percent(high, 0))
+    return ends(fixed(100 * low, 0), percent(high, 0))
 
 
 def probability(value: float) -> str:
@@ -201,7 +206,7 @@ def probability_range(bounds: tuple[float, float]) -> str:
         return tr("at most {value}", value=high)
     if at_most > constants.LARGEST_PROBABILITY:
         return tr("at least {value}", value=low)
-    return tr("{low} to {high}", low=low, high=high)
+    return ends(low, high)
 
 
 def change(ln: Number, std: Number, digits: int = 2) -> str:
@@ -236,8 +241,9 @@ def time_left(days: float) -> str:
     """Format remaining days, with years from 1,000 on; infinite is beyond the horizon."""
     if np.isinf(days) or days <= 0:
         return tr("already passed") if days <= 0 else tr("beyond")
-    years = f" ({tr('{n} years', n=fixed(days / 365.25, 1))})" if days >= 1000 else ""
-    return f"{coarse(days)}{GAP}{tr('days')}{years}"
+    text = coarse(days) + GAP + tr("days")
+    years = tr("{n} years", n=fixed(days / 365.25, 1))
+    return f"{text} ({years})" if days >= 1000 else text
 
 
 def service_text(service: Service) -> str:
@@ -273,7 +279,8 @@ class _Cells(Formatter):
         if function:
             return function(value, *map(_option, options))
         text = format(value, format_spec)
-        return decimal(text) if isinstance(value, float) else text
+        # without a format it may be an argument of another one
+        return decimal(text) if format_spec and isinstance(value, float) else text
 
 
 _FORMATTER = _Cells()

@@ -13,6 +13,7 @@ from lmshealth.report.text import (
     capitalize,
     count,
     day,
+    ends,
     in_brackets,
     interval,
     joined,
@@ -161,11 +162,6 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
     yield logs + (tr(", {distance} further.", distance=km(travel)) if travel > 0 else ".")
 
 
-def _spread(low: str, high: str) -> str:
-    """Return a 90 % interval in brackets."""
-    return f" (90{GAP}%: {tr('{low} to {high}', low=low, high=high)})"
-
-
 def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
     was, present = (
         {one.name: one for one in summary.health if one.determined} for summary in (before, now)
@@ -188,7 +184,7 @@ def _life_change(before: Summary, now: Summary) -> str:
         ]
         for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
     )
-    spread = _spread(low[1], high[1]) if now.life else ""
+    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life else ""
     return tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
 
 

@@ -29,6 +29,11 @@ KEYWORDS: dict[str | None, dict[str, Any]] = {
     FACT: {"fact": None},
 }
 IN_TEMPLATES: dict[str, Any] = {"_": None, "_n": (1, 2)}
+# Lines of the header: dates, and placeholders for people.
+_LEFT_OUT = (
+    *(b"POT-Creation-Date", b"PO-Revision-Date", b"Generated-By", b"Copyright", b"FIRST AUTHOR"),
+    *(b"Report-Msgid-Bugs-To", b"Last-Translator", b"Language-Team", b"Project-Id-Version"),
+)
 
 
 def main() -> None:
@@ -53,9 +58,8 @@ def as_po(catalogue: Catalog) -> bytes:
     write_po(
         target, catalogue, width=100, omit_header=False, sort_by_file=True, include_lineno=False
     )
-    dated = b"POT-Creation-Date", b"PO-Revision-Date", b"Generated-By"
     lines = target.getvalue().splitlines(keepends=True)
-    return b"".join(line for line in lines if not line.removeprefix(b'"').startswith(dated))
+    return b"".join(line for line in lines if not line.lstrip(b'"# ').startswith(_LEFT_OUT))
 
 
 def as_mo(catalogue: Catalog) -> bytes:
@@ -82,8 +86,11 @@ def messages() -> Iterator[tuple[Any, str, str | None]]:
                 yield message, place, context
     for file in sorted(TEMPLATES.glob("*.j2")):
         with file.open("rb") as content:
-            for _, _, message, _ in babel_extract(content, IN_TEMPLATES, [], {}):
-                yield message, f"lmshealth/report/templates/{file.name}", None
+            for _, function, found, _ in babel_extract(content, IN_TEMPLATES, [], {}):
+                texts = found if isinstance(found, tuple) else (found,)  # of all arguments
+                message = texts[:2] if function == "_n" else texts[0]
+                if message is not None:  # a word that is marked elsewhere
+                    yield message, f"lmshealth/report/templates/{file.name}", None
     place = "lmshealth/_private/tables.toml"
     for table in TABLES.values():
         if "page" in table.shown:
