@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from datetime import date
-from functools import cache
+from functools import cache, lru_cache
 from importlib import resources
 from typing import IO, Literal, get_args
 
@@ -21,6 +21,7 @@ FACT = "fact"
 """Context of sentences of results (`_private.names.fact`), which tables have in English."""
 
 _language: ContextVar[Language] = ContextVar("language", default="en")
+_MOST_TEXT = 3000  # characters of sentences that are looked up: a file may hold any text
 _PLACE = re.compile(r"\\\{(\w+)[^}]*\\\}")
 _NUMBER = re.compile(r"(?<![\w.])(\d+)\.(\d+)(?![\w.])")
 _DAY = re.compile(r"\b\d{4}-\d\d-\d\d\b")
@@ -168,8 +169,11 @@ def _pattern(template: str) -> str:
     return _PLACE.sub(place, re.escape(template))
 
 
+@lru_cache(maxsize=1000)
 def _sentences(chosen: Language, text: str) -> str | None:
     """Translate a text that consists of known sentences; None for another."""
+    if len(text) > _MOST_TEXT:
+        return None
     matches = [(found, said) for own, said in _facts(chosen) if (found := own.match(text))]
     for found, said in sorted(matches, key=lambda one: one[0].end()):
         rest = text[found.end() :].strip()

@@ -140,8 +140,9 @@ def _grouped(value: float) -> str:
 
 
 def count(n: int, noun: str) -> str:
-    """Return a number with its noun (log, stage, day or week), in the plural unless it is 1."""
-    return tr_either(*_COUNTED[noun], n).format(n=_grouped(n))
+    """Return a number with its noun, in the plural unless it is 1; nouns of terminals are English."""
+    one, many = _COUNTED.get(noun, (f"{{n}} {noun}", f"{{n}} {noun}s"))
+    return tr_either(one, many, n).format(n=_grouped(n))
 
 
 def fixed(value: Number, digits: int) -> str:

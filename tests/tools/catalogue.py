@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -39,12 +40,17 @@ _LEFT_OUT = (
 def main() -> None:
     """Update the catalogue of every language but English, and compile it."""
     for language in LANGUAGES[1:]:
-        with path(language, "po").open("rb") as file:
-            known = read_po(file, locale=language, domain=DOMAIN)
+        known = stored(language)
         known.update(template(), no_fuzzy_matching=True)
         known.obsolete.clear()
         path(language, "po").write_bytes(as_po(known))
-        path(language, "mo").write_bytes(as_mo(known))
+        path(language, "mo").write_bytes(as_mo(stored(language)))
+
+
+def stored(language: str) -> Catalog:
+    """Read the catalogue of a language."""
+    with path(language, "po").open("rb") as file:
+        return read_po(file, locale=language, domain=DOMAIN)
 
 
 def path(language: str, suffix: str) -> Path:
@@ -63,7 +69,8 @@ def as_po(catalogue: Catalog) -> bytes:
 
 
 def as_mo(catalogue: Catalog) -> bytes:
-    """Compile a catalogue."""
+    """Compile a catalogue; its header has a fixed date, so that the bytes are reproducible."""
+    catalogue.creation_date = catalogue.revision_date = datetime(2000, 1, 1, tzinfo=UTC)
     target = io.BytesIO()
     write_mo(target, catalogue)
     return target.getvalue()
