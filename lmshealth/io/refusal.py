@@ -12,7 +12,7 @@ _MOST_LISTED = 12
 class Unusable(Exception):
     """A file that cannot be used; `read_log` turns it into a ``BadLog`` with the file's name.
 
-    The reason is the code in ``refused.csv`` (README.md lists all); the detail is what was found,
+    The reason is the code in ``refused.csv`` (report/REFUSALS.md has all); the detail is what was found,
     what is needed, and the next step.
     """
 

@@ -140,7 +140,7 @@ def _grouped(value: float) -> str:
 
 
 def count(n: int, noun: str) -> str:
-    """Return a number with its noun, in the plural unless it is 1; nouns of terminals are English."""
+    """Return a number with its noun, in the plural unless it is 1."""
     one, many = _COUNTED.get(noun, (f"{{n}} {noun}", f"{{n}} {noun}s"))
     return tr_either(one, many, n).format(n=_grouped(n))
 

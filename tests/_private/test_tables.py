@@ -10,7 +10,7 @@ import pytest
 
 from lmshealth._private.tables import RUN_TABLES, SHARED, TABLES, Column, Table
 from lmshealth.report.text import cells, first_field, view_columns
-from tests.tools import columns as page
+from tests.tools import columns
 
 _SUFFIXES = {
     "_hz": "Hz", "_km": "km", "_um": "µm", "_nm": "nm", "_mm_s": "mm/s", "_mm_s2": "mm/s²",
@@ -44,17 +44,18 @@ def test_columns_have_meanings_and_shared_ones_are_used() -> None:
 def test_views_have_formats(name: str) -> None:
     """Every heading of a view has a value to show, and headings are unique."""
     for view in TABLES[name].shown.values():
-        columns = view_columns(view)
-        assert len(columns) == view.count("|") + 1
-        assert all(first_field(form) for form in columns.values())
+        forms = view_columns(view)
+        assert len(forms) == view.count("|") + 1
+        assert all(first_field(form) for form in forms.values())
 
 
 def test_the_page_of_all_columns_is_current() -> None:
     """TABLES.md is what the specification makes; `python -m tests.tools.columns` writes it."""
-    assert page.PAGE.read_text(encoding="utf-8") == page.page()
+    text = columns.pages()["TABLES.md"]
+    assert (columns.REPORT / "TABLES.md").read_text(encoding="utf-8") == text
     for name, table in TABLES.items():
-        assert f"**{name}{'.csv' if name in RUN_TABLES else ''}**" in page.page()
-        assert all(f"`{column}`" in page.page() for column in table.names)
+        assert f"**{name}{'.csv' if name in RUN_TABLES else ''}**" in text
+        assert all(f"`{column}`" in text for column in table.names)
 
 
 def test_rows_need_a_value_for_every_column() -> None:

@@ -1,4 +1,4 @@
-"""Write ``lmshealth/report/TABLES.md``, the columns of all tables, from their specification.
+"""Write ``TABLES.md`` and ``REFUSALS.md`` of ``lmshealth/report`` from ``_private/tables.toml``.
 
 ``python -m tests.tools.columns`` does so. Columns that are the same in many tables are explained
 once.
@@ -9,9 +9,27 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from lmshealth._private.tables import RUN_TABLES, SHARED, TABLES, Table
+from lmshealth._private.tables import REFUSALS, RUN_TABLES, SHARED, TABLES, Table
+from lmshealth.io.log import WARNINGS
 
-PAGE = Path(__file__).parents[2] / "lmshealth" / "report" / "TABLES.md"
+REPORT = Path(__file__).parents[2] / "lmshealth" / "report"
+_KINDS = {
+    "log": "Logs",
+    "channel": "Channels of a log that is used",
+    "warning": "Warnings: it is used nevertheless",
+    "mode": "Modes of a log that is used",
+    "blow": "Blows of an impact test",
+    "row": "Rows of tables",
+}
+_OF_REFUSALS = """\
+# Refusals: cause and cure
+
+<!-- Written by `python -m tests.tools.columns` from ../_private/tables.toml; edit that file. -->
+
+Every code in the column `reason` of `refused.csv`, of `BadLog.reason` and of `Refusal.reason`. The
+detail beside it states what was found and what is needed. What is refused is listed on the page of
+the machine too, and does not end a run ([exit status](../cli/README.md#exit-status)). Limits are in
+`constants.py` of [io](../io/README.md) and [modal](../modal/README.md)."""
 _HEAD = ["", "| column | unit or type | meaning |", "| --- | --- | --- |"]
 _OPENING = """\
 # Columns of all tables
@@ -31,13 +49,29 @@ an option, are there where they are needed.
 
 
 def main() -> None:
-    """Write the page."""
-    PAGE.write_text(page(), encoding="utf-8", newline="\n")
+    """Write the pages."""
+    for name, text in pages().items():
+        (REPORT / name).write_text(text, encoding="utf-8", newline="\n")
 
 
-def page() -> str:
-    """Return the text of the page."""
-    return "".join(f"{line}\n" for line in _lines())
+def pages() -> dict[str, str]:
+    """Return the texts of the pages by the names of their files."""
+    found = {"TABLES.md": _lines(), "REFUSALS.md": _refusals()}
+    return {name: "".join(f"{line}\n" for line in lines) for name, lines in found.items()}
+
+
+def _refusals() -> Iterator[str]:
+    """Yield a section per code, so that each has an address of its own."""
+    yield _OF_REFUSALS
+    for kind, title in _KINDS.items():
+        yield from ("", f"## {title}")
+        for code, one in REFUSALS.items():
+            if one.what == kind:
+                flag = WARNINGS.get(code)
+                yield from ("", f"### {code}", "", f"*Cause:* {_begun(one.cause)}.", "")
+                yield f"*Cure:* {_begun(one.cure)}."
+                if flag:
+                    yield from ("", f"Modes that it may change have the flag `{flag}`.")
 
 
 def _lines() -> Iterator[str]:
@@ -54,6 +88,11 @@ def _lines() -> Iterator[str]:
                 for column, meanings in table.values.items():
                     yield from ("", f"Values of `{column}`:", "")
                     yield from (f"- `{value}`: {meaning}" for value, meaning in meanings.items())
+
+
+def _begun(text: str) -> str:
+    """Begin a text with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def _rows(table: Table) -> Iterator[str]:
