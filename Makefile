@@ -7,7 +7,7 @@ DEMO := demo
 # Of `make fuzz`: seconds in which files are damaged and read.
 SECONDS ?= 60
 
-.PHONY: demo notebooks picture check test long slow studies coverage statistics bench fuzz lock locked sbom clean
+.PHONY: demo notebooks site picture check test long slow studies coverage statistics bench fuzz lock locked sbom clean
 
 demo: .venv/installed
 	@rm -rf $(DEMO)
@@ -27,6 +27,12 @@ notebooks: .venv/installed
 	$(BIN)/jupytext --set-kernel python3 --to ipynb --execute --run-path . studies/notebooks/*.py
 	@mv studies/notebooks/*.ipynb $(DEMO)/notebooks/
 	$(BIN)/jupyter nbconvert --to html $(DEMO)/notebooks/*.ipynb
+
+# The documentation as a site in demo/site, with executed notebooks; a broken link fails.
+site: notebooks
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable ".[docs]"
+	$(BIN)/python -m tests.tools.site.pages $(DEMO)/site-source
+	$(BIN)/sphinx-build -W --keep-going -q -b html -c tests/tools/site $(DEMO)/site-source $(DEMO)/site
 
 # Linters, types, layers of the packages.
 check: .venv/installed

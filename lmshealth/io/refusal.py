@@ -12,8 +12,8 @@ _MOST_LISTED = 12
 class Unusable(Exception):
     """A file that cannot be used; `read_log` turns it into a ``BadLog`` with the file's name.
 
-    The reason is the code in ``refused.csv`` (report/REFUSALS.md has all); the detail is what was found,
-    what is needed, and the next step.
+    The reason is the code in ``refused.csv`` (report/REFUSALS.md has all); the detail is what was
+    found, what is needed, and the next step.
     """
 
     def __init__(self, reason: str, detail: str) -> None:
