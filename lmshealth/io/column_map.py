@@ -19,7 +19,8 @@ from lmshealth._private.files import read_table
 from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.metadata import KEYS, as_text
+from lmshealth.io.covariates import metadata_keys
+from lmshealth.io.metadata import as_text
 from lmshealth.io.refusal import Unusable, listed, repeated
 
 Role = Literal[
@@ -266,8 +267,10 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
             if plain := [text for text in _PLAIN_TABLES if self.recognises(text)]:
                 needed = "needed lines that only files of this layout have"
                 faults.append(f"recognise: also fits other tables, as {plain[0][:40]!r}; {needed}")
-        if unknown := sorted(set(self.metadata) - set(KEYS)):
-            faults.append(f"metadata: got {listed(unknown)}; known keys are {listed(KEYS)}")
+        if unknown := sorted(set(self.metadata) - set(metadata_keys())):
+            faults.append(
+                f"metadata: got {listed(unknown)}; known keys are {listed(metadata_keys())}"
+            )
         if faults:
             raise ValueError("; ".join(faults))
 
@@ -410,8 +413,10 @@ def _check(columns: ColumnMap) -> None:
         raise ValueError(f"[columns] reads one column twice: {listed(twice)}")
     for target in columns.units:
         columns.signal(target)
-    if unknown := sorted(set(columns.metadata) - set(KEYS)):
-        raise ValueError(f"[metadata] has {listed(unknown)}; known keys are {listed(KEYS)}")
+    if unknown := sorted(set(columns.metadata) - set(metadata_keys())):
+        raise ValueError(
+            f"[metadata] has {listed(unknown)}; known keys are {listed(metadata_keys())}"
+        )
     if columns.sample_rate_hz is not None and "sample_rate_hz" in columns.metadata:
         raise ValueError("sample_rate_hz is given twice, at the top and in [metadata]")
     for key, value in columns.metadata.items():

@@ -10,6 +10,7 @@ from lmshealth._private.arrays import freeze
 from lmshealth._private.result import Result
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples
+from lmshealth.io.covariates import covariates
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
 _SUFFIXES = {"displacement": "m", "acceleration": "m_s2", "current": "a"}
@@ -32,7 +33,8 @@ def possible(key: str) -> str:
 def low_high(key: str) -> tuple[float, float]:
     """Return the range of the numbers of a key."""
     most = constants.LARGEST_NUMBER
-    return constants.RANGES.get(key, (-most, most))
+    known = constants.RANGES.get(key) or covariates().get(key)
+    return known or (-most, most)
 
 
 def expect_moment(moment: datetime) -> None:

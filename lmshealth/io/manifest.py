@@ -10,9 +10,9 @@ from typing import NamedTuple
 from lmshealth._private.files import escapes
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
+from lmshealth.io.covariates import metadata_keys
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log
 from lmshealth.io.log import Refusal
-from lmshealth.io.metadata import KEYS
 from lmshealth.io.refusal import Unusable, shown
 from lmshealth.io.tables import read_sheet
 
@@ -200,7 +200,7 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         if outside or (not follow_links and escapes(log, root)):
             yield Refusal(shown(file), "escapes", f"{place} names a file out of the folder")
             continue
-        row = {key: cells[key] for key in KEYS if cells.get(key)}
+        row = {key: cells[key] for key in metadata_keys() if cells.get(key)}
         if own.setdefault(log, row) != row:
             trouble = trouble or f"{shown(file)} has another row already; keep one of them"
         if trouble:

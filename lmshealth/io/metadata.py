@@ -9,21 +9,9 @@ from datetime import UTC, date, datetime, timedelta
 import numpy as np
 
 from lmshealth.io import constants
+from lmshealth.io.covariates import covariates, metadata_keys
 from lmshealth.io.log import MOMENTS, Metadata, expect_moment, expect_possible, possible
 from lmshealth.io.refusal import Unusable
-
-COVARIATES = ("temperature_c", "payload_kg", "position_mm")
-KEYS = (
-    "stage",
-    "recorded_at",
-    "travel_km",
-    "sample_rate_hz",
-    *COVARIATES,
-    "servo_id",
-    "baseline",
-    "description",
-    "velocity_mm_s",
-)
 
 # Characters that no name has, as a class of regular expressions: control and bidirectional ones,
 # and those that nobody sees (soft hyphens, fillers, byte order marks, tags, selectors of variants).
@@ -43,7 +31,7 @@ def parse_metadata(
     The sample rate in Hz is returned beside the rest. `Unusable` (``metadata``, or ``future`` for a
     moment after `latest`, see `parse_moment`) names key and value.
     """
-    given = {key: text[key].strip() for key in KEYS if text.get(key, "").strip()}
+    given = {key: text[key].strip() for key in metadata_keys() if text.get(key, "").strip()}
     travel, velocity = _number(given, "travel_km"), _number(given, "velocity_mm_s")
     if (flag := given.get("baseline", "").lower()) and flag not in _BOOLEANS:
         raise _bad(given, "baseline", "true or false")
@@ -51,7 +39,9 @@ def parse_metadata(
         stage=parse_name(given, "stage"),
         recorded_at=parse_moment(given, latest),
         travel=None if travel is None else 1e3 * travel,
-        covariates={key: value for key in COVARIATES if (value := _number(given, key)) is not None},
+        covariates={
+            key: value for key in covariates() if (value := _number(given, key)) is not None
+        },
         servo_id=parse_name(given, "servo_id"),
         baseline=_BOOLEANS.get(flag),
         description=parse_name(given, "description"),

@@ -13,8 +13,8 @@ import numpy as np
 
 from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
+from lmshealth.io.covariates import covariates
 from lmshealth.io.log import Refusal
-from lmshealth.io.metadata import COVARIATES
 from lmshealth.machine.notices import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
@@ -104,16 +104,17 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
     """Return the estimates of one log, one row per mode, with a column per channel of a shape."""
     metadata, modes, error = reading.metadata, reading.modes, reading.loop_error
     of_log = {
-        **{name: metadata.covariates.get(name) for name in COVARIATES},
+        **{name: metadata.covariates.get(name) for name in covariates()},
         "log": reading.log,
         "travel_km": None if metadata.travel is None else metadata.travel / _KM,
         "delta_e_below_40hz_um": None if error is None else error / _MICRO,
         "sample_rate_hz": reading.sample_rate,
     }
     rows = [TABLES["modes"].read(metadata, **of_log, **own) for own in to_rows(modes.to_columns())]
+    further = {key: value for key, value in of_log.items() if key not in TABLES["modes"].names}
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
         channels = zip(modes.shape_channels, shape, strict=True)
-        row |= {f"shape_{channel}": part for channel, part in channels}
+        row |= further | {f"shape_{channel}": part for channel, part in channels}
     return rows
 
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:  # above, so that --help needs no scipy
 
 _KM = 1000.0
 GAP = "\u202f"  # narrow no-break space between a number and its unit, and between thousands
-_UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB"}
+_UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB", "percent": "%"}
 
 Number = float | np.floating[Any]
 

@@ -16,8 +16,8 @@ import pandas as pd
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
+from lmshealth.io.covariates import covariates as known_covariates
 from lmshealth.io.log import Metadata, Refusal
-from lmshealth.io.metadata import COVARIATES
 from lmshealth.io.tables import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
@@ -76,7 +76,7 @@ def read_estimates(
     are refused.
     """
     table = _read(path, _NEEDED, "estimate")
-    covariates = [*COVARIATES]
+    covariates = [*known_covariates()]
     if stage is not None:
         covariates += [c.name for c in stage.description.covariate if c.name not in covariates]
     shapes = [name for name in table.columns if name.startswith(_SHAPE)]

@@ -27,6 +27,7 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
 from lmshealth.io.column_map import ColumnMap, role_of
+from lmshealth.io.covariates import metadata_keys
 from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
     Content,
@@ -37,7 +38,7 @@ from lmshealth.io.formats.content import (
     not_numeric,
     wanted,
 )
-from lmshealth.io.metadata import KEYS, as_text
+from lmshealth.io.metadata import as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -51,7 +52,7 @@ def _load_hdf5(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         # A name that is no text comes as bytes.
         names = [n.decode("utf-8", "replace") if isinstance(n, bytes) else n for n in file]
         chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
-        metadata = {key: _attribute(file, key) for key in KEYS if key in file.attrs}
+        metadata = {key: _attribute(file, key) for key in metadata_keys() if key in file.attrs}
         check_size(8 * sum(dataset.size for dataset in chosen.values()), path.stat().st_size)
         taken = {name: Spool(dataset.size) for name, dataset in chosen.items()}
         for name, dataset in chosen.items():
@@ -230,7 +231,7 @@ def _load_mat(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     names = [name for name, _, _ in variables]
     chosen = _chosen(names, columns)
     stored, n_samples = path.stat().st_size, 0
-    if not chosen - set(KEYS) and (channels := _testlab(path, variables, max_memory)):
+    if not chosen - set(metadata_keys()) and (channels := _testlab(path, variables, max_memory)):
         found, content = choose([channel for channel, _ in channels], columns)
         samples = {name: as_samples(channels[k][1]) for name, k in found.items()}
         return replace(content, columns=samples)
@@ -255,7 +256,7 @@ def _load_mat(path: Path, columns: ColumnMap, max_memory: float) -> Content:
                 # MATLAB stores whole numbers in fewer bytes than they take here.
                 check_size(8 * n_samples, stored)
                 read[name] = as_samples(_series(name, array))
-            elif name in KEYS:
+            elif name in metadata_keys():
                 metadata[name] = _text(name, array)
     present += [name for name in names if name not in chosen]
     return Content(read, metadata, tuple(present))
@@ -280,7 +281,7 @@ def _check_claim(
     name: str, shape: tuple[int, ...], kind: str, stored: int, max_memory: float
 ) -> None:
     """Refuse a variable by its header, before memory is taken for it."""
-    if kind in _OTHERS and name not in KEYS:
+    if kind in _OTHERS and name not in metadata_keys():
         raise not_numeric(name, _OTHERS[kind])
     if min(shape, default=0) < 0:
         raise corrupt(f"variable {name[:80]!r} has impossible dimensions")
@@ -297,7 +298,7 @@ def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
             raise Unusable("columns", detail + listed(names))
     else:
         roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
-        known = roots | set(KEYS)
+        known = roots | set(metadata_keys())
         chosen = {name for name in names if name in known or columns.target(name)}
     if twice := repeated(name for name in names if name in chosen):
         raise Unusable("columns", f"the file holds {listed(twice)} more than once")

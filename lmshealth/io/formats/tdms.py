@@ -18,6 +18,7 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, role_of
+from lmshealth.io.covariates import metadata_keys
 from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
     Content,
@@ -27,7 +28,7 @@ from lmshealth.io.formats.content import (
     library,
     not_numeric,
 )
-from lmshealth.io.metadata import KEYS, as_text
+from lmshealth.io.metadata import as_text
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _MAGIC = b"TDSm"
@@ -81,7 +82,9 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         read |= {} if stamps is None else {"time_s": stamps}
         starts = [since.first for since in times.values()]
         starts += [channel.properties.get("wf_start_time") for channel in wanted.values()]
-        own = {key: as_text(file.properties[key]) for key in KEYS if key in file.properties}
+        own = {
+            key: as_text(file.properties[key]) for key in metadata_keys() if key in file.properties
+        }
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
     metadata = ({} if start is None else {"recorded_at": as_text(start)}) | clock | own
     return replace(content, columns=read, metadata=metadata)
