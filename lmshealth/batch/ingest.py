@@ -21,6 +21,7 @@ from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
+from lmshealth.io.covariates import SHIPPED, covariates
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
@@ -137,7 +138,8 @@ class _Task:
     def key(self, description: str) -> str:
         """Return the fingerprint of all that the outcome of the log depends on."""
         as_read = format_name(self.path), sorted(self.overrides.items()), self.columns
-        return fingerprint(VERSION, self.digest, *as_read, description)
+        own = [key for key in covariates() if key not in SHIPPED]  # of installed packages
+        return fingerprint(VERSION, self.digest, *as_read, description, *own)
 
 
 class _Outcome(NamedTuple):

@@ -13,7 +13,7 @@ GROUP = "lmshealth.covariates"
 
 Key = tuple[str, float, float]
 
-_SHIPPED = ("temperature_c", "payload_kg", "position_mm")
+SHIPPED = ("temperature_c", "payload_kg", "position_mm")
 OTHER_KEYS = (
     *("stage", "recorded_at", "travel_km", "sample_rate_hz"),
     *("servo_id", "baseline", "description", "velocity_mm_s"),
@@ -27,7 +27,7 @@ def covariates() -> Mapping[str, tuple[float, float]]:
 
     They are found on first use: a package that offers one may import this one.
     """
-    shipped = [(key, *constants.RANGES[key]) for key in _SHIPPED]
+    shipped = [(key, *constants.RANGES[key]) for key in SHIPPED]
     return {
         key: (low, high) for key, low, high in load_plug_ins(GROUP, "covariate", shipped, _checked)
     }

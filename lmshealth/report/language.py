@@ -137,8 +137,11 @@ def _templates(chosen: Language) -> list[tuple[str, str, str]]:
     from babel.messages.mofile import read_mo
 
     with _file(chosen) as file:
-        found = [(one.context or "", one.id, one.string) for one in read_mo(file)]
-    return [one for one in found if isinstance(one[1], str) and isinstance(one[2], str)]
+        return [
+            (one.context or "", one.id, one.string)
+            for one in read_mo(file)
+            if isinstance(one.id, str) and isinstance(one.string, str)
+        ]
 
 
 @cache

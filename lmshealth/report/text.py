@@ -228,7 +228,7 @@ def km(metres: Number) -> str:
 
 def whole_km(metres: Number) -> str:
     """Format a distance given in m to the kilometre."""
-    return f"{_grouped(metres / _KM)}{GAP}km"
+    return f"{_grouped(float(metres) / _KM)}{GAP}km"
 
 
 def travel_left(metres: float, horizon: float) -> str:

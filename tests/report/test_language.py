@@ -289,8 +289,9 @@ def test_pages_have_no_english_words(make: Maker, tmp_path: Path, language: Any)
         of_day = on_day(summary, status, summary.recorded_at.date() + timedelta(days))
         with speaking(language):
             page = date_page(make_page(made, summary, before=before), of_day, status)
-            index = write_index(tmp_path, [of_day], made.refused).read_text(encoding="utf-8")
-        found[name] = english(page, known) | english(index, known)
+            index = write_index(tmp_path, [of_day], made.refused)
+        row = english(index.read_text(encoding="utf-8"), known)
+        found[name] = found.get(name, set()) | english(page, known) | row
         assert f'<html lang="{language}">' in page
         if name == "worn":
             as_it_was = date_page(make_page(made, summary), of_day, status)

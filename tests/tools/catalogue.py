@@ -29,7 +29,7 @@ KEYWORDS: dict[str | None, dict[str, Any]] = {
     None: {"tr": None, "mark": None, "tr_either": (1, 2), "mark_either": (1, 2)},
     FACT: {"fact": None},
 }
-IN_TEMPLATES: dict[str, Any] = {"_": None, "_n": (1, 2)}
+IN_TEMPLATES = ("_", "_n")
 # Lines of the header: dates, and placeholders for people.
 _LEFT_OUT = (
     *(b"POT-Creation-Date", b"PO-Revision-Date", b"Generated-By", b"Copyright", b"FIRST AUTHOR"),
@@ -95,9 +95,9 @@ def messages() -> Iterator[tuple[Any, str, str | None]]:
         with file.open("rb") as content:
             for _, function, found, _ in babel_extract(content, IN_TEMPLATES, [], {}):
                 texts = found if isinstance(found, tuple) else (found,)  # of all arguments
-                message = texts[:2] if function == "_n" else texts[0]
-                if message is not None:  # a word that is marked elsewhere
-                    yield message, f"lmshealth/report/templates/{file.name}", None
+                of_template = texts[:2] if function == "_n" else texts[0]
+                if of_template is not None:  # a word that is marked elsewhere
+                    yield of_template, f"lmshealth/report/templates/{file.name}", None
     place = "lmshealth/_private/tables.toml"
     for table in TABLES.values():
         if "page" in table.shown:

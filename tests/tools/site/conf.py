@@ -13,7 +13,6 @@ html_title = f"lmshealth {release}"
 html_show_sphinx = False
 html_copy_source = False
 html_show_search_summary = False  # a page in a folder may not read others
-html_static_path = []
 
 # Anchors of headings as on the pages of a repository; links to missing ones are warnings.
 myst_heading_anchors = 4
