@@ -8,14 +8,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from studies.harness.metrics import (
-    clopper_pearson,
-    crps,
-    place,
-    service_at,
-    unexpected_breaks,
-)
-from studies.harness.study import judge_places
+from lmshealth.calibration.ranks import clopper_pearson, judge_places, place
+from studies.harness.metrics import crps, service_at, unexpected_breaks
 from tests.oracles import check_coverage
 
 NEVER = np.inf
