@@ -48,9 +48,14 @@ test: .venv/installed
 long: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "study or slow or statistical"
 
-# Quick forms of all studies: the questions of studies/README.md on few data.
+# Quick forms of all studies: the questions of studies/README.md on few data. With FULL=1 all are
+# recorded in full, which takes a night; an interrupted run goes on where it was.
 studies: .venv/installed
+ifdef FULL
+	$(BIN)/python -m studies.harness.full
+else
 	$(BIN)/pytest -n 2 --dist worksteal -m study
+endif
 
 # Tests of seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed

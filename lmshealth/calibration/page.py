@@ -39,6 +39,7 @@ class Picture:
     title: str
     svg: str
     caption: str
+    kind: str = ""  # class of the figure in the style sheet
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,10 +77,8 @@ def rank_histogram(ax: Axes, places: ArrayLike) -> Axes:
     colours = [RED if out else BLUE for out in outside]
     ax.bar(edges[:-1], counts, width=1 / bins, align="edge", color=colours, ec="#fefefe", lw=0.7)
     ax.set(xlim=(0, 1), ylim=(0, 1.15 * max(high, counts.max(initial=0))))
-    ax.set_xticks([0, 0.5, 1], ["truth below all draws", "in the middle", "above all"])
-    for label, side in zip(ax.get_xticklabels(), ("left", "center", "right"), strict=True):
-        label.set_horizontalalignment(side)
-    ax.set_ylabel("lives" if n else "")
+    ax.set_xticks([0, 0.5, 1], ["below all", "middle", "above all"])
+    ax.set(xlabel="true value among the values held possible", ylabel="number")
     ax.grid(visible=False)
     return ax
 
@@ -111,7 +110,8 @@ def share_picture(
 ) -> Picture:
     """Draw shares with a caption."""
     size = (9.2 if wide else 4.5, 0.9 + 0.26 * len(rows))
-    return Picture(title, svg(lambda ax: share_plot(ax, rows), salt=salt, size=size), caption)
+    text = svg(lambda ax: share_plot(ax, rows), salt=salt, size=size)
+    return Picture(title, text, caption, "wide-figure" if wide else "")
 
 
 def render_page(
@@ -158,7 +158,10 @@ def expectation_rows(check: CalibrationCheck) -> list[dict[str, str]]:
         row = {"lives": kind, "quantity": _spelled(quantity), "n": str(own[0].n)}
         row |= {f"{100 * one.level:.0f}{GAP}% hold": _measured(one) for one in own}
         wrong = [f"{100 * x.level:.0f}{GAP}%: {x.verdict}" for x in own if x.verdict != "as stated"]
-        row |= {"median width": _width(own[-1]), "": ", ".join(wrong) or "as stated"}
+        row |= {
+            f"median width at {100 * own[-1].level:.0f}{GAP}%": _width(own[-1]),
+            "": ", ".join(wrong) or "as stated",
+        }
         rows.append(row)
     return rows
 

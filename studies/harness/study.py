@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from lmshealth.calibration.ranks import NOMINAL, judge_coverage
-from studies.harness.provenance import code_of, name_of
+from studies.harness.provenance import code_of, commit, machine, name_of
 
 Row = dict[str, Any]
 Work = Callable[..., Any]
@@ -85,18 +85,22 @@ class Study:
             reasons = {check: why for check, why in not_met.items() if check in failed}
             answer = {**answer, "not_met": reasons}
         print(json.dumps(answer, indent=1))
+        wrong = sorted(set(failed) - set(not_met))
         if not self.quick:
-            self._write(record_of(self._script), {**answer, **(details or {})})
-        if not set(failed) <= set(not_met) and not (self.quick and quick_may_fail):
+            self._write(record_of(self._script), {**answer, **(details or {})}, wrong)
+        if wrong and not (self.quick and quick_may_fail):
             raise SystemExit(f"not as asked: {failed}")
 
-    def _write(self, path: Path, answer: Mapping[str, Any]) -> None:
+    def _write(self, path: Path, answer: Mapping[str, Any], failed: list[str]) -> None:
         """Write a record: results, versions, and run time with that of kept trials."""
         content = {
             "question": self._question,
             **answer,
             "recorded": {
                 "date": datetime.now(UTC).date().isoformat(),
+                "commit": commit(),
+                "machine": machine(),
+                "failed": failed,
                 "python": platform.python_version(),
                 **{name: version(name) for name in _PACKAGES},
                 "wall_s": round(time.perf_counter() - self._wall, 1),
