@@ -1,5 +1,6 @@
 """Calibration of a stage description: lives drawn from it, through the chain of real logs."""
 
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -132,6 +133,11 @@ class CalibrationCheck(Result):
     def wrong(self) -> tuple[str, ...]:
         """Names of the checks that are not as stated."""
         return tuple(name for name, fine in self.passed.items() if not fine)
+
+    @property
+    def without_result(self) -> dict[str, int]:
+        """Reasons of lives without a posterior, and how many lives have them."""
+        return dict(Counter(one.failed for one in self.outcomes if one.failed))
 
     @property
     def blind(self) -> tuple[str, ...]:

@@ -197,6 +197,7 @@ def _blocks(check: CalibrationCheck) -> Iterator[Block]:
             "“as described” has lives of all kinds as often as the description expects them; only "
             "there coverage must be as stated. In lives of one kind alone it may be higher or "
             "lower, which is shown beside it. In brackets: 95 % Monte-Carlo interval.",
+            *(f"Without a result are {k} lives: {why}." for why, k in check.without_result.items()),
         ),
         [
             share_picture(

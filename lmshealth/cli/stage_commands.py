@@ -7,6 +7,7 @@ from typing import Any
 import click
 
 from lmshealth.cli import options, terminal, views
+from lmshealth.errors import NotEnoughData
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
@@ -162,6 +163,10 @@ def check_calibration(
     if not outcomes and interrupted:
         raise interrupted
     found = check.summarise(described, resolved, outcomes, seed=seed)
+    without = [f"{n} lives have no result: {why}" for why, n in found.without_result.items()]
+    if not found.coverage:
+        raise NotEnoughData(f"{found.stage}: {'; '.join(without)}; correct description or schedule")
+    terminal.print_notes(without)
     report = page.write_results(out, found) if out else None
     if style == "json":
         terminal.print_json(page.document(found))

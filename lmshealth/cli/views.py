@@ -1,5 +1,7 @@
 """Terminal output of results: logs, stage descriptions, plans, tracks, health, remaining life."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from datetime import date
