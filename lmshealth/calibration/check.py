@@ -34,7 +34,6 @@ from lmshealth.life.verdict import (
 from lmshealth.machine.service import decide, remaining_days
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
-from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import accepted_estimates, track
 
@@ -465,8 +464,7 @@ def _rates(kind: str, lives: Sequence[LifeOutcome], stage: Stage) -> Iterator[Ra
     if kind == "foreign change":
         yield from rate("reported as outside the map", (o.verdict == OUTSIDE_MAP for o in sound))
     if kind == "healthy":
-        alarms = (one.alarm is not None for one in done)
-        yield from rate("alarm of the tracker (false)", alarms, at_most=FALSE_ALARM_PROBABILITY)
+        yield from rate("alarm of the tracker (false)", (o.alarm is not None for o in done))
     if kind == "wearing":
         for low, high in pairwise(constants.LOSSES):
             found = [

@@ -21,6 +21,7 @@ from lmshealth.report.figures import BLUE, INK, MUTED, RED, svg
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import csv_text
 from lmshealth.report.text import GAP, coarse, percent
+from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -298,6 +299,9 @@ def _detection(check: CalibrationCheck) -> Block:
     text = (
         "What is reported of lives whose truth is known. A loss is the share of its baseline that "
         "a parameter has truly lost at the last log.",
+        f"The tracker declares {percent(FALSE_ALARM_PROBABILITY)} of false alarms for healthy "
+        "machines whose modes wander as little as its own model has it. Some of these lives wander "
+        "more, which raises alarms and no verdict.",
     )
     return Block("What is detected, and what is reported by mistake", text, pictures,
                  rate_rows(check.rates))  # fmt: skip

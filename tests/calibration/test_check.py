@@ -114,13 +114,14 @@ def test_too_few_lives_are_named_as_that() -> None:
 
 
 def test_rates_are_held_to_what_is_stated() -> None:
-    """Alarms of healthy lives and limits before the service date may not be more frequent."""
+    """Limits before the service date may not be more frequent than the accepted risk."""
     assert not any(one.exceeded for one in summary(outcomes(100, late=0.04)).rates)
     found = summary(outcomes(100, alarms=0.1, late=0.3))
-    assert {one.what for one in found.rates if one.exceeded} == {
-        "alarm of the tracker (false)", "limit reached before the service date",
-    }  # fmt: skip
-    assert len(found.wrong) == 2
+    late = "limit reached before the service date"
+    assert {one.what for one in found.rates if one.exceeded} == {late}
+    assert found.wrong == (f"{DRAWN}: {late}",)
+    alarms = next(one for one in found.rates if one.what == "alarm of the tracker (false)")
+    assert (alarms.hits, alarms.n) == (10, 100)
 
 
 def test_a_life_without_posterior_counts_as_unpublished(
