@@ -66,9 +66,10 @@ coverage: .venv/installed
 	$(BIN)/pytest -n 2 -m "not slow and not study and not statistical" \
 		--cov=lmshealth --cov-fail-under=95
 
-# Calibration of errors and intervals; LMSHEALTH_SEED=7 draws other data.
+# Calibration of errors and intervals, with a page of ranks and coverages; LMSHEALTH_SEED=7 draws
+# other data.
 statistics: .venv/installed
-	$(BIN)/pytest -n 2 --dist worksteal -m statistical
+	LMSHEALTH_STATISTICS=$(DEMO)/statistics.html $(BIN)/pytest -n 2 --dist worksteal -m statistical
 
 # Speed of every step relative to a peer, recorded in studies/cost/ratios/result.json.
 bench: .venv/installed

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
 import numpy as np
@@ -55,13 +55,22 @@ class Block:
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """A share with its 95 % interval, beside what is stated."""
+    """A share with its 95 % interval, beside what is stated: ``as``, at ``most`` or ``least``."""
 
     label: str
     share: float
     low: float
     high: float
     stated: float | None = None
+    side: Literal["as", "most", "least"] = "as"
+
+    @property
+    def missed(self) -> bool:
+        """Whether the interval lies on the wrong side of what is stated."""
+        if self.stated is None:
+            return False
+        above, below = self.low > self.stated, self.high < self.stated
+        return (above and self.side != "least") or (below and self.side != "most")
 
 
 def rank_histogram(ax: Axes, places: ArrayLike) -> Axes:
@@ -87,8 +96,7 @@ def rank_histogram(ax: Axes, places: ArrayLike) -> Axes:
 def share_plot(ax: Axes, rows: Sequence[Share]) -> Axes:
     """Plot shares with their intervals, and dashed lines where they are stated."""
     for y, one in enumerate(rows):
-        missed = one.stated is not None and not one.low <= one.stated <= one.high
-        colour = RED if missed else BLUE
+        colour = RED if one.missed else BLUE
         ax.plot([100 * one.low, 100 * one.high], [y, y], color=colour, lw=5, alpha=0.45)
         ax.plot(100 * one.share, y, "o", ms=5, color=colour)
         if one.stated is not None:
@@ -281,7 +289,9 @@ def _detection(check: CalibrationCheck) -> Block:
         for one in rates
     ]  # fmt: skip
     false = [one for one in check.rates if "(false)" in one.what or one.at_most is not None]
-    alarms = [Share(f"{o.kind}: {o.what}"[:70], o.share, o.low, o.high, o.at_most) for o in false]
+    alarms = [
+        Share(f"{o.kind}: {o.what}"[:70], o.share, o.low, o.high, o.at_most, "most") for o in false
+    ]
     pictures = []
     if rows:
         caption = (
