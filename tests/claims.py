@@ -112,10 +112,11 @@ class Claims:
 
     def rows(self) -> list[dict[str, Any]]:
         """Write the claims down for the judgement of the whole suite."""
+        none = float("nan")
         return [
             {"name": f"{self.link}: {name}", "p": float(p), "trials": self.trials,
-             "level": self.level, "of": self.of, "control": float(self.controls.get(name, float("nan"))),
-             **_kept(p), "wrong": _kept(self.controls.get(name, 1.0))}
+             "level": self.level, "of": self.of, "control": float(self.controls.get(name, none)),
+             **_kept(p), "wrong": _kept(self.controls.get(name, none))}
             for name, p in self.p.items()
         ]  # fmt: skip
 
