@@ -37,7 +37,7 @@ def test_the_page_has_all_claims(
 ) -> None:
     """Figures say what good looks like; shares have intervals, claims p values and controls."""
     made, target = rows(), tmp_path / "page.html"
-    write_page(target, made, [(0.003, rejected), (0.005, False), (0.01, False)], failed=failed)  # type: ignore[arg-type]
+    write_page(target, made, [(0.003, rejected), (0.005, False), (0.01, False)], failed=failed)
     page = target.read_text(encoding="utf-8")
     assert headline in page
     assert ("REJECTED" in page) == rejected
@@ -54,7 +54,7 @@ def test_the_page_has_all_claims(
 def test_some_claims_are_not_all(tmp_path: Path) -> None:
     """A run of some tests holds no more than these."""
     made = rows()[:1]
-    write_page(tmp_path / "page.html", made, [(0.003, False)], failed=False)  # type: ignore[arg-type]
+    write_page(tmp_path / "page.html", made, [(0.003, False)], failed=False)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "Claims that were tested hold" in text
     assert "1 of 3 claims" in text

@@ -1,7 +1,7 @@
 """Calibration of a stage description: lives drawn from it, through the chain of real logs."""
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -204,7 +204,7 @@ def check_calibration(
 
 def draw_outcomes(
     stage: Stage, schedule: Schedule, *, lives: int, seed: int, workers: int
-) -> Iterator[tuple[LifeOutcome, int]]:
+) -> Generator[tuple[LifeOutcome, int], None, None]:
     """Yield the outcome of each life when it is there, with the number of all lives."""
     if lives < 1:
         raise BadQuestion(f"{lives} lives: needed is at least 1")

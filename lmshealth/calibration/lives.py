@@ -71,23 +71,20 @@ class Schedule:
 
 def _median_life(stage: Stage) -> float:
     """Return the least median travel in m to a limit by the laws of a parameter, each by itself."""
-    rng, medians = np.random.default_rng(0), []
+    rng, n = np.random.default_rng(0), constants.N_LIVES
+    medians = [stage.description.usage.horizon_km * KM]
     for _, parameter in parameters_with_limit(stage):
         assert parameter.limit is not None
-        lives, weights = [], []
-        for law, weight in laws_of(parameter, 0.0):
-            if law.names:
-                path = DegradationPath(law, 0.0, ())
-                theta = path.natural(path.draw(rng, constants.N_LIVES, KM), KM)
-                lives.append(path.passage(theta, parameter.limit.below / parameter.baseline))
-                weights.append(np.full(constants.N_LIVES, weight))
-        if lives:
-            ordered, weight = np.concatenate(lives), np.concatenate(weights)
-            order = np.argsort(ordered)
-            half = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
-            medians.append(float(ordered[order][half]))
-    horizon = stage.description.usage.horizon_km * KM
-    return min([one for one in medians if np.isfinite(one)], default=horizon)
+        limit = parameter.limit.below / parameter.baseline
+        laws = [(law, weight) for law, weight in laws_of(parameter, 0.0) if law.names]
+        ends = []
+        for law, weight in laws:
+            path, share = DegradationPath(law, 0.0, ()), weight / sum(own for _, own in laws)
+            theta = path.natural(path.draw(rng, int(np.ceil(share * n)), KM), KM)
+            ends.append(path.passage(theta, limit))
+        if ends:
+            medians.append(float(np.median(np.concatenate(ends))))
+    return min(medians)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -16,11 +16,6 @@ from functools import cache
 from typing import Any
 
 import numpy as np
-from arviz_stats.ecdf_utils import (
-    compute_ecdf,
-    get_pointwise_confidence_band,
-    simulate_confidence_bands,
-)
 from numpy.typing import ArrayLike
 from scipy import stats
 
@@ -85,10 +80,13 @@ def judge_places(places: FloatArray, nominal: float) -> Row:
 @cache
 def band(n: int) -> tuple[FloatArray, FloatArray]:
     """Return the simultaneous band of the distribution of n ranks, minus that of a uniform one."""
+    from arviz_stats import ecdf_utils  # late: it costs more than numpy to import
+
+    ecdf: Any = ecdf_utils  # the library has no types
     rng = np.random.default_rng(n)
     simulations = _SIMULATIONS if n >= _FEW else _FEW_SIMULATIONS
-    prob = simulate_confidence_bands(n, 1, _POINTS, LEVEL, simulations, rng)
-    low, high = get_pointwise_confidence_band(prob, n, _POINTS)
+    prob = ecdf.simulate_confidence_bands(n, 1, _POINTS, LEVEL, simulations, rng)
+    low, high = ecdf.get_pointwise_confidence_band(prob, n, _POINTS)
     return low - _POINTS, high - _POINTS
 
 
@@ -96,7 +94,7 @@ def judge(ranks: FloatArray) -> Row:
     """Return whether ranks may be uniform: their band, a test of their histogram, coverages."""
     n = ranks.size
     low, high = band(n)
-    off = compute_ecdf(ranks, _POINTS) - _POINTS
+    off = np.searchsorted(np.sort(ranks), _POINTS, side="right") / n - _POINTS
     counts = np.histogram(ranks, bins=N_BINS, range=(0, 1))[0]
     return {
         "n": n,

@@ -42,7 +42,7 @@ class Identifiability:
 
     def log_variance(self, duration: float) -> FloatArray:
         """Bound the variance of ln f of each mode in one log, shape ``(n_modes,)``."""
-        return self.log_std(duration)[0] ** 2
+        return np.asarray(self.log_std(duration)[0] ** 2)
 
     def log_std(self, duration: float) -> FloatArray:
         """Bound the standard deviations of ln f and ln ζ in one log, shape ``(2, n_modes)``."""
