@@ -181,16 +181,16 @@ def check_calibration(
 
     Examples
     --------
-    Twelve lives are too few for a judgement; every result is there all the same:
+    Few lives do not suffice for a judgement; every result is there all the same:
 
     >>> import lmshealth
     >>> from lmshealth.calibration.lives import Schedule
     >>> stage = lmshealth.load_stage("lms-y")
-    >>> found = lmshealth.check_calibration(stage, Schedule(logs=12), lives=2, seed=1)
+    >>> found = lmshealth.check_calibration(stage, Schedule(logs=12), lives=1, seed=1)
     >>> sorted({one.kind for one in found.outcomes})
     ['foreign change', 'healthy', 'wearing']
     >>> found.coverage[0].kind, found.coverage[0].quantity, found.coverage[0].n
-    ('as described', 'guide preload now', 2)
+    ('as described', 'guide preload now', 1)
     """
     resolved = (schedule or Schedule()).resolved(stage)
     found = draw_outcomes(stage, resolved, lives=lives, seed=seed, workers=workers)

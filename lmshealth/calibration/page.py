@@ -136,12 +136,16 @@ def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
     """Return state, headline and reasons of a check, for page and terminal."""
     drawn = f"{sum(one.drawn for one in check.outcomes)} lives drawn from the description"
     if check.wrong:
-        return "bad", "Not as stated", [f"By {drawn}, not so: {'; '.join(check.wrong)}."]
+        return (
+            "bad",
+            "The stated uncertainty is wrong",
+            [f"By {drawn}, not so: {'; '.join(check.wrong)}."],
+        )
     if check.blind:
         why = f"By {drawn} these faults would not be found: {'; '.join(check.blind)}."
-        return "open", "As stated, as far as so few lives show", [f"{why} Draw more lives."]
+        return "open", "No fault found, in too few lives to be sure", [f"{why} Draw more lives."]
     why = f"Intervals and ranks of {drawn} agree with what is stated; wrong ones would be found."
-    return "good", "As stated", [why]
+    return "good", "The stated uncertainty is right", [why]
 
 
 def _spelled(quantity: str) -> str:
@@ -231,6 +235,9 @@ def _blocks(check: CalibrationCheck) -> Iterator[Block]:
             "possible. If its uncertainty is right, all ranks are equally frequent: the bars are "
             "level. Bars high at both ends: intervals too narrow. High in the middle: too wide. "
             "High on the left: estimates too high; on the right: too low.",
+            "In the table, “changes” is whether a parameter changes at all, “off its law” its "
+            "deviation from its law, “remaining” the travel left, and “moves alone” whether a mode "
+            "moves by a foreign cause.",
         ),
         [
             histogram_picture(
@@ -300,9 +307,7 @@ def _detection(check: CalibrationCheck) -> Block:
         )
         pictures.append(share_picture("Losses that are reported", rows, caption, salt="losses"))
     if alarms:
-        caption = (
-            "Good: as far left as possible, and not right of the dashed line, if there is one."
-        )
+        caption = "Good: near 0 %, and no bar wholly right of its dashed line, if it has one."
         pictures.append(
             share_picture("False alarms and late dates", alarms, caption, salt="false", wide=True)
         )
@@ -311,7 +316,7 @@ def _detection(check: CalibrationCheck) -> Block:
         "a parameter has truly lost at the last log.",
         f"The tracker declares {percent(FALSE_ALARM_PROBABILITY)} of false alarms for healthy "
         "machines whose modes wander as little as its own model has it. Some of these lives wander "
-        "more, which raises alarms and no verdict.",
+        "more: they raise alarms, though hardly a verdict.",
     )
     return Block("What is detected, and what is reported by mistake", text, pictures,
                  rate_rows(check.rates))  # fmt: skip
