@@ -10,7 +10,7 @@ import pytest
 
 from tests.claims import Claims, Part
 from tests.statistical import evidence
-from tests.statistical.page import write_page
+from tests.statistical.page import _TITLES, write_page
 
 PART = Part(200, ("ranks", "rate", "squares"))
 
@@ -69,3 +69,9 @@ def test_a_p_value_keeps_what_it_is_of() -> None:
     both = evidence.all_of([evidence.at_least(9, 10, 0.5), evidence.at_least(1, 10, 0.5)])
     assert both == pytest.approx(2 * 11 / 1024)
     assert len(both.shares) == 2
+
+
+def test_every_group_of_claims_has_a_title(root: Path) -> None:
+    """Those of all files of statistical tests."""
+    files = (root / "tests" / "statistical").glob("test_*_calibration.py")
+    assert {path.stem[5:-12] for path in files} == set(_TITLES)

@@ -18,6 +18,17 @@ from lmshealth.calibration.page import (
 from lmshealth.calibration.ranks import clopper_pearson
 
 Row = dict[str, Any]
+_TITLES = {
+    "decay": "Modes from free decays",
+    "frf": "Modes from frequency responses",
+    "growth": "Growth of vibration with velocity",
+    "kind": "Health and verdicts by kind of life",
+    "life": "Health and remaining life",
+    "line": "Spectral lines",
+    "modal": "Modes from ambient vibration",
+    "planning": "Planning of logs",
+    "tracking": "Tracking of modes over a life",
+}
 _SIDES = {"as": "", "most": "at most ", "least": "at least "}
 
 
@@ -68,7 +79,10 @@ def _block(
     figures: list[Picture] = []
     shares = [share for row, _ in own for share in _shares(row["name"], row)]
     if shares:
-        caption = "Good: each bar reaches its dashed line, or lies on the side that is claimed."
+        caption = (
+            "Good: each bar reaches its dashed line, or lies on the claimed side of it. By chance "
+            "one of twenty misses it (red)."
+        )
         figures.append(
             share_picture("Coverages and rates", shares, caption, salt=f"s{number}", wide=True)
         )
@@ -98,7 +112,8 @@ def _block(
         }
         for row, (level, out) in own
     ]
-    return Block(group.replace("_", " ").capitalize(), (f"{len(table)} claims.",), figures, table)
+    text = f"{len(table)} claims, tested by tests/statistical/test_{group}_calibration.py."
+    return Block(_TITLES[group], (text,), figures, table)
 
 
 def _measured(share: Sequence[Any]) -> str:
