@@ -6,12 +6,14 @@ from typing import Any
 
 import click
 
+from lmshealth.calibration.constants import LEAST_LOGS
 from lmshealth.cli import options, terminal, views
 from lmshealth.errors import NotEnoughData
+from lmshealth.life.constants import MAX_LOGS
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
-from lmshealth.stage.constants import DURATIONS
+from lmshealth.stage.constants import DURATIONS, KM_PER_DAY
 from lmshealth.stage.description import Stage
 from lmshealth.stage.planning import plan as make_plan
 
@@ -109,17 +111,29 @@ def plan(
     default=100,
     help="Lives drawn from the description; each kind of life gets at least a quarter as many.",
 )
-@click.option("--logs", type=int, default=40, help="Logs of a life.")
-@click.option("--every", type=options.Finite(), default=7.0, help="Days from log to log.")
-@click.option("--seconds", type=options.Finite(), default=60.0, help="Length of a log in s.")
+@click.option(
+    "--logs", type=click.IntRange(LEAST_LOGS, MAX_LOGS), default=40, help="Logs of a life."
+)
+@click.option(
+    "--every",
+    type=options.Finite(0, 1000, min_open=True),
+    default=7.0,
+    help="Days from log to log.",
+)
+@click.option(
+    "--seconds",
+    type=options.Finite(0, 1e9, min_open=True),
+    default=60.0,
+    help="Length of a log in s.",
+)
 @click.option(
     "--km-per-day",
-    type=options.Finite(),
+    type=options.Finite(*KM_PER_DAY),
     help="Travel; default [usage] of the description, or that of machines in the middle of life.",
 )
 @click.option(
     "--frequency-std",
-    type=options.Finite(),
+    type=options.Finite(0, 1, min_open=True),
     metavar="SHARE",
     help="Standard deviation of a natural frequency in one log, as a share of it; default the "
     "Cramér-Rao bound with the SNR of the description.",
