@@ -29,7 +29,8 @@ if TYPE_CHECKING:
 PAGE = "calibration.html"
 # Probability that some bar of uniform ranks leaves the band of its histogram.
 _OUTSIDE = 0.01
-_MOST_BINS, _PER_BIN = 20, 8
+# Few bins: with more, the band is so wide that no bar leaves it.
+_LEAST_BINS, _MOST_BINS, _PER_BIN = 5, 20, 20
 _FLAT = "Good: bars of equal height, none beyond the grey band."
 
 
@@ -77,7 +78,7 @@ def rank_histogram(ax: Axes, places: ArrayLike) -> Axes:
     """Plot the histogram of ranks ``(n,)`` from 0 to 1 with the band of uniform ones."""
     values = np.ravel(places)
     n = values.size
-    bins = int(np.clip(n // _PER_BIN, 2, _MOST_BINS))
+    bins = int(np.clip(n // _PER_BIN, _LEAST_BINS, _MOST_BINS))
     low, high = stats.binom.interval(1 - _OUTSIDE / bins, n, 1 / bins)
     ax.axhspan(low, high, color=MUTED, alpha=0.2, lw=0)
     ax.axhline(n / bins, color=INK, lw=1, ls=(0, (5, 3)))
@@ -325,12 +326,13 @@ def _detection(check: CalibrationCheck) -> Block:
 def _controls(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
     """Show the same check of intervals that are wrong on purpose."""
     words = dict(zip(constants.WRONG_WIDTHS, ("too narrow", "too wide"), strict=True))
+    where = dict(zip(constants.WRONG_WIDTHS, ("at both ends", "in the middle"), strict=True))
     pictures = [
         histogram_picture(
             f"{_spelled(name).capitalize()}, intervals {word} on purpose",
             [o.controls[f"{factor:g}"][name] for o in check.outcomes
              if o.drawn and name in o.controls.get(f"{factor:g}", {})],
-            "This one must not look good.",
+            f"This one must not look good: it is high {where[factor]}.",
             salt=f"control-{factor:g}".replace(".", "-"),
         )
         for name in quantities[:1]
