@@ -54,9 +54,14 @@ test: .venv/installed
 long: .venv/installed
 	$(BIN)/pytest -n 2 --dist worksteal -m "study or slow or statistical"
 
-# Quick forms of all studies: the questions of studies/README.md on few data.
+# Quick forms of all studies: the questions of studies/README.md on few data. With FULL=1 all are
+# recorded in full, which takes a night; an interrupted run goes on where it was.
 studies: .venv/installed
+ifdef FULL
+	$(BIN)/python -m studies.harness.full
+else
 	$(BIN)/pytest -n 2 --dist worksteal -m study
+endif
 
 # Tests of seconds each: whole files, servers, browsers, chains.
 slow: .venv/installed
@@ -67,9 +72,10 @@ coverage: .venv/installed
 	$(BIN)/pytest -n 2 -m "not slow and not study and not statistical" \
 		--cov=lmshealth --cov-fail-under=95
 
-# Calibration of errors and intervals; LMSHEALTH_SEED=7 draws other data.
+# Calibration of errors and intervals, with a page of ranks and coverages; LMSHEALTH_SEED=7 draws
+# other data.
 statistics: .venv/installed
-	$(BIN)/pytest -n 2 --dist worksteal -m statistical
+	LMSHEALTH_STATISTICS=$(DEMO)/statistics.html $(BIN)/pytest -n 2 --dist worksteal -m statistical
 
 # Speed of every step relative to a peer, recorded in studies/cost/ratios/result.json.
 bench: .venv/installed

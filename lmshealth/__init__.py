@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from lmshealth.batch.ingest import Settings as Settings
     from lmshealth.batch.run import RunResult as RunResult
     from lmshealth.batch.run import run as run
+    from lmshealth.calibration.check import CalibrationCheck as CalibrationCheck
+    from lmshealth.calibration.check import check_calibration as check_calibration
     from lmshealth.errors import LmshealthError as LmshealthError
     from lmshealth.io.log import Log as Log
     from lmshealth.io.log import Refusal as Refusal
@@ -62,6 +64,7 @@ _HOMES = {
     "analyse": "batch.analysis",
     "assess": "machine.assessment",
     "build_history": "tracking.history",
+    "check_calibration": "calibration.check",
     "decide": "machine.service",
     "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
@@ -83,6 +86,7 @@ _HOMES = {
 # Types of the results of these functions.
 _RESULTS = {
     "Assessment": "machine.assessment",
+    "CalibrationCheck": "calibration.check",
     "FrfReading": "modal.deterministic.frequency_response",
     "Health": "life.health",
     "History": "tracking.history",

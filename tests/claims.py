@@ -6,14 +6,17 @@ the probability that a suite without fault fails at all [Holm1979]. A claim that
 below the level over the number of claims, fails its own test; so does a control that is not
 rejected at that same, strictest level: the check could not have seen a fault.
 
-As a pytest plugin this gathers the claims of all workers, applies the rule and prints a table.
+As a pytest plugin this gathers the claims of all workers, applies the rule and prints a table. It
+writes a page with their ranks and coverages to the file that LMSHEALTH_STATISTICS names.
 """
 
 from __future__ import annotations
 
 import hashlib
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,7 +83,8 @@ class Claims:
     of : int
         Number of claims of the whole suite.
     p, controls : dict
-        P values by claim; of several controls of a claim the largest.
+        P values by claim; of several controls of a claim the largest. They may have ``shares`` and
+        ``places`` (`tests.statistical.evidence`).
     """
 
     link: str
@@ -99,18 +103,20 @@ class Claims:
         """State a claim, once."""
         assert name in self.part.claims, f"{name!r} is none of {self.part.claims}"
         assert name not in self.p, f"{name!r} is claimed twice"
-        self.p[name] = float(p)
+        self.p[name] = p
 
     def control(self, name: str, p: float) -> None:
         """Give the p value that a claim has on input that is wrong."""
         assert name in self.part.claims, f"{name!r} is none of {self.part.claims}"
-        self.controls[name] = max(float(p), self.controls.get(name, 0.0))
+        self.controls[name] = max(p, self.controls.get(name, 0.0))
 
     def rows(self) -> list[dict[str, Any]]:
         """Write the claims down for the judgement of the whole suite."""
+        none = float("nan")
         return [
-            {"name": f"{self.link}: {name}", "p": p, "trials": self.trials, "level": self.level,
-             "of": self.of, "control": self.controls.get(name, float("nan"))}
+            {"name": f"{self.link}: {name}", "p": float(p), "trials": self.trials,
+             "level": self.level, "of": self.of, "control": float(self.controls.get(name, none)),
+             **_kept(p), "wrong": _kept(self.controls.get(name, none))}
             for name, p in self.p.items()
         ]  # fmt: skip
 
@@ -131,6 +137,12 @@ class Claims:
         ]
         if wrong:
             pytest.fail("\n".join(wrong), pytrace=False)
+
+
+def _kept(p: float) -> dict[str, Any]:
+    """Return the counts and places of a p value, as lists that workers can send."""
+    shares = [list(one) for one in getattr(p, "shares", ())]
+    return {"shares": shares, "places": list(getattr(p, "places", ()))}
 
 
 KEY = pytest.StashKey[Claims]()
@@ -170,8 +182,10 @@ class _Judgement:
         if self.rows and self.rejected()[1].any() and session.exitstatus == 0:
             session.exitstatus = pytest.ExitCode.TESTS_FAILED
 
-    def pytest_terminal_summary(self, terminalreporter: pytest.TerminalReporter) -> None:
-        """Print the table of claims, the least probable first."""
+    def pytest_terminal_summary(
+        self, terminalreporter: pytest.TerminalReporter, exitstatus: int
+    ) -> None:
+        """Print the table of claims, the least probable first, and write their page."""
         if not self.rows:
             return
         asked, rejected = self.rejected()
@@ -190,6 +204,13 @@ class _Judgement:
             f"{len(self.rows)} of {of} claims made, {np.count_nonzero(rejected)} rejected by Holm's"
             f" rule: a suite without fault fails in at most {level:.0%} of reseeded runs"
         )
+        if target := os.environ.get("LMSHEALTH_STATISTICS"):
+            from tests.statistical.page import write_page  # late: few runs need it
+
+            failed = exitstatus != pytest.ExitCode.OK
+            held = zip(asked.tolist(), rejected.tolist(), strict=True)
+            write_page(Path(target), self.rows, list(held), failed=failed)
+            write(f"Page: {target}")
 
 
 def pytest_configure(config: pytest.Config) -> None:

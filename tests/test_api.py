@@ -13,8 +13,9 @@ import pytest
 
 import lmshealth
 
-# `save` and `load` came with the types of results, which need no example of their own.
-MOST_NAMES = 22
+# `save` and `load` came with the types of results, which need no example of their own;
+# `check_calibration` is a question that each description raises.
+MOST_NAMES = 23
 FUNCTIONS = sorted(set(lmshealth.__all__) - set(lmshealth._RESULTS))
 # Of these nothing is needed to import the package or to show help, and all take their time.
 HEAVY = (
@@ -67,7 +68,9 @@ def assessed(folder: Path) -> str:
     given: lmshealth.Track = track
     told = lmshealth.analyse(folder, stage).judgement.why
     plan = lmshealth.plan(stage, "guide_preload", 0.05)
+    checked: dict[str, bool] = lmshealth.check_calibration(stage, lives=5, workers=2).passed
     result = lmshealth.run(folder, [stage], folder / "out", lmshealth.Settings(workers=2))
+    assert checked
     reveal_type(  # noqa: F821
         (refused, alone, laws, day, assessment.judgement.verdict, plan.duration_of_one, result)
     )

@@ -19,7 +19,7 @@ from studies.harness import provenance
 from studies.harness.study import Trials
 
 SCRIPT = '''
-from studies.harness.metrics import place
+from lmshealth.calibration.ranks import place
 
 SCALE = 2.0
 done = []
@@ -100,7 +100,7 @@ def test_line_cut_off(written: Any, tmp_path: Path) -> None:
     [
         ("SCALE = 2.0", "SCALE = 3.0", False),
         ("number / 3", "number / 4", False),
-        ("from studies.harness.metrics import place\n", "", True),
+        ("from lmshealth.calibration.ranks import place\n", "", True),
         ("return len(rows)", "return 2 * len(rows)", True),
         ('"""Draw one."""', '"""Draw another."""', True),
         ("# no round number", "", True),
@@ -122,7 +122,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
     text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
     before = provenance.code_of(written(text).draw)
     assert provenance.code_of(written(text).draw) == before
-    modules = provenance._closure({provenance.PROJECT / "studies" / "harness" / "metrics.py"})
+    modules = provenance._closure({provenance.PROJECT / "lmshealth" / "calibration" / "ranks.py"})
     assert len(modules) > 1
     for module in sorted(modules):
         plain = provenance._tree(module)
@@ -141,7 +141,7 @@ def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.Monkey
 def test_gathered_names(written: Any) -> None:
     """Of the package a trial needs the homes of the names it uses, and what these register."""
     text = SCRIPT.replace(
-        "studies.harness.metrics import place", "lmshealth import read_log as place"
+        "lmshealth.calibration.ranks import place", "lmshealth import read_log as place"
     )
     tree = provenance._tree(Path(written(text).__file__ or ""))
     needed = provenance._closure(provenance._imports(tree.body))

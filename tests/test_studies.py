@@ -20,7 +20,7 @@ from studies.cost.workers import judged
 from studies.robustness.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
 pytestmark = pytest.mark.study
-PARTS = ("preload", "mount")
+PARTS = ("guide preload", "mount stiffness")
 
 
 def run_study(root: Path, name: str) -> str:
@@ -326,7 +326,7 @@ def test_sbc_life(root: Path) -> None:
         kind: sum(answer["ranks"][kind][f"{name} changes"]["histogram"][0] for name in PARTS)
         for kind in ("posterior", "every part taken to change")
     }
-    lives = answer["ranks"]["posterior"]["preload now"]["n"]
+    lives = answer["ranks"]["posterior"]["guide preload now"]["n"]
     assert low["posterior"] < 0.2 * 2 * lives
     assert low["every part taken to change"] > 0.25 * 2 * lives
 

@@ -22,6 +22,7 @@ from lmshealth.errors import LmshealthError
 
 # Module of each command, and the text of the list of commands, which is printed without scipy.
 _COMMANDS = {
+    "check-calibration": ("stage_commands", "Check coverage and detection on simulated lives."),
     "error": ("log_commands", "Analyse the following error."),
     "frf": ("log_commands", "Measure a frequency response and identify its modes."),
     "infer": ("machine_commands", "Infer the health parameters from a track."),
@@ -81,7 +82,7 @@ class _Group(click.Group):
         if cmd_name not in _COMMANDS:
             return None
         module = import_module(f"lmshealth.cli.{_COMMANDS[cmd_name][0]}")
-        command: click.Command = getattr(module, cmd_name)
+        command: click.Command = getattr(module, cmd_name.replace("-", "_"))
         return command
 
     def format_commands(self, ctx: click.Context, formatter: click.HelpFormatter) -> None:

@@ -1,9 +1,12 @@
 """Terminal output of results: logs, stage descriptions, plans, tracks, health, remaining life."""
 
+from __future__ import annotations
+
 import math
 from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
+from typing import TYPE_CHECKING
 
 from lmshealth._private.names import spell
 from lmshealth._private.tables import TABLES, Row
@@ -40,6 +43,9 @@ from lmshealth.report.text import (
 )
 from lmshealth.report.wording import headline, next_step, service_on_day
 from lmshealth.tracking.track import Track
+
+if TYPE_CHECKING:
+    from lmshealth.calibration.check import CalibrationCheck
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
 
@@ -515,3 +521,15 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
     if service.planned is not None:
         planned = probability_range(service.planned_risk)
         yield f"Before the service planned for {service.planned}: {planned}."
+
+
+def print_calibration(check: CalibrationCheck) -> None:
+    """Print coverage, detection and the verdict of a check of calibration."""
+    from lmshealth.calibration import page  # late: it imports all that draws
+
+    print_table(check.title(), page.expectation_rows(check), 2)
+    print_line("")
+    print_table("Detection, false alarms and dates", page.rate_rows(check.rates), 2)
+    print_line("")
+    _, headline, reasons = page.verdict_of(check)
+    print_text(f"{headline}. {' '.join(reasons)}")

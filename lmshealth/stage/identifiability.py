@@ -42,7 +42,11 @@ class Identifiability:
 
     def log_variance(self, duration: float) -> FloatArray:
         """Bound the variance of ln f of each mode in one log, shape ``(n_modes,)``."""
-        return np.array([_bound(mode, duration) for mode in self.modes])
+        return np.asarray(self.log_std(duration)[0] ** 2)
+
+    def log_std(self, duration: float) -> FloatArray:
+        """Bound the standard deviations of ln f and ln ζ in one log, shape ``(2, n_modes)``."""
+        return np.sqrt([_bound(mode, duration) for mode in self.modes]).T
 
     def drift_variance(
         self, duration: float, n_logs: int, n_baseline: int | None = None
@@ -108,16 +112,18 @@ def identifiability_of(stage: Stage) -> Identifiability:
 
 
 @lru_cache(maxsize=1 << 14)
-def _bound(mode: ModeSpec, duration: float) -> float:
-    """Bound the variance of ln f in the band that identification uses; infinite by short logs."""
+def _bound(mode: ModeSpec, duration: float) -> tuple[float, float]:
+    """Bound the variances of ln f and ln ζ in the band that is fitted; infinite by short logs."""
     f, zeta = mode.frequency_hz, mode.damping_ratio
     if 2 * zeta * f * duration < constants.LEAST_RESOLUTION:
-        return np.inf
+        return np.inf, np.inf
     longest = constants.MOST_ORDINATES / (2 * constants.BAND_HALF_WIDTH * zeta * f)
     if duration > longest:
-        return _bound(mode, longest) * longest / duration
+        of_f, of_zeta = _bound(mode, longest)
+        return of_f * longest / duration, of_zeta * longest / duration
     band = (f * (1 - constants.BAND_HALF_WIDTH * zeta), f * (1 + constants.BAND_HALF_WIDTH * zeta))
-    return float(ambient_bound(f, zeta, mode.snr, duration, band=band)[0, 0])
+    of_f, of_zeta = np.diag(ambient_bound(f, zeta, mode.snr, duration, band=band)).tolist()
+    return of_f, of_zeta
 
 
 def ambient_bound(

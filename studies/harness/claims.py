@@ -9,7 +9,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from studies.harness.metrics import clopper_pearson
+from lmshealth.calibration.ranks import clopper_pearson
 
 Row = Mapping[str, Any]
 

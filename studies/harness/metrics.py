@@ -4,19 +4,17 @@ A prediction is a set of draws, one column per life: ``(n_draws, n)``; truths, h
 have the shape ``(n,)``, or one value for all, in the unit of the draws. Draws and truths that never
 reach their limit are infinite. A truth that is known only to lie beyond some travel is *censored*
 there: a count of what lies beyond cannot be computed, and to leave such lives out biases the rest.
-`crps` and `place` therefore take the horizon of each life.
+`crps` therefore takes the horizon of each life.
 
 References
 ----------
-Gneiting2007 and Gneiting2011 for the score, Czado2009 for places, Clopper1934 for intervals of
-shares, Susto2015 for services.
+Gneiting2007 and Gneiting2011 for the score, Susto2015 for services.
 """
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.stats import beta as beta_distribution
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 
@@ -35,27 +33,6 @@ def crps(draws: FloatArray, truth: ArrayLike, *, horizon: ArrayLike = np.inf) ->
     # Half the mean distance of two draws, Σ |x_i - x_j| / (2 n²), from their order.
     order = (2 * np.arange(1, n + 1) - n - 1) / n**2
     return np.asarray(np.mean(np.abs(off), axis=0) - order @ np.sort(off, axis=0))
-
-
-def place(
-    draws: FloatArray, truth: ArrayLike, rng: np.random.Generator, *, horizon: ArrayLike = np.inf
-) -> FloatArray:
-    """Return the place of truths among draws, from 0 to 1: probability integral transforms.
-
-    Among draws equal to the truth, as all that lie beyond the horizon with it, the place is drawn
-    at random, so that places of truths that are one more draw are uniform.
-    """
-    x, y = np.minimum(draws, horizon), np.minimum(truth, horizon)
-    below, tied = np.sum(x < y, axis=0), np.sum(x == y, axis=0)
-    return np.asarray((below + rng.uniform(size=y.shape) * (tied + 1)) / (x.shape[0] + 1))
-
-
-def clopper_pearson(hits: int, trials: int, level: float = 0.95) -> tuple[float, float]:
-    """Return the exact interval of a proportion."""
-    tail = (1 - level) / 2
-    low = float(beta_distribution.ppf(tail, hits, trials - hits + 1)) if hits else 0.0
-    high = float(beta_distribution.ppf(1 - tail, hits + 1, trials - hits)) if hits < trials else 1.0
-    return low, high
 
 
 def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -> FloatArray:

@@ -1,9 +1,13 @@
-"""By which code a trial of a study is done."""
+"""By which code, and on which machine, a trial of a study is done."""
 
 from __future__ import annotations
 
 import ast
 import hashlib
+import os
+import platform
+import re
+import subprocess
 import sys
 from collections.abc import Callable, Iterable
 from functools import cache, partial
@@ -15,9 +19,31 @@ from typing import Any
 PROJECT = Path(__file__).parents[2]
 _PACKAGES = ("lmshealth", "models", "studies")
 _LIBRARIES = ("numpy", "scipy", "emcee")
+_CODE = ("*.py", "*.toml", "*.csv")
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
 # The package itself gathers names of all its modules: of it a trial needs those that it names.
 _GATHERING = PROJECT / "lmshealth" / "__init__.py"
+
+
+def commit() -> str:
+    """Return the commit of the code, with a plus if it has changed since; empty without git."""
+
+    def git(*words: str) -> str:
+        command = ["git", "-C", str(PROJECT), *words]
+        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        return done.stdout.strip() if done.returncode == 0 else ""
+
+    changed = git("status", "--porcelain", "--", *_CODE)
+    return git("rev-parse", "--short=10", "HEAD") + ("+" if changed else "")
+
+
+def machine() -> str:
+    """Name the system, its processor and the number of these, without the name of the host."""
+    info = Path("/proc/cpuinfo")
+    text = info.read_text(encoding="utf-8") if info.exists() else ""
+    model = re.search(r"^model name\s*: (.+)$", text, re.MULTILINE)
+    name = model[1] if model else platform.processor() or platform.machine()
+    return f"{platform.system()}, {os.cpu_count()} of {name}"
 
 
 def bare(work: Callable[..., Any]) -> Any:

@@ -27,16 +27,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import norm
 
-from studies.harness.metrics import clopper_pearson
-from studies.harness.provenance import code_of, name_of
+from lmshealth.calibration.ranks import NOMINAL, judge_coverage
+from studies.harness.provenance import code_of, commit, machine, name_of
 
 Row = dict[str, Any]
 Work = Callable[..., Any]
 
 STUDIES = Path(__file__).parents[1]
 KEPT = STUDIES / ".kept"
-# Coverage that intervals state, and level of the interval by which a coverage is judged.
-NOMINAL, LEVEL = 0.95, 0.999
 _PACKAGES = ("lmshealth", "numpy", "scipy", "emcee", "filterpy")
 
 
@@ -87,18 +85,22 @@ class Study:
             reasons = {check: why for check, why in not_met.items() if check in failed}
             answer = {**answer, "not_met": reasons}
         print(json.dumps(answer, indent=1))
+        wrong = sorted(set(failed) - set(not_met))
         if not self.quick:
-            self._write(record_of(self._script), {**answer, **(details or {})})
-        if not set(failed) <= set(not_met) and not (self.quick and quick_may_fail):
+            self._write(record_of(self._script), {**answer, **(details or {})}, wrong)
+        if wrong and not (self.quick and quick_may_fail):
             raise SystemExit(f"not as asked: {failed}")
 
-    def _write(self, path: Path, answer: Mapping[str, Any]) -> None:
+    def _write(self, path: Path, answer: Mapping[str, Any], failed: list[str]) -> None:
         """Write a record: results, versions, and run time with that of kept trials."""
         content = {
             "question": self._question,
             **answer,
             "recorded": {
                 "date": datetime.now(UTC).date().isoformat(),
+                "commit": commit(),
+                "machine": machine(),
+                "failed": failed,
                 "python": platform.python_version(),
                 **{name: version(name) for name in _PACKAGES},
                 "wall_s": round(time.perf_counter() - self._wall, 1),
@@ -192,31 +194,10 @@ def _read(path: Path, name: str, code: str) -> dict[str, Row]:
     return {json.dumps(row["task"]): row for row in rows if row["work"] == name}
 
 
-def judge_coverage(hits: int, n: int, nominal: float = NOMINAL) -> Row:
-    """Return the coverage of n intervals of which ``hits`` contain the truth, and whether it holds.
-
-    It holds if the Clopper-Pearson interval of the share at level `LEVEL` contains the nominal.
-    """
-    row = share_row(hits, n)
-    return row | {"holds": row["low"] <= nominal <= row["high"]}
-
-
-def judge_places(places: NDArray[np.float64], nominal: float) -> Row:
-    """Return the coverage of central intervals from places of truths among draws, of any shape."""
-    hits = int(np.sum(np.abs(places - 0.5) < nominal / 2))
-    return {"nominal": nominal} | judge_coverage(hits, places.size, nominal)
-
-
 def judge_scores(z: NDArray[np.float64], nominal: float = NOMINAL) -> Row:
     """Return the coverage of normal intervals from errors in standard deviations."""
     hits = int(np.sum(np.abs(z) < norm.isf((1 - nominal) / 2)))
     return judge_coverage(hits, z.size, nominal)
-
-
-def share_row(hits: int, n: int, level: float = LEVEL) -> Row:
-    """Return a share with its Clopper-Pearson interval."""
-    low, high = clopper_pearson(hits, n, level)
-    return {"hits": hits, "n": n, "share": hits / n, "low": low, "high": high}
 
 
 def real_data() -> Path:

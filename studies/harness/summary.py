@@ -135,7 +135,8 @@ def section(record: Record, folder: Path) -> Iterator[str]:
         return
     made = record.content["recorded"]
     link = f"[record]({record.path.relative_to(folder).as_posix()})"
-    yield f"{record.question} {script}, recorded {made['date']} in {_duration(made)}: {link}."
+    when = made["date"] + (f" by {made['commit']}" if made.get("commit") else "")
+    yield f"{record.question} {script}, recorded {when} in {_duration(made)}: {link}."
     yield ""
     yield "| claim | figure | uncertainty | comparison | |"
     yield "| --- | --- | --- | --- | --- |"

@@ -22,6 +22,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
+from lmshealth.calibration.ranks import judge_coverage
 from lmshealth.errors import BadQuestion
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import identifiability_of
@@ -31,7 +32,7 @@ from models.lives.simulation import Plan
 from studies.harness.claims import Claim, covered, percents, span
 from studies.harness.data.cramer_rao import long_record_law
 from studies.harness.data.lives import Array, identified, life_of, rng_of
-from studies.harness.study import Row, Study, judge_coverage
+from studies.harness.study import Row, Study
 
 SHORT, LONG = (1, 20.0), (20, 300.0)  # logs, and seconds of each
 

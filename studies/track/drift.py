@@ -40,13 +40,14 @@ from typing import NamedTuple
 import numpy as np
 from scipy import stats
 
+from lmshealth.calibration.lives import make_history
+from lmshealth.calibration.ranks import share_row
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
 from studies.harness.checkout import ROOT, checkout
 from studies.harness.claims import Claim, percents, share
-from studies.harness.data.histories import make_history
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 
 MODES, LN_F, LN_ZETA = ("roll", "pitch", "yaw"), np.log([110.0, 124.0, 138.0]), np.log(0.016)
 STD_ZETA, REFERENCE_C = 0.06, 21.0

@@ -11,6 +11,7 @@ from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 
 from lmshealth._private.seeds import stream
+from lmshealth.calibration.lives import START
 from lmshealth.life.posterior.ensemble_sampling import sample
 from lmshealth.life.posterior.importance_sampling import WeightedDraws, importance_sample_to_ess
 from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
@@ -18,7 +19,6 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.read_tables import Drifts
 from studies.harness.cost import cpu_s
-from studies.harness.data.histories import START
 
 TRUTH = np.log([[0.8, 0.9]])
 # What two dozen logs of 20 s reach; the baseline is common to the modes of a log.

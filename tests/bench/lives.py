@@ -9,11 +9,11 @@ import numpy as np
 from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
+from lmshealth.calibration.lives import make_history
 from lmshealth.life.posterior.importance_sampling import importance_sample_to_ess
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, ln_health
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
-from studies.harness.data.histories import make_history
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch")

@@ -1,8 +1,12 @@
-"""P values of what statistical tests claim: how improbable the data are if the claim is true."""
+"""P values of what statistical tests claim: how improbable the data are if the claim is true.
+
+Each keeps the counts and places that it is of, which `tests.statistical.page` draws.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -11,28 +15,49 @@ from scipy import stats
 _Z95 = float(stats.norm.isf(0.025))
 
 
-def as_often(hits: int, n: int, share: float) -> float:
+class Evidence(float):
+    """A p value with its counts (hits, number, stated share, side) and places of truths."""
+
+    shares: tuple[tuple[int, int, float, str], ...]
+    places: tuple[float, ...]
+
+    def __new__(
+        cls, p: float, shares: Iterable[Any] = (), places: Iterable[float] = ()
+    ) -> Evidence:
+        """Keep what a p value is of."""
+        made = super().__new__(cls, p)
+        made.shares, made.places = tuple(shares), tuple(places)
+        return made
+
+
+def _binomial(hits: int, n: int, share: float, side: str, alternative: Any) -> Evidence:
+    p = stats.binomtest(int(hits), int(n), share, alternative=alternative).pvalue
+    return Evidence(float(p), [(int(hits), int(n), float(share), side)])
+
+
+def as_often(hits: int, n: int, share: float) -> Evidence:
     """Two-sided p value of so many hits, where each has this probability."""
-    return float(stats.binomtest(int(hits), int(n), share).pvalue)
+    return _binomial(hits, n, share, "as", "two-sided")
 
 
-def at_most(hits: int, n: int, share: float) -> float:
+def at_most(hits: int, n: int, share: float) -> Evidence:
     """P value of so many hits or more, where each has at most this probability."""
-    return float(stats.binomtest(int(hits), int(n), share, alternative="greater").pvalue)
+    return _binomial(hits, n, share, "most", "greater")
 
 
-def at_least(hits: int, n: int, share: float) -> float:
+def at_least(hits: int, n: int, share: float) -> Evidence:
     """P value of so few hits or fewer, where each has at least this probability."""
-    return float(stats.binomtest(int(hits), int(n), share, alternative="less").pvalue)
+    return _binomial(hits, n, share, "least", "less")
 
 
-def all_of(p: Iterable[float]) -> float:
+def all_of(p: Iterable[float]) -> Evidence:
     """P value of several claims made as one: the least of theirs, times their number."""
     values = list(p)
-    return min(1.0, len(values) * min(values))
+    shares = (share for one in values for share in getattr(one, "shares", ()))
+    return Evidence(min(1.0, len(values) * min(values)), shares)
 
 
-def covered(off: ArrayLike, factor: float = 1.0) -> float:
+def covered(off: ArrayLike, factor: float = 1.0) -> Evidence:
     """P value of the coverage of 95 % intervals, of errors in standard deviations.
 
     The control is a ``factor`` on the width of the intervals.
@@ -41,7 +66,7 @@ def covered(off: ArrayLike, factor: float = 1.0) -> float:
     return as_often(int(np.count_nonzero(inside)), inside.size, 0.95)
 
 
-def uniform(places: ArrayLike) -> float:
+def uniform(places: ArrayLike) -> Evidence:
     """P value of places of the truth in posteriors, which are uniform from 0 to 1.
 
     Their distribution by Kolmogorov and Smirnov, which sees a bias, and the coverages of central
@@ -52,7 +77,8 @@ def uniform(places: ArrayLike) -> float:
         as_often(int(np.count_nonzero(np.abs(places - 0.5) < share / 2)), places.size, share)
         for share in (0.5, 0.9)
     ]
-    return all_of([*levels, float(stats.kstest(places, "uniform").pvalue)])
+    found = all_of([*levels, float(stats.kstest(places, "uniform").pvalue)])
+    return Evidence(found, found.shares, places.round(4).tolist())
 
 
 def sum_of_squares(total: float, dof: float) -> float:

@@ -13,18 +13,17 @@ import numpy as np
 import pytest
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth.calibration.check import quantities, ranks_of, true_quantities
+from lmshealth.calibration.lives import map_std
+from lmshealth.calibration.ranks import place
 from lmshealth.life import constants
 from lmshealth.life.fleet_prior import machine_evidence, needs_fleet_prior
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
-from lmshealth.life.prognosis import _usage, passages
+from lmshealth.life.prognosis import _usage, passages, prognosis_of
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
-from studies.harness.data.histories import map_std
-from studies.harness.metrics import place
-from studies.harness.ranks import N_DRAWS
-from studies.life.calibration.lives import draw
-from studies.life.calibration.run import machine, quantities, true_quantities
+from studies.life.calibration.run import drawn_life, machine
 from studies.life.fleet.lives import YOUNG, draw_fleet
 from studies.life.fleet.lives import draw as draw_machine
 from studies.life.fleet.run import (
@@ -158,6 +157,17 @@ def test_health_off_its_law_is_calibrated(
     claims.control("health now, off its law", uniform(wrong))
 
 
+def worsened(name: str, draws: FloatArray) -> FloatArray:
+    """Return wrong draws of a quantity; an end that never comes is one at the horizon."""
+    if "changes" in name:
+        return 1 - draws
+    if "off its law" in name:
+        return draws - 0.2
+    if "now" in name:
+        return 0.8 * draws
+    return np.nan_to_num(draws, posinf=1000 * machine().description.usage.horizon_km) / 4
+
+
 def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Claims) -> None:
     """Of the shipped Y stage health now, whether a part wears and what remains is one more draw.
 
@@ -165,21 +175,18 @@ def test_ranks_of_whole_lives_are_uniform(rng: np.random.Generator, claims: Clai
     part wears, a fifth less of health, and a quarter of what remains.
     """
     places, wrong = [], []
-    horizon = 1000 * machine().description.usage.horizon_km
     for _ in range(claims.trials):
-        drawn = draw(rng, machine())
-        truth = np.minimum(true_quantities(drawn, rng), horizon)
+        drawn = drawn_life(rng)
+        truth = true_quantities(drawn, machine(), rng)
         found = fit_life(drawn.history, machine(), int(rng.integers(1 << 32)), chains=False)
-        draws = np.minimum(quantities(found, drawn.now, rng), horizon)
-        draws = draws[rng.permutation(len(draws))[:N_DRAWS]]
-        worse = [1 - draws[:, :2], 0.8 * draws[:, 2:4], draws[:, 4:5] - 0.2, draws[:, 5:] / 4]
-        places.append(place(draws, truth, rng))
-        wrong.append(place(np.hstack(worse), truth, rng))
-    for name, right, rash in zip(
-        claims.part.claims, np.transpose(places), np.transpose(wrong), strict=True
-    ):
-        claims.claim(name, uniform(right))
-        claims.control(name, uniform(rash))
+        draws = quantities(found, machine(), prognosis_of(found, drawn.history, machine()))
+        draws = {name: own for name, own in draws.items() if name in claims.part.claims}
+        worse = {name: worsened(name, own) for name, own in draws.items()}
+        places.append(ranks_of(truth, draws, rng))
+        wrong.append(ranks_of(truth, worse, rng))
+    for name in claims.part.claims:
+        claims.claim(name, uniform([own[name] for own in places]))
+        claims.control(name, uniform([own[name] for own in wrong]))
 
 
 def test_young_machines_are_told_right_by_their_fleet(

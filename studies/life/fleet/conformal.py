@@ -30,6 +30,7 @@ from unittest.mock import patch
 
 import numpy as np
 
+from lmshealth.calibration.lives import make_history
 from lmshealth.life import constants, prognosis
 from lmshealth.life.fleet_prior import ended_lives
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
@@ -37,7 +38,6 @@ from lmshealth.life.prognosis import prognose
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from studies.harness.claims import Claim, counted, number
-from studies.harness.data.histories import make_history
 from studies.harness.study import Row, Study
 from studies.life.fleet.lives import machine
 from studies.life.kinds.worlds import course

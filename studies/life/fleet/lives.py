@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from lmshealth.calibration.lives import Part, make_history, map_std, part_of, shares, without_health
 from lmshealth.life import constants
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.posterior.scenarios import DegradationPath, laws_of
@@ -16,8 +17,6 @@ from lmshealth.stage.description import ScatterPrior, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History
-from studies.harness.data.histories import make_history, map_std
-from studies.life.calibration.lives import Part, part_of, shares, without_health
 
 Array = NDArray[np.float64]
 

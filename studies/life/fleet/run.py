@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import sem
 
+from lmshealth.calibration.ranks import judge_places, place
 from lmshealth.life.fleet_prior import (
     FleetPrior,
     MachineEvidence,
@@ -40,8 +41,8 @@ from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
 from studies.harness.claims import Claim, covered, measured, percents
-from studies.harness.metrics import crps, place
-from studies.harness.study import Row, Study, judge_places
+from studies.harness.metrics import crps
+from studies.harness.study import Row, Study
 from studies.life.fleet.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
 
 Array = NDArray[np.float64]

@@ -8,8 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from studies.harness.metrics import place as rank_of
-from studies.harness.study import Row, share_row
+from lmshealth.calibration.ranks import place as rank_of
+from lmshealth.calibration.ranks import share_row
+from studies.harness.study import Row
 from studies.life.kinds.ideal import marginals, place, quantile
 from studies.life.kinds.plant import MODES, PARAMETERS
 from studies.life.kinds.worlds import SEED, SHARES, Life, life_of

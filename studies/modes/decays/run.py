@@ -34,10 +34,10 @@ import numpy as np
 from scipy import optimize
 
 from lmshealth import identify_decays
+from lmshealth.calibration.ranks import clopper_pearson
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Description, ModeSpec, Stage
 from studies.harness.claims import Claim, percents, span
-from studies.harness.metrics import clopper_pearson
 from studies.harness.study import Row, Study, Trials
 from studies.modes.decays.beam import REPEATS, judge_beam, one_beam
 from studies.modes.decays.cases import CASES, QUIET, RATE, Case, one_machine, simulate, to_log

@@ -26,9 +26,10 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth.calibration.ranks import share_row
 from studies.harness.claims import Claim, counted, number
 from studies.harness.program import Program
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 from studies.modes.described.answers import answer
 from studies.modes.described.worlds import SEED, WORLDS, Case, case
 

@@ -21,12 +21,13 @@ from collections.abc import Iterator
 import numpy as np
 
 from lmshealth import identify
+from lmshealth.calibration.ranks import judge_coverage
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
 from studies.harness.claims import Claim, covered, number, percents, span
-from studies.harness.study import Row, Study, judge_coverage, judge_scores
+from studies.harness.study import Row, Study, judge_scores
 from studies.modes.identification.cases import CASES, HEADLINE, Case
 from studies.modes.identification.records import Array, describe
 

@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import median_filter
 
+from lmshealth.calibration.ranks import clopper_pearson
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectral_lines import find_lines
-from studies.harness.metrics import clopper_pearson
 from studies.harness.study import Row
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ import numpy as np
 import pandas as pd
 
 from lmshealth import identify, load_stage
+from lmshealth.calibration.ranks import clopper_pearson
 from lmshealth.modal.modes import Modes
 from studies.harness.command_line import call
-from studies.harness.metrics import clopper_pearson
 from studies.harness.study import Row
 from studies.modes.real.make_map import PUBLISHED, PUBLISHED_DAMPING
 from studies.modes.real.sets import Z95, describe, identify_known, to_log

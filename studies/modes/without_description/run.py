@@ -32,9 +32,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth import identify
+from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import Claim, span
 from studies.harness.cost import one_thread
-from studies.harness.metrics import clopper_pearson
 from studies.harness.study import Study, judge_scores
 from studies.modes.without_description.worlds import FAMILIES, World, log_of
 

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 
 from lmshealth import identify, read_log
+from lmshealth.calibration.ranks import place as rank_of
 from lmshealth.errors import LmshealthError
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
@@ -152,7 +153,7 @@ def _true_verdict(stage: Stage, truth: Array) -> str:
 def _placed(draws: Array, truth: Array, rng: np.random.Generator, horizon: float = np.inf) -> Row:
     """Return per quantity the place of the truth among draws, and the quantiles."""
     cuts = np.quantile(draws, _LEVELS, axis=0, method="inverted_cdf")
-    place = metrics.place(draws, truth, rng, horizon=horizon)
+    place = rank_of(draws, truth, rng, horizon=horizon)
     return {
         "place": place.tolist(),
         "quantiles": [[_number(value) for value in row] for row in cuts.T],

@@ -28,13 +28,13 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth.calibration.ranks import clopper_pearson, judge_places, share_row
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.modal.identification import identify
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted, number
-from studies.harness.metrics import clopper_pearson
 from studies.harness.provenance import code_of
-from studies.harness.study import Row, Study, judge_places, judge_scores, share_row
+from studies.harness.study import Row, Study, judge_scores
 from studies.robustness.drawn_machines.machines import (
     PARAMETERS,
     RISK,

@@ -30,6 +30,8 @@ from unittest.mock import patch
 
 import numpy as np
 
+from lmshealth.calibration.lives import START
+from lmshealth.calibration.ranks import share_row
 from lmshealth.io.log import Metadata
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
@@ -39,8 +41,7 @@ from lmshealth.tracking.association import associate
 from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted
-from studies.harness.data.histories import START
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 from studies.robustness.off_model.worlds import Array
 
 SEED, N_LIVES, N_LOGS, CONTROL_LOGS = 20261125, 5, 100, 50

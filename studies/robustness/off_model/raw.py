@@ -29,6 +29,7 @@ import msgspec
 import numpy as np
 
 from lmshealth import LogEstimates, assess, identify, load_stage, read_log
+from lmshealth.calibration.ranks import share_row
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.life.verdict import degraded_below, verdict_of
@@ -38,7 +39,7 @@ from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
 from models.lives.simulation import Plan, simulate_life
 from studies.harness.claims import Claim, counted
 from studies.harness.data.lives import SECONDS, life_of
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 from studies.robustness.drawn_machines.machines import InService
 
 STAGE, FIRST_SEED, LIVES, LOGS = "lms-y", 2000, 12, 16

@@ -22,11 +22,12 @@ from unittest.mock import patch
 
 import numpy as np
 
+from lmshealth.calibration.ranks import share_row
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.track import track
 from studies.harness.claims import Claim, counted, number
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 from studies.robustness.off_model.worlds import COURSES, DISTURBANCES, MODES, life_of
 
 LIVES, QUICK_LIVES = 100, 2

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from scipy.optimize import brentq
 from scipy.signal import lfilter
 
+from lmshealth.calibration.lives import make_history
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
-from studies.harness.data.histories import make_history
 
 Array = NDArray[np.float64]
 MODES = ("roll", "pitch", "yaw")

@@ -22,10 +22,11 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
+from lmshealth.calibration.ranks import share_row
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, associate
 from studies.harness.claims import Claim, counted, percents
-from studies.harness.study import Row, Study, share_row
+from studies.harness.study import Row, Study
 from studies.track.crossings.lives import KINDS, Life, judge, make_life, nearest, recovered
 
 SEED = 20261124

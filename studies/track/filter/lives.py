@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from lmshealth.calibration.lives import make_history
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.constants import (
     BIAS_STD,
@@ -23,7 +24,7 @@ from lmshealth.tracking.constants import (
 from lmshealth.tracking.filters import filter_bank
 from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
-from studies.harness.data.histories import keep_series, make_history
+from studies.harness.data.histories import keep_series
 
 Array = NDArray[np.float64]
 QUANTITIES = ("ln f", "ln ζ", "drift")

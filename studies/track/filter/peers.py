@@ -12,6 +12,7 @@ from unittest.mock import patch
 import numpy as np
 from filterpy.kalman import KalmanFilter
 
+from lmshealth.calibration.lives import make_history
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.constants import (
@@ -27,7 +28,6 @@ from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
 from studies.harness.cost import in_turns
-from studies.harness.data.histories import make_history
 from studies.harness.study import Row
 from studies.track.filter.lives import Array, banks, draw, filtered
 

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 from scipy import stats
 
+from lmshealth.calibration.ranks import LEVEL
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import track
-from studies.harness.study import LEVEL, Row, judge_scores
+from studies.harness.study import Row, judge_scores
 from studies.track.filter import lives
 
 

@@ -1,0 +1,68 @@
+"""Record all studies in full, one after the other: ``make studies FULL=1``.
+
+A study whose record was made by the code of this commit without a failed check is not run again,
+and trials of an interrupted study are kept (`studies.harness.study`). A study that fails does not
+stop the others; the exit status is then 1. What studies print is in ``studies/.kept``.
+"""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from studies.harness.provenance import PROJECT, commit
+from studies.harness.study import KEPT, record_of
+from studies.harness.summary import GROUPS
+
+_RECORDS = "Study(__file__"
+
+
+def scripts(root: Path, groups: Sequence[str]) -> Iterator[tuple[Path, str]]:
+    """Yield the scripts that record, in the order of the groups, with their names as modules."""
+    for group in groups:
+        for path in sorted((root / group).rglob("*.py")):
+            if _RECORDS in path.read_text(encoding="utf-8"):
+                yield path, ".".join(path.relative_to(root.parent).with_suffix("").parts)
+
+
+def is_fresh(script: Path, now: str) -> bool:
+    """Return whether a record was made by a commit, of which nothing has been changed since."""
+    path = record_of(script)
+    made = json.loads(path.read_text(encoding="utf-8"))["recorded"] if path.exists() else {}
+    return made.get("commit") == now != "" and not now.endswith("+") and not made.get("failed")
+
+
+def run_all(root: Path, groups: Sequence[str], kept: Path = KEPT) -> list[str]:
+    """Run the studies of groups in a folder whose records are not fresh; return what failed."""
+    failed, now = [], commit()
+    kept.mkdir(parents=True, exist_ok=True)
+    for script, module in scripts(root, groups):
+        if is_fresh(script, now):
+            print(f"{module}: recorded by {now}", flush=True)
+            continue
+        start, log = time.perf_counter(), kept / f"{module}.txt"
+        with log.open("w", encoding="utf-8") as file:
+            command = [sys.executable, "-m", module]
+            done = subprocess.run(command, cwd=root.parent, stdout=file, stderr=file, check=False)
+        minutes = f"{(time.perf_counter() - start) / 60:.1f} min"
+        if done.returncode:
+            failed.append(module)
+        print(f"{module}: {'FAILED, see ' + str(log) if done.returncode else 'done'}, {minutes}",
+              flush=True)  # fmt: skip
+    return failed
+
+
+def main() -> int:
+    """Record all studies, then write the pages of all records."""
+    failed = run_all(PROJECT / "studies", GROUPS)
+    pages = subprocess.run([sys.executable, "-m", "studies.harness.summary"], check=False)
+    print(f"{len(failed)} studies failed: {', '.join(failed)}" if failed else "All are recorded.")
+    return int(bool(failed) or pages.returncode != 0)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
