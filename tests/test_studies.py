@@ -63,7 +63,6 @@ def test_modes_real(root: Path, needs: Callable[[str], None]) -> None:
     answer = json.loads(run_study(root, "studies.modes.real.run"))
     failed = {name for name, held in answer["passed"].items() if not held}
     assert failed == set(answer["not_met"])
-    assert answer["building"]["verdict"] == "healthy"
     assert answer["weak_mode"]["modes_at_mains"] == 0
 
 

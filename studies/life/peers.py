@@ -9,7 +9,8 @@ Method
     and a factor on each mode's drift, with small process noise in the filter and none in the
     prediction. It has advantages: the plant's map itself, that the mount stays, the
     distribution of the lengths, and the size of the map's error; temperature is removed by least
-    squares on temperature and a parabola of the travel, and the baseline is the mean of three logs.
+    squares on temperature and powers of
+    the travel, and the first log is the baseline.
     Scores of both on the same lives: coverage of 90 % intervals of health and of the remaining
     life, mean continuous ranked probability score of the remaining life up to 10,000 km, and
     processor time. Control, which must be worse: the distribution of lengths without any log.
@@ -38,6 +39,10 @@ LOST = 1 - LIMITS["guide_preload"]
 PARTICLES, SAMPLES, HORIZON_KM, STEP_KM = 2000, 300, 10_000.0, 20.0
 # Of a log's ln f beside the map: stated errors, walk, and the baseline.
 NOISE, JITTER, POWER_STD = 7e-4, 3e-4, 0.4
+NOT_MET = {
+    f"preload, late: {name} predicts better than no log": f"a fast end that no log shows yet: {why}"
+    for name, why in ((PEER, "its law has none"), (OURS, "it may begin at any time"))
+}
 _SCALES = [f"scale_{mode}" for mode in MODES]
 
 
@@ -52,7 +57,7 @@ def main() -> None:
                                    if task[0] == kind]) for kind in KINDS}
         for name, own in found.items()
     }  # fmt: skip
-    study.conclude({"programs": rows, "passed": judge(rows)}, quick_may_fail=True)
+    study.conclude({"programs": rows, "passed": judge(rows)}, not_met=NOT_MET, quick_may_fail=True)
 
 
 def by_lmshealth(kind: str, k: int) -> Row:
@@ -106,7 +111,8 @@ def by_progpy(kind: str, k: int) -> Row:
 
     start, life, rng = time.process_time(), life_of(kind, k), np.random.default_rng(k)
     np.random.seed(k)  # noqa: NPY002 (progpy draws from the global generator)
-    noise = {**dict.fromkeys(Preload.states, 0.0), "ln_life": JITTER, "ln_power": JITTER}
+    noise = {"travel": 0.0, "ln_life": JITTER, "ln_power": JITTER}
+    noise |= dict.fromkeys(_SCALES, JITTER / 10)
     model = Preload(process_noise=noise, measurement_noise=NOISE)
     prior = {
         "travel": np.zeros(PARTICLES),
@@ -120,11 +126,11 @@ def by_progpy(kind: str, k: int) -> Row:
     ]
     begin = UnweightedSamples(particles, _type=model.StateContainer)
     own = ParticleFilter(model, begin, measurement_noise=dict.fromkeys(MODES, NOISE))
-    # Ln f since the first three logs, without the effect of temperature.
+    # Ln f since the first log, without the effect of temperature.
     travel, warm = life.travel / 1e3, life.temperature - REFERENCE_C
-    table = np.column_stack([np.ones_like(travel), travel, travel**2, warm])
+    table = np.column_stack([travel[:, None] ** [0, 0.5, 1, 2], warm])
     seen = life.ln_f - np.outer(warm, np.linalg.lstsq(table, life.ln_f, rcond=None)[0][-1])
-    seen -= seen[:3].mean(axis=0)
+    seen -= seen[0]
     for s, row in zip(travel, seen, strict=True):
         if s > own.t:
             own.estimate(s, {}, dict(zip(MODES, row.tolist(), strict=True)), dt=s - own.t)

@@ -28,8 +28,7 @@ COLUMN_MAP = MAPS["dropbear_ds8/open/10steps_test0.txt.gz"].replace(
 )
 # The roller rests where it moves by less than this share of its travel in so many seconds; the
 # median over a part of that hides the noise of its sensor.
-_STILL, _WHILE, _SMOOTH = 0.01, 0.05, 0.02
-_SHORTEST = 0.3
+_STILL, _WHILE, _SMOOTH, _SHORTEST = 0.01, 0.05, 0.02, 0.3
 
 
 def read_beam(folder: Path, repeat: int) -> Log:

@@ -22,8 +22,7 @@ SHAKE = {
     "Flexible": ((3.63, 3.75, 0.15), (11.1, 11.25, 0.3), (16.6, 16.8, 0.3)),
     "Stiff": ((7.73, 7.98, 0.15), (25.0, 25.0, 0.3)),
 }
-FLOORS = ("1st", "2nd", "3rd")
-KOMA_RATE = 12.0
+FLOORS, KOMA_RATE = ("1st", "2nd", "3rd"), 12.0
 # Channels 3 and 4 are accelerations; the set's own description drops channel 5.
 WEIMAR_RATE, WEIMAR_CHANNELS = 256.0, (3, 4)
 WEIMAR = (4.018, 4.771, 6.682, 7.616, 9.665, 12.167, 12.598)
