@@ -86,7 +86,7 @@ def by_progpy(kind: str, k: int) -> Row:
         """Loss of preload by a power of the travel, which is the time (km)."""
 
         is_vectorized = True
-        inputs: ClassVar = []
+        inputs: ClassVar[list[str]] = []
         states: ClassVar = ["travel", "ln_life", "ln_power", *_SCALES]
         outputs: ClassVar = list(MODES)
         events: ClassVar = ["limit"]

@@ -142,10 +142,11 @@ def write_manifest(folder: Path, name: str) -> None:
 
 
 def beam(data: Path, scratch: Path, *, quick: bool) -> list[Machine]:
-    """Return the machines of the beam: its roller moved by one step, left alone, moved by five."""
+    """Return the machines of the beam: its roller moved by one step, or by five, or left alone."""
     n_repeats = len(list((data / "dropbear_ds8/open").glob("10steps_test*.txt.gz")))
     repeats = range(3 if quick else n_repeats)
-    dwells = {(k, way): [] for k in range(6) for way in ("up", "down")}
+    ways = [(k, way) for k in range(6) for way in ("up", "down")]
+    dwells: dict[tuple[int, str], list[Path]] = {one: [] for one in ways}
     for repeat in repeats:
         for where, log in cut_dwells(data, repeat, scratch / "dwells").items():
             dwells[where].append(log)
