@@ -309,6 +309,7 @@ def test_measured(root: Path, needs: Callable[[str], None]) -> None:
     assert not moved["q05"] < moved["before"] < moved["q95"]
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_peers_of_lives(root: Path) -> None:
     """The particle filter of progpy predicts a linear loss better than a guess without logs."""
     pytest.importorskip("progpy")
