@@ -14,6 +14,7 @@ Method
     Scores of both on the same lives: coverage of 90 % intervals of health and of the remaining
     life, mean continuous ranked probability score of the remaining life up to 10,000 km, and
     processor time. Control, which must be worse: the distribution of lengths without any log.
+    Noise, jitter and baseline of the peer were chosen by its scores on the first two kinds here.
 Run time
     Ten minutes on one processor. progpy comes with the extra ``peers``.
 """

@@ -157,9 +157,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         f"the state before inside: {before}",
         met=passed[CHANGED] and not before,
     )
-    yield counted(
-        "unchanged machines judged healthy (control)", controls, len(same), met=passed[NO_STEP]
-    )
+    yield counted("unchanged machines judged healthy", controls, len(same), met=passed[NO_STEP])
     yield counted(
         "changes beyond the description of which no value is certified",
         sum(not row["certified"] for row in beyond),
