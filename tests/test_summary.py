@@ -89,11 +89,11 @@ def test_figures_follow_the_record(copied: Path) -> None:
 
 def test_a_missing_record_is_reported(copied: Path) -> None:
     """A study without a record is named as such, and claims nothing."""
-    (copied / "track" / "beam.json").unlink()
-    part = summary.group_page("track").split("### beam")[1].split("###")[0]
+    (copied / "track" / "drift.json").unlink()
+    part = summary.group_page("track").split("### drift")[1].split("###")[0]
     assert "**Not recorded**" in part
     assert "|" not in part
-    (line,) = [one for one in summary.overview().splitlines() if "[track/beam]" in one]
+    (line,) = [one for one in summary.overview().splitlines() if "[track/drift]" in one]
     assert line.endswith("|  |  |  | no |")
 
 

@@ -269,7 +269,9 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
     assert stage.modal_map is not None  # a life has one
     low, high = stage.modal_map.low, stage.modal_map.high
     margin = constants.EDGE_SHARE * (high - low)
-    least, most = np.quantile(flat, (0.05, 0.95), axis=1)
+    least, middle, most = np.quantile(flat, (0.05, 0.5, 0.95), axis=1)
+    # Laws stay on the map; a deviation from them, whose effect is linear, may leave it.
+    on_map = ((middle >= low) & (middle <= high)).all(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
         informed = np.clip(1 - flat.var(axis=1) / variance, 0, 1)
         correlation = [np.atleast_2d(np.corrcoef(one, rowvar=False)) for one in flat]
@@ -292,7 +294,7 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
         prior_width=width * baseline,
         identifiable=np.tile(seen, (n, 1)),
         correlation=np.stack(correlation),
-        fit=np.full(n, life.fit),
+        fit=np.where(on_map, life.fit, 0.0),
         at_edge=(least < low + margin) | (most > high - margin),
         seed=life.seed,
     )

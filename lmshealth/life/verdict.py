@@ -22,7 +22,7 @@ from lmshealth.modal.naming import off_description
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.filters.change_detection import Event
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Track
+from lmshealth.tracking.track import Track, accepted_estimates
 
 # Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.
 NO_HEALTH = ("alarm", "no-alarm", "not-enough-data")
@@ -164,6 +164,7 @@ def doubt_of_names(
 ) -> str:
     """Return why health that depends on the names of modes is not published; empty if it may be.
 
+    Names are in doubt, or no log shows the modes of the map any more.
     Modes move with wear, and a repair need not restore them: those of the first baseline are
     compared with the description, as all logs until the next baseline estimate it.
     ``readings`` are the estimates of the logs of the history, in its order, for their flags.
@@ -210,12 +211,30 @@ def doubt_of_names(
         if 2 * k > n_logs
     ]
     if not often:
-        return ""
+        return _nothing_seen(stage, history, track)
     return fact(
         "The names of the modes are in doubt, so that no health is published: another mode may "
         "have the name {names} since the baseline (flag doubtful-name). Describe the modes that "
         "refused.csv lists as undescribed.",
         names=", ".join(often),
+    )
+
+
+def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
+    """Return that no mode of the map is where it is searched for any more; empty if one is.
+
+    A mode that has left its search is not found, so that the logs before would give the health.
+    """
+    columns = [k for name in stage.informative for k in history.columns(name)]
+    found = np.isfinite(accepted_estimates(history, track).ln_frequency[history.baseline :])
+    least, missed = stage.description.baseline.logs, int(found[::-1, columns].any(axis=1).argmax())
+    if not columns or missed < least:
+        return ""
+    names = ", ".join(dict.fromkeys(history.series[k].mode for k in columns))
+    return (
+        f"None of the modes of the map ({names}) was found in the last {missed} logs, so that no "
+        "health is published: look into their spectra for where the modes are now; search there, "
+        "or excite more."
     )
 
 

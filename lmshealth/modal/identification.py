@@ -190,13 +190,17 @@ def read_modes(
     except BadLog as why:
         if why.reason != "too-short":
             raise
+        if not select_segments(log, "settling"):
+            raise
         try:
             reading = read_decays(log, stage, **chosen)
-        except BadLog:
-            raise why from None
-        if not reading.modes.names:
-            raise
-        return reading
+            if reading.modes.names:
+                return reading
+            decays = "; ".join(row.detail for row in reading.modes.refused if row.mode)
+        except BadLog as error:
+            decays = error.detail
+        detail = f"{why.detail}; of its decays after stops: {decays}"
+        raise BadLog(log.name, why.reason, detail) from None
 
 
 def read_decays(

@@ -350,10 +350,10 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     return legend(ax)
 
 
-def bars(ax: Axes, travel: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
+def bars(ax: Axes, x: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
     """Draw points with bars from low, middle and high values, shape ``(3, n)``."""
     style: Any = {"fmt": "o", "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
-    ax.errorbar(travel / _KM, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
+    ax.errorbar(x, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
 
 
 def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, informed: bool) -> None:
@@ -526,10 +526,19 @@ def _density(ax: Axes, draws: FloatArray) -> None:
     ax.set_ylabel(tr("probability density per %"))
 
 
-def odometer(ax: Axes, *, room: int = ROOM) -> Axes:
-    """Label the odometer axis and add the legend."""
+def along(lives: History | Track) -> FloatArray:
+    """Return the odometer in km, or without one the days since the first log, ``(n_logs,)``."""
+    if np.isfinite(lives.travel).all():
+        return lives.travel / _KM
+    seconds = [(moment - lives.recorded_at[0]).total_seconds() for moment in lives.recorded_at]
+    return np.array(seconds) / 86400
+
+
+def odometer(ax: Axes, lives: History | Track | None = None, *, room: int = ROOM) -> Axes:
+    """Label the axis of the odometer, or of the days of ``lives`` without one; add the legend."""
     grouped(ax)
-    ax.set_xlabel(tr("odometer in km"))
+    days = lives is not None and not np.isfinite(lives.travel).all()
+    ax.set_xlabel(tr("days since the first log") if days else tr("odometer in km"))
     return legend(ax, room=room)
 
 
@@ -595,22 +604,22 @@ def plot_frequencies(ax: Axes, history: History, track: Track | None, mode: str)
     if high - low < 0.01 * middle:
         ax.set_ylim(0.995 * middle, 1.005 * middle)
     ax.set_ylabel(tr("natural frequency in Hz"))
-    return odometer(ax)
+    return odometer(ax, history)
 
 
 def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     """Plot the filtered natural frequency of a mode with its 95 % band, and the steps."""
     k = track.modes.index(mode)
-    _filtered(ax, track.travel, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
+    x = along(track)
+    _filtered(ax, x, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
     names = {
         kind: tr(words) for kind, words in _WORDS.items()
     }  # each kind has one entry in the legend
     for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
-        name, x = names.pop(kind, None), track.travel[first] / _KM
-        ax.axvline(x, lw=1.0, label=name, zorder=1, **style)
+        ax.axvline(x[first], lw=1.0, label=names.pop(kind, None), zorder=1, **style)
     ax.set_ylabel(tr("natural frequency in Hz"))
-    return odometer(ax)
+    return odometer(ax, track)
 
 
 def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> Axes:
@@ -620,19 +629,19 @@ def plot_damping(ax: Axes, history: History, track: Track | None, mode: str) -> 
     top = max(_logs(ax, history, n + k, level[:, k], (100.0, "%")) for k in columns)
     if track is not None and mode in track.modes:
         k = track.modes.index(mode)
-        _filtered(ax, track.travel, track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
+        _filtered(ax, along(track), track.ln_damping[:, k], track.ln_damping_std[:, k], 100.0)
     # Bars of uncertain logs may exceed the figure.
     if top > 0:
         ax.set_ylim(0, 1.08 * min(top, 300 * float(np.exp(np.nanmax(level[:, columns])))))
     ax.set_ylabel(tr("damping ratio in %"))
-    return odometer(ax)
+    return odometer(ax, history)
 
 
 def plot_nis(ax: Axes, track: Track) -> Axes:
     """Plot the normalised innovation squared of each epoch with its 95 % chi-square band."""
     seen = np.flatnonzero((track.nis_dof > 0) & np.isfinite(track.nis))
     seen = seen[_thinned(seen.size)]
-    x, nis = track.travel[seen] / _KM, track.nis[seen]
+    x, nis = along(track)[seen], track.nis[seen]
     low, high = chi_square_band(track.nis_dof[seen])
     ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label=tr("95 % band"))
     inside = (nis >= low) & (nis <= high)
@@ -654,7 +663,7 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     else:
         ax.set_ylim(bottom=0)
         ax.set_ylabel("NIS")
-    return odometer(ax)
+    return odometer(ax, track)
 
 
 def plot_waterfall(
@@ -735,12 +744,13 @@ def _logs(
     seen = np.flatnonzero(np.isfinite(level) & np.isfinite(std))
     seen = seen[_thinned(seen.size)]
     bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
-    bars(ax, history.travel[seen], bounds, tr("each log, ±2σ"), 3)
+    x = along(history)[seen]
+    bars(ax, x, bounds, tr("each log, ±2σ"), 3)
     texts = [
         f"{title(history, k)}\n{fixed(value, 2)} ± {fixed(value * std[k], 2)}{GAP}{name}"
         for k, value in zip(seen.tolist(), bounds[1], strict=True)
     ]
-    hints(ax, history.travel[seen] / _KM, bounds[1], texts)
+    hints(ax, x, bounds[1], texts)
     return float(np.max(bounds[2], initial=0.0))
 
 
@@ -749,15 +759,13 @@ def title(lives: History | Track, k: int) -> str:
     return f"{lives.logs[k]}\n{moment(lives.recorded_at[k])}, {whole_km(lives.travel[k])}"
 
 
-def _filtered(
-    ax: Axes, travel: FloatArray, level: FloatArray, std: FloatArray, unit: float
-) -> None:
+def _filtered(ax: Axes, x: FloatArray, level: FloatArray, std: FloatArray, unit: float) -> None:
     """Draw the filtered line with its 95 % band, above the logs."""
-    travel, level, std = (one[_thinned(one.size)] for one in (travel, level, std))
-    x, reach = travel / _KM, 1.96 * std
+    x, level, std = (one[_thinned(one.size)] for one in (x, level, std))
+    reach = 1.96 * std
     low, high = unit * np.exp(level - reach), unit * np.exp(level + reach)
     ax.fill_between(x, low, high, color=BLUE, alpha=0.25, lw=0, zorder=3)
-    style: Any = {"color": BLUE, "lw": 1.8, "marker": "o" if travel.size < 3 else "", "zorder": 4}
+    style: Any = {"color": BLUE, "lw": 1.8, "marker": "o" if x.size < 3 else "", "zorder": 4}
     ax.plot(x, unit * np.exp(level), label=tr("filtered, 95 % band"), **style)
 
 
@@ -767,7 +775,7 @@ def _baselines(ax: Axes, history: History, track: Track, column: int) -> None:
     for first, end in pairwise([*history.baselines, len(history.logs)]):
         own = base[first:end][np.isfinite(base[first:end])]
         if own.size:
-            x = track.travel[[first, end - 1]] / _KM
+            x = along(track)[[first, end - 1]]
             name = None if first > history.baselines[0] else tr("baseline")
             ax.plot(x, [own[-1]] * 2, color=GREEN, lw=1.1, ls=_DASHED, label=name)
 

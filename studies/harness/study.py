@@ -211,9 +211,3 @@ def record_of(script: str | Path) -> Path:
     """Return the file of a script's record: ``result.json`` of ``run.py``, else of its own name."""
     path = Path(script)
     return path.with_name("result.json" if path.stem == "run" else f"{path.stem}.json")
-
-
-def read_record(script: str) -> Row:
-    """Read the record of a script."""
-    found: Row = json.loads(record_of(script).read_text(encoding="utf-8"))
-    return found

@@ -374,6 +374,14 @@ def test_logs_that_no_life_explains_inform_no_parameter(stage: Stage, health: He
     assert not found.publishable_parameters().any()
 
 
+def test_a_state_beyond_the_map_is_not_published(stage: Stage) -> None:
+    """The modes of a preload below the grid leave no value: it would be an extrapolation."""
+    for share, published in ((1.3, True), (0.4, False)):
+        end = share * AXES["guide_preload"][0]
+        found = infer(lived(np.linspace(1, end, 12), np.ones(12)), stage, 1, chains=False)
+        assert found.publishable_parameters()[0] == published
+
+
 @pytest.mark.usefixtures("unchained")
 def test_a_posterior_at_the_edge_of_the_map_is_a_bound(tmp_path: Path) -> None:
     """Drifts further than the map reaches pile up at its end, reported by parameter."""

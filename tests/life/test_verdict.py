@@ -305,3 +305,19 @@ def test_a_name_that_most_logs_doubt_withholds_health(stage: Stage) -> None:
     assert doubt_of_names(stage, logs(8), track, unsure[:4] + sure[4:]) == ""
     doubt = doubt_of_names(stage, logs(8), track, unsure[:5] + sure[5:])
     assert f"{track.modes[1]} in 5 of 8 logs" in doubt
+
+
+def test_modes_that_have_left_their_searches_withhold_health(stage: Stage) -> None:
+    """Logs before are no state of now: with none of the modes in five logs there is no health."""
+    track, history = make_track(np.zeros((12, 2)), np.tile(1e-8 * np.eye(2), (12, 1, 1))), logs(12)
+    ln_f = np.log(np.tile([stage.modes[0].frequency_hz, stage.modes[1].frequency_hz], (12, 1)))
+    for last, lost in ((8, False), (7, True)):
+        seen = np.where(np.arange(12)[:, None] < last, ln_f, np.nan)
+        seen = np.resize(seen, (12, len(history.series)))
+        found = replace(history, ln_frequency=seen)
+        doubt = doubt_of_names(stage, found, track)
+        assert ("in the last 5 logs, so that no health" in doubt) is lost
+    stray = replace(found, ln_frequency=np.where(np.arange(12)[:, None] == 9, ln_f, seen))
+    assert doubt_of_names(stage, stray, track) == ""
+    outliers = replace(track, outliers=tuple((9, mode) for mode in track.modes))
+    assert doubt_of_names(stage, stray, outliers)

@@ -985,7 +985,8 @@ def test_a_log_that_only_moves_and_stops_is_read_from_its_decays() -> None:
 
 
 def test_stops_that_excite_nothing_leave_the_log_too_short() -> None:
-    """Where decays show no mode either, the refusal is that of the segments."""
+    """Where decays show no mode either, the refusal is that of the segments, with that of them."""
     log = stops_log(0.3, noise=50.0)
-    with pytest.raises(BadLog, match=r"too-short.*no segment of constant velocity"):
+    refused = r"too-short.*no segment of constant velocity.*decays after stops: no resonance"
+    with pytest.raises(BadLog, match=refused):
         identify(log, make_stage([("a", 62.0, 0.02)]))

@@ -241,6 +241,20 @@ def test_nis_band_is_chi_square(ax: Axes, track: Track) -> None:
     assert "log scale" in ax.get_ylabel()
 
 
+def test_figures_without_odometer_count_days(ax: Axes, history: History, track: Track) -> None:
+    """A machine without odometer has its logs at their days, also on a logarithmic scale."""
+    unknown = np.full_like(track.travel, np.nan)
+    days = replace(track, travel=unknown, nis=np.where(np.arange(track.nis.size), 1.0, 1e3))
+    logs = replace(history, travel=unknown)
+    plots.svg(lambda ax: plots.plot_nis(ax, days), salt="a")
+    plots.plot_frequencies(ax, logs, days, logs.modes[0])
+    assert ax.get_xlabel() == "days since the first log"
+    drawn = ax.lines[0].get_xdata()
+    passed = (history.recorded_at[-1] - history.recorded_at[0]).total_seconds() / 86400
+    assert np.isfinite(np.asarray(drawn, dtype=float)).all() and passed > 0
+    assert np.isclose(np.max(np.asarray(drawn, dtype=float)), passed)
+
+
 def test_waterfall_shows_every_log_in_its_column(ax: Axes, history: History, track: Track) -> None:
     """Colours are the levels, columns hold their logs, and lines do not decide the colours."""
     waterfall = make_waterfall(history)

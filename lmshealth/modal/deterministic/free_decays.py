@@ -32,6 +32,7 @@ from lmshealth.modal.targets import (
     choose_targets,
     limit_channels,
 )
+from lmshealth.signal.constants import SETTLING_TIME
 from lmshealth.signal.segments import Segment, select_segments
 from lmshealth.stage.description import Stage
 
@@ -192,11 +193,15 @@ def _limits(
     low, high = max(low, least), min(high, top)
     needed = constants.DECAY_PERIODS + constants.DECAY_ORDINATES
     if high * duration < needed:
+        # More recording does not help where a decay is as long as any that is used.
+        todo = "continue recording after the stop"
+        if duration > 0.99 * SETTLING_TIME:
+            todo = f"no more than {SETTLING_TIME:g} s after a stop are used, excite it otherwise"
         raise BadLog(
             log.name,
             "too-short",
             f"decays of {duration:.3g} s hold {max(high * duration, 0):.0f} periods of the highest "
-            f"mode; needed are {needed:.0f}: continue recording after the stop",
+            f"mode; needed are {needed:.0f}: {todo}",
         )
     return low, high
 

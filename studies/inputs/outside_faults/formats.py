@@ -193,7 +193,6 @@ def spectrum(folder: Path, names: str = "Frequency [Hz],PSD [g²/Hz]") -> Path:
 
 
 EXACT: dict[bool, Ask] = {b: partial(read, partial(uff, binary=b), 126.0) for b in (False, True)}
-ALIGNED = (1.5, 1.8)
 CONTROL: Ask = partial(read, log, 126.0)
 NAMED: Ask = partial(proposed, partial(timed, names="Time [us],a,b", unit=1e6, digits=0),
                      ("2000 Hz",), mode=126.0)  # fmt: skip

@@ -14,6 +14,7 @@ from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Log
 from lmshealth.signal.segments import Segment
 from lmshealth.stage.description import Description, ModeSpec, Stage
+from studies.harness.data.samples import MAPS
 from studies.harness.study import Row
 
 REPEATS = 3
@@ -22,25 +23,12 @@ TABLE = {1.227: 26.25, 1.648: 28.22, 2.085: 30.81, 2.505: 33.90, 2.935: 37.55, 3
 TOLERANCE, UP_AND_DOWN = 0.15, 0.1
 BEAM = ModeSpec("beam", 33.0, 0.002, search=0.3)
 # The position is in volts; it takes the place of a displacement.
-COLUMN_MAP = """
-[columns]
-time_s = "3"
-acc_low = "0"
-acc_high = "1"
-delta_e_roller = "2"
-[units]
-acc_low = 1.0
-acc_high = 1.0
-delta_e_roller = 1.0
-[csv]
-skip_rows = 9
-delimiter = "\\t"
-header = false
-"""
+COLUMN_MAP = MAPS["dropbear_ds8/open/10steps_test0.txt.gz"].replace(
+    "[units]", 'delta_e_roller = "2"\n[units]\ndelta_e_roller = 1.0'
+)
 # The roller rests where it moves by less than this share of its travel in so many seconds; the
 # median over a part of that hides the noise of its sensor.
-_STILL, _WHILE, _SMOOTH = 0.01, 0.05, 0.02
-_SHORTEST = 0.3
+_STILL, _WHILE, _SMOOTH, _SHORTEST = 0.01, 0.05, 0.02, 0.3
 
 
 def read_beam(folder: Path, repeat: int) -> Log:

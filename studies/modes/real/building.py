@@ -94,15 +94,12 @@ def write_log(path: Path, samples: np.ndarray[Any, Any], hours: float) -> None:
 def evaluate(out: Path, full: Modes, n_windows: int) -> Row:
     """Compare windows with the published values and with the full record."""
     modes = pd.read_csv(out / "modes.csv")
-    health = pd.read_csv(out / "health.csv").iloc[-1]
     prognosis = pd.read_csv(out / "prognosis.csv").set_index("parameter").loc["any"]
     columns = ["log", "mode", "frequency_hz", "frequency_std_hz"]
     columns += ["damping_ratio", "damping_ratio_std"]
     return {
         "n_windows": n_windows,
         "modes": {name: compare(name, modes[modes["mode"] == name], full) for name in PUBLISHED},
-        "stiffness": {key: float(health[key]) for key in ("q05", "median", "q95")},
-        "verdict": str(pd.read_csv(out / "verdict.csv").iloc[0]["verdict"]),
         "service_by": None if pd.isna(prognosis["service_by"]) else str(prognosis["service_by"]),
         "windows": modes[columns].to_dict("records"),
     }

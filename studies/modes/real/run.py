@@ -4,18 +4,16 @@ Method
     A timber building under ambient excitation (90 min, 6 accelerometers, 100 Hz) is cut into
     5-minute logs, on which `lmshealth run` is called with building.toml; the whole record and its
     thirds are identified as one log each, the whole also with other dampings in the description,
-    from which the band of the fit follows. All other sets are one log each, with a description of
-    what is known: a three-storey frame on a shaking table with flexible and with stiff columns
-    (floor by floor, because the loggers were not started together; damping assumed as 2 %), and two
-    sets that are simulated by others: a shear frame with exact parameters (koma), and a light frame
-    with dampings of 0.2 % (Weimar). A weak mode beside the mains (MPSTD) is searched for without a
+    from which the band of the fit follows. Two sets are simulated by others, one log each: a shear
+    frame with exact parameters (koma), and a light frame with dampings of 0.2 % (Weimar). A weak
+    mode beside the mains (MPSTD) is searched for without a
     description. The shear frame's parameters are compared as documented, and as an integration by
     the trapezoidal rule in steps of its 12 Hz makes them. Control: the coverage of the building's
     windows with all standard deviations halved.
 Run time
     About a minute on one processor.
 Data
-    Folders ``palisaden_building``, ``shake_3storey``, ``SIMULATED_koma_shearframe``,
+    Folders ``palisaden_building``, ``SIMULATED_koma_shearframe``,
     ``SIMULATED_weimar_frame`` and ``uff58_samples`` of LMSHEALTH_DATA.
 """
 
@@ -27,7 +25,7 @@ from itertools import combinations, product
 from studies.harness.claims import Claim, counted, number, percents, span
 from studies.harness.study import Row, Study, real_data
 from studies.modes.real.building import study_building
-from studies.modes.real.sets import Z95, study_koma, study_mpstd, study_shake, study_weimar
+from studies.modes.real.sets import Z95, study_koma, study_mpstd, study_weimar
 
 NOT_MET = {
     "building: no end of life visible": "no log excludes that an end begins within a time as short "
@@ -55,7 +53,6 @@ def main() -> None:
     answer: Row = {
         "seed": 0,
         "building": study_building(data, quick=study.quick),
-        "shake": study_shake(data),
         "shear_frame": study_koma(data),
         "light_frame": study_weimar(data),
         "weak_mode": study_mpstd(data),
@@ -67,7 +64,6 @@ def main() -> None:
 def judge_building(building: Row) -> dict[str, bool]:
     """Return whether the building is as it is known to be."""
     modes, n = building["modes"].values(), building["n_windows"]
-    low, _, high = building["stiffness"].values()
     seen = [part for part in building["parts"] if "f_hz" in part]
     inside = [abs(p[key]) < Z95 for p in seen for key in _OFF]
     found = [row for row in building["described"] if "f_hz" in row]
@@ -91,8 +87,6 @@ def judge_building(building: Row) -> dict[str, bool]:
         "building: every third gives every mode": len(seen) == len(building["parts"]),
         "building: intervals of each third hold the whole": all(inside),
         "building: halved intervals hold less": halved < held,
-        "building: verdict is healthy": building["verdict"] == "healthy",
-        "building: stiffness 1 inside its 90 % interval": low < 1 < high,
         "building: no end of life visible": building["service_by"] is None,
     }
 
@@ -100,15 +94,8 @@ def judge_building(building: Row) -> dict[str, bool]:
 def judge_others(answer: Row) -> dict[str, bool]:
     """Return whether all others are as they are known to be."""
     shear, light, weak = answer["shear_frame"], answer["light_frame"], answer["weak_mode"]
-    shake = answer["shake"]["rows"]
-    every, seen = (
-        {(row["frame"], row["mode"]) for row in shake if key in row} for key in ("mode", "f_hz")
-    )
     kinds = [line["kind"] for line in weak["lines"]]
     return {
-        "shake: every mode is seen on some floor": seen == every,
-        "shake: frequencies right wherever seen": all(row.get("right", True) for row in shake),
-        "shake: stiffness ratio 4.5 ± 0.5": abs(answer["shake"]["stiffness_ratio"] - 4.5) < 0.5,
         "shear frame: documented frequencies inside": all(r["holds_documented_f"] for r in shear),
         "shear frame: stepped frequencies inside": all(r["holds_stepped_f"] for r in shear),
         "shear frame: documented dampings inside": all(r["holds_documented_zeta"] for r in shear),

@@ -2,21 +2,17 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-import msgspec
 import numpy as np
 from scipy.stats import norm
 
 from lmshealth import identify, read_log
-from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.log import Channel, Log, Metadata
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Description, ModeSpec, Stage
-from studies.harness.data.samples import MAPS
 from studies.harness.study import Row
 
 Z95 = float(norm.isf(0.025))
@@ -26,9 +22,7 @@ SHAKE = {
     "Flexible": ((3.63, 3.75, 0.15), (11.1, 11.25, 0.3), (16.6, 16.8, 0.3)),
     "Stiff": ((7.73, 7.98, 0.15), (25.0, 25.0, 0.3)),
 }
-# Nobody says how it is damped: the usual first guess for a frame.
-SHAKE_DAMPING, FLOORS = 0.02, ("1st", "2nd", "3rd")
-KOMA_RATE = 12.0
+FLOORS, KOMA_RATE = ("1st", "2nd", "3rd"), 12.0
 # Channels 3 and 4 are accelerations; the set's own description drops channel 5.
 WEIMAR_RATE, WEIMAR_CHANNELS = 256.0, (3, 4)
 WEIMAR = (4.018, 4.771, 6.682, 7.616, 9.665, 12.167, 12.598)
@@ -131,26 +125,3 @@ def study_mpstd(data: Path) -> Row:
         "modes_at_mains": int(np.sum(np.abs(modes.frequency - MAINS) < 1)),
         "lines": [{"frequency_hz": line.frequency, "kind": line.kind} for line in lines],
     }
-
-
-def study_shake(data: Path) -> Row:
-    """Identify the frame on a shaking table, floor by floor: the loggers' clocks do not agree."""
-    rows: list[Row] = []
-    for frame, known in SHAKE.items():
-        middle = [(low + high) / 2 for low, high, _ in known]
-        for floor in FLOORS:
-            name = f"shake_3storey/open/{frame}_BonusEvent_{floor}.csv"
-            columns = msgspec.convert(tomllib.loads(MAPS[name]), ColumnMap)
-            log = read_log(data / name, columns=columns)
-            found = identify_known(log, middle, [SHAKE_DAMPING] * len(known), ["acc_x"])
-            for k, (row, (low, high, tolerance)) in enumerate(zip(found, known, strict=True)):
-                row |= {"frame": frame, "floor": floor, "mode": k, "low_hz": low, "high_hz": high}
-                row["tolerance_hz"] = tolerance
-                if "f_hz" in row:
-                    row["right"] = low - tolerance <= row["f_hz"] <= high + tolerance
-                rows.append(row)
-    first = [
-        np.median([r["f_hz"] for r in rows if r["frame"] == f and r["mode"] == 0 and "f_hz" in r])
-        for f in SHAKE
-    ]
-    return {"rows": rows, "stiffness_ratio": float((first[1] / first[0]) ** 2)}

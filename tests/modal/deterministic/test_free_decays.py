@@ -239,6 +239,9 @@ def test_what_cannot_be_analysed_is_said() -> None:
     stage = make_stage(MODES)
     with pytest.raises(BadLog, match="too-short"):
         identify_decays(log, stage, segments=[Segment(0, 30, 0.0)])
+    # Half a second is used of a decay, which more recording does not lengthen.
+    with pytest.raises(BadLog, match=r"no more than 0\.5 s after a stop"):
+        identify_decays(log, make_stage([("a", 20.0, 0.01)]), segments=[Segment(0, 200, 0.0)])
     with pytest.raises(BadLog, match="sample-rate"):
         of_pieces(log, make_stage([("high", 180.0, 0.01)]))
     with pytest.raises(BadLog, match="channel"):
