@@ -75,6 +75,7 @@ class ClusterData:
     binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
+    static: float = 0.0  # static response of modes that is expected
 
     @property
     def duration(self) -> float:
@@ -204,9 +205,13 @@ def fit_modes(
     binned: BinnedSpectra,
     targets: tuple[Target, ...],
     band: tuple[float, float],
+    static: float = 0.0,
 ) -> ClusterFit:
-    """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence."""
-    data = prepare(spectra, binned, targets, band)
+    """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
+
+    ``static`` is the expected static response of the modes over their shapes.
+    """
+    data = replace(prepare(spectra, binned, targets, band), static=static)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -519,7 +524,8 @@ def _solve(
         [
             np.log([target.frequency for target in targets]),
             np.log(zeta),
-            np.zeros(layout.n_poles - 2 * len(targets)),
+            np.full(len(targets), data.static),
+            np.zeros(layout.n_poles - 3 * len(targets)),
             [float(i == j) for i, j in layout.force],
             [sign[c, i] * amplitude[c, i] / scale[i] for c, i in layout.shape],
         ]
