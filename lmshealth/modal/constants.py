@@ -90,8 +90,7 @@ PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
 PRIOR_FLOORS = (5.0, 2.0, 1.0), (0.3, 2.0, 1.0)
 # Standard deviations of priors that are marginalised over these widths, of which the fit uses the
 # last: the share of a floor that is coherent with the modes and with other floors (in units of the
-# floor), its bend, and the static response of a mode over its receptance: 0 where the force acts on
-# the moving body, -1 where the base moves and the acceleration is absolute.
+# floor), its bend, and the static response of a mode, over its receptance, less that of the band.
 WIDTHS_SHARED, WIDTHS_COMMON, WIDTHS_BEND = (0.03, 0.1, 1.0), (0.03, 0.3, 3.0), (0.03, 0.1, 1.0)
 WIDTHS_STATIC = (0.03, 0.2, 1.0)
 

@@ -596,7 +596,8 @@ def _fit_group(
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    fit = fit_modes(found.around(near, low, high), binned, near, (low, high))
+    around, static = found.around(near, low, high), found.model.static
+    fit = fit_modes(around, binned, near, (low, high), static)
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

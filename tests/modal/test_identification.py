@@ -410,12 +410,12 @@ def test_white_noise_has_no_mode() -> None:
 
 def test_what_is_too_weak_for_a_mode_is_said_to_stand_out() -> None:
     """Without a description a peak that no fit bears out is named with what it lacks."""
-    log = acceleration_log(rng(2), [Mode(120.0, 0.01)], 30.0, 1000.0, 1600.0)
+    log = acceleration_log(rng(4), [Mode(120.0, 0.01)], 30.0, 1000.0, 1600.0)
     found = identify(log, band=(60.0, 200.0))
     assert found.names == ()
     (refusal,) = found.refused
     assert refusal.reason == "too-uncertain"
-    assert refusal.detail.startswith("1 peak above the noise, of which none is a mode: 119.8")
+    assert refusal.detail.startswith("1 peak above the noise, of which none is a mode: 120.57")
 
 
 def test_a_mode_that_is_not_there_is_refused_and_the_other_kept() -> None:
@@ -556,9 +556,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         binned: BinnedSpectra,
         targets: tuple[Target, ...],
         band: tuple[float, float],
+        static: float,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, binned, targets, band)
+        return fit_modes(view, binned, targets, band, static)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen

@@ -34,8 +34,10 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 
 # Multiplicative updates to convergence; their exponent over that for which monotonicity is proved.
 _UPDATES, _STRIDE = 25, 1.8
-# So many channels are fitted as they are; of more, directions from this singular value on.
-_FEW, _INDEPENDENT = 4, 0.1
+# So many channels are fitted as they are; of more, directions that leave so much of each mode.
+_FEW, _SEEN = 4, 0.9
+# Ordinates at which directions are compared, at least.
+_LOOKED_AT = 200
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
 _COLLAPSED = 0.1
 # That with which a pole begins anew beside a line.
@@ -75,6 +77,7 @@ class ClusterData:
     binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
+    static: float = 0.0  # static response of modes that is expected
 
     @property
     def duration(self) -> float:
@@ -204,9 +207,13 @@ def fit_modes(
     binned: BinnedSpectra,
     targets: tuple[Target, ...],
     band: tuple[float, float],
+    static: float = 0.0,
 ) -> ClusterFit:
-    """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence."""
-    data = prepare(spectra, binned, targets, band)
+    """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
+
+    ``static`` is the expected static response of the modes over their shapes.
+    """
+    data = replace(prepare(spectra, binned, targets, band), static=static)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -356,22 +363,44 @@ def _over(spectrum: CrossSpectrum, unit: FloatArray) -> CrossSpectrum:
 def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArray:
     """Return an orthonormal basis of the directions in which the modes are seen best.
 
-    They are the shapes φ, and (1 + G G*)⁻¹ φ, which avoids what is foreign, at all ordinates; both
-    in units of the noise, in which nothing else distinguishes directions.
+    They span the shapes φ, and (1 + G G*)⁻¹ φ, which avoids what is foreign, at the ordinates; both
+    in units of the noise, in which nothing else distinguishes directions. There are as many as
+    leave each mode its share of φ* (1 + G G*)⁻¹ φ in the mean of the ordinates.
     """
     shapes = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
     phi = np.stack(shapes, axis=1) / np.linalg.norm(shapes, axis=1)
+    foreign = [
+        s.foreign[:: 1 + s.frequency.size // _LOOKED_AT]
+        for s in spectra.spectra
+        if s.foreign is not None
+    ]
+    if not foreign:
+        return np.asarray(np.linalg.svd(phi, full_matrices=False)[0])
     columns = [phi]
-    for s in spectra.spectra:
-        if s.foreign is not None:
-            adjoint = np.swapaxes(s.foreign.conj(), 1, 2)
-            share = np.linalg.solve(np.eye(len(adjoint[0])) + adjoint @ s.foreign, adjoint @ phi)
-            best = phi - s.foreign @ share
-            best = best / np.linalg.norm(best, axis=1, keepdims=True)
-            rows = np.moveaxis(best, 1, 0).reshape(len(phi), -1) / np.sqrt(s.frequency.size)
-            columns += [rows.real, rows.imag]
-    u, size, _ = np.linalg.svd(np.concatenate(columns, axis=1), full_matrices=False)
-    return np.asarray(u[:, size > _INDEPENDENT])
+    for g in foreign:
+        best = phi - g @ _share(g, phi)
+        best = best / np.linalg.norm(best, axis=1, keepdims=True)
+        rows = np.moveaxis(best, 1, 0).reshape(len(phi), -1) / np.sqrt(len(g))
+        columns += [rows.real, rows.imag]
+    u = np.linalg.svd(np.concatenate(columns, axis=1), full_matrices=False)[0]
+    whole = [_seen(np.eye(len(phi)), phi, g) for g in foreign]
+    for n in range(phi.shape[1], u.shape[1]):
+        shares = [_seen(u[:, :n], phi, g) / all_ for g, all_ in zip(foreign, whole, strict=True)]
+        if np.concatenate(shares).mean(axis=0).min() > _SEEN:
+            return np.asarray(u[:, :n])
+    return np.asarray(u)
+
+
+def _share(g: ComplexArray, phi: FloatArray) -> ComplexArray:
+    """Return (1 + G* G)⁻¹ G* φ, shape ``(n, n_foreign, n_modes)``."""
+    adjoint = np.swapaxes(g.conj(), 1, 2)
+    return np.asarray(np.linalg.solve(np.eye(g.shape[2]) + adjoint @ g, adjoint @ phi))
+
+
+def _seen(basis: FloatArray, phi: FloatArray, g: ComplexArray) -> FloatArray:
+    """Return φ* (1 + G G*)⁻¹ φ of what a basis shows, shape ``(n, n_modes)``."""
+    phi, g = basis.T @ phi, basis.T @ g
+    return np.asarray(np.sum(phi * (phi - g @ _share(g, phi)), axis=1).real)
 
 
 def mask_prominent_lines(data: ClusterData) -> ClusterData:
@@ -519,7 +548,8 @@ def _solve(
         [
             np.log([target.frequency for target in targets]),
             np.log(zeta),
-            np.zeros(layout.n_poles - 2 * len(targets)),
+            np.full(len(targets), data.static),
+            np.zeros(layout.n_poles - 3 * len(targets)),
             [float(i == j) for i, j in layout.force],
             [sign[c, i] * amplitude[c, i] / scale[i] for c, i in layout.shape],
         ]

@@ -64,7 +64,7 @@ def floor_ratio(data: BandData, g: ComplexArray) -> FloatArray:
 class JointModel:
     """Modes with real shapes and correlated forces, and independent floors.
 
-    E = Σ R_ij b_i b_j* + floors, b_i = φ_i h_i + ρ_i. Modes are refined one after the other by
+    E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Modes are refined one after the other by
     Fisher's scoring with the others fixed, so that the cost of a sweep is linear in their number.
     It selects modes; published estimates come from the likelihood of `whittle`.
     """
@@ -74,8 +74,9 @@ class JointModel:
     f: FloatArray  # in Hz, (n_modes,)
     zeta: FloatArray
     phi: FloatArray  # root of the PSD of the modal force in each channel, (n_channels, n_modes)
-    rho: FloatArray  # static response, as phi
+    rho: FloatArray  # static response beside that of all modes, as phi
     r: FloatArray  # correlations of the forces, (n_modes, n_modes)
+    static: float = 0.0  # c: -1 where the base moves and absolute acceleration is measured
 
     def subset(self, kept: BoolArray) -> JointModel:
         """Return the model of some of its modes."""
@@ -124,7 +125,7 @@ class JointModel:
         """
         count = data.count if within is None else data.count * within(data.frequency)
         n, more = len(self.phi), data.scale.size - len(self.phi)
-        h = response(self.f[:, None], self.zeta[:, None], self.data.frequency)
+        h = self._response(self.data.frequency)
         # Expected cross spectra of a channel with the others, per unit of its part in each mode.
         unit = h.T[:, :, None] * (self.r @ np.swapaxes(self._b.conj(), 1, 2))
         weighted = count[:, None, None] * (unit @ self._inverse)
@@ -170,8 +171,12 @@ class JointModel:
 
     def _columns(self, frequency: FloatArray) -> ComplexArray:
         """Return b, shape ``(n, n_channels, n_modes)``."""
+        return np.asarray(self.phi * self._response(frequency).T[:, None, :] + self.rho)
+
+    def _response(self, frequency: FloatArray) -> ComplexArray:
+        """Return h + c, shape ``(n_modes, n)``."""
         h = response(self.f[:, None], self.zeta[:, None], frequency)
-        return np.asarray(self.phi * h.T[:, None, :] + self.rho)
+        return np.asarray(h + self.static)
 
     @cached_property
     def _b(self) -> ComplexArray:
@@ -260,7 +265,7 @@ class JointModel:
         u = np.concatenate(
             [
                 np.stack(slopes, axis=1)[:, None, :] * self.phi[None, :, i, None],
-                h[:, None, None] * eye,
+                (h + self.static)[:, None, None] * eye,
                 np.ones((h.size, 1, 1)) * eye,
             ],
             axis=2,

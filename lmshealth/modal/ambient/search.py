@@ -54,6 +54,11 @@ _DOUBTFUL, _NEAR, _MOST_TRIED = 150.0, 3.0, 6
 _ROUNDS = 4
 # Half widths of the windows in which the residual is averaged, as fractions of the frequency.
 _WINDOWS = (0.003, 0.006, 0.012, 0.024)
+# Static responses of all modes that are tried: of force and acceleration, and of absolute
+# acceleration where the base moves.
+_STATICS = 0.0, -1.0
+# Sweeps of the model whose modes are chosen: fits see its other modes as foreign.
+_SWEEPS = 20
 # Modes closer than this, in half-power bandwidths, are neighbours; of these, those that overlap.
 _NEIGHBOUR, _OVERLAP = 12.0, 4.0
 
@@ -126,7 +131,7 @@ def search(
         first = _informative(spectra, low, high)
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
-    model = _without_splits(model, len(hints))
+    model = _without_splits(model, len(hints)).refined(_SWEEPS)
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
@@ -466,7 +471,8 @@ def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
     r = np.real(s * np.outer(turn.conj(), turn)) / np.outer(root, root)
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
     real = np.real(phi[chosen] * turn[:, None]).T * (root / peak[chosen])
-    return JointModel(data, floor, f[chosen], zeta[chosen], real, np.zeros_like(real), r)
+    poles = f[chosen], zeta[chosen], real, np.zeros_like(real), r
+    return min((JointModel(data, floor, *poles, c) for c in _STATICS), key=lambda one: one.misfit)
 
 
 def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:

@@ -620,9 +620,10 @@ def marginalise(likelihood: Likelihood, p: FloatArray) -> Marginal:
     index = np.array([unknown for group in groups for unknown in group], dtype=int)
     precision = np.linalg.inv(cov[np.ix_(index, index)])
     follow = cov[:n, index] @ precision  # regression of ln f and ln ζ on these unknowns
-    gain, mean, narrowed = _narrow(p[index], precision, [len(group) for group in groups])
+    x = (p - likelihood.start)[index]
+    gain, mean, narrowed = _narrow(x, precision, [len(group) for group in groups])
     weight = softmax(gain)
-    moved = (mean - p[index]) @ follow.T
+    moved = (mean - x) @ follow.T
     estimate = p[:n] + weight @ moved
     apart = p[:n] + moved - estimate
     less = cov[np.ix_(index, index)] - np.tensordot(weight, narrowed, axes=1)
