@@ -231,10 +231,12 @@ def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
     if not columns or missed < least:
         return ""
     names = ", ".join(dict.fromkeys(history.series[k].mode for k in columns))
-    return (
-        f"None of the modes of the map ({names}) was found in the last {missed} logs, so that no "
+    return fact(
+        "None of the modes of the map ({names}) was found in the last {missed} logs, so that no "
         "health is published: look into their spectra for where the modes are now; search there, "
-        "or excite more."
+        "or excite more.",
+        names=names,
+        missed=missed,
     )
 
 

@@ -27,8 +27,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import Claim, number
-from studies.harness.metrics import clopper_pearson, crps
+from studies.harness.metrics import crps
 from studies.harness.study import Row, Study
 from studies.life.kinds.answers import IMPORTANCE, answer
 from studies.life.kinds.plant import LIMITS, MODES, Array, drift, map_table

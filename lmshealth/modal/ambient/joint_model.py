@@ -64,9 +64,9 @@ def floor_ratio(data: BandData, g: ComplexArray) -> FloatArray:
 class JointModel:
     """Modes with real shapes and correlated forces, and independent floors.
 
-    E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Modes are refined one after the other by
-    Fisher's scoring with the others fixed, so that the cost of a sweep is linear in their number.
-    It selects modes; published estimates come from the likelihood of `whittle`.
+    E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Modes are refined one after the other
+    by Fisher's scoring with the others fixed, so that the cost of a sweep is linear in their
+    number. It selects modes; published estimates come from the likelihood of `whittle`.
     """
 
     data: BandData
