@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.optimize import isotonic_regression
 from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
@@ -245,7 +245,7 @@ def plot_spectra(
     level, fitted, singular = map(density, (summary.level, summary.fitted, summary.singular))
     refused = {one.channel: one.reason for one in modes.refused if not one.mode}
     count = summary.count.astype(float)
-    range_ = gamma.ppf([[0.025], [0.975]], count) / count
+    range_ = gammaincinv(count, [[0.025], [0.975]]) / count
     for ax, name, derived, own, fit in zip(
         panels, summary.channels, summary.derived, level, fitted, strict=False
     ):
