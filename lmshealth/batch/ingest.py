@@ -27,11 +27,7 @@ from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_m
 from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
-from lmshealth.modal.identification import read_modes
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.mode_shapes import mode_shapes
-from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
-from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 
 NOT_LISTED = "not-listed"
@@ -428,6 +424,12 @@ def identify_log(
     It is read with `max_memory` and `latest` of `read_log`; the identification may take ``limit``
     seconds of processor time.
     """
+    # Late: only workers need them, and only where a log is new.
+    from lmshealth.modal.identification import read_modes
+    from lmshealth.modal.mode_shapes import mode_shapes
+    from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
+    from lmshealth.signal.following_error import loop_error
+
     by, stage, asked = "", None, None
     try:
         read = partial(read_log, columns=task.columns, overrides=task.overrides)

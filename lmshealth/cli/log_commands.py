@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import click
-import pandas as pd
 from msgspec.structs import replace
 
 from lmshealth._private.files import write_text
@@ -123,6 +122,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
 
 def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
     """Write a manifest with what the files state; a manifest names no file out of its folder."""
+    import pandas as pd  # late: only this needs it
+
     folder = sheet.absolute().parent
     if outside := [row["file"] for row in rows if not row["file"].is_relative_to(folder)]:
         why = f"not written, {outside[0]} is not in its folder: choose --out with the logs in it"

@@ -18,11 +18,6 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
 from lmshealth._private.names import spell
 from lmshealth.io.log import SI_UNITS, Log, Refusal
-from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
-from lmshealth.modal.ambient.search import Found
-from lmshealth.modal.deterministic.frequency_response import FrfReading
-from lmshealth.modal.deterministic.measured import MeasuredResponse
-from lmshealth.modal.identification import ModalReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
@@ -35,6 +30,12 @@ from lmshealth.stage.description import ChannelSpec, Stage
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
+    from lmshealth.modal.ambient.search import Found
+    from lmshealth.modal.deterministic.frequency_response import FrfReading
+    from lmshealth.modal.deterministic.measured import MeasuredResponse
+    from lmshealth.modal.identification import ModalReading
 
 _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.

@@ -1,13 +1,15 @@
 """Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
-from collections.abc import Sequence
+import csv
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from io import BytesIO
+from io import StringIO
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.polynomial.chebyshev import chebder, chebvander
 
 from lmshealth._private.arrays import BoolArray, FloatArray
@@ -81,67 +83,91 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         why = getattr(error, "strerror", None) or error
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     try:
-        # Blank lines are kept, so that the index of a row gives its line.
-        table = pd.read_csv(BytesIO(content), skip_blank_lines=False).dropna(how="all")
-    except ValueError:
+        header, *records = csv.reader(StringIO(content.decode("utf-8-sig"), newline=""))
+        if any(len(cells) > len(header) for cells in records):
+            raise ValueError
+    except (ValueError, csv.Error):
         # A description may name any file: nothing of one that is no table is quoted.
         raise BadStage(f"{path}: it is not a modal map: no table of numbers with commas") from None
-    needed = {*parameters, "mode", "frequency_hz"}
-    missing, extra = needed - set(table.columns), set(table.columns) - needed
+    header, needed = [name.strip() for name in header], {*parameters, "mode", "frequency_hz"}
+    missing, extra = needed - set(header), set(header) - needed
+    extra |= {name for name in header if header.count(name) > 1}
     if missing:
-        there = "it is not a modal map" if missing == needed else f"there are {list(table.columns)}"
+        there = "it is not a modal map" if missing == needed else f"there are {header}"
         raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
     if extra:
         raise BadStage(
             f"{path}: columns {sorted(extra)} are not parameters of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
-    numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
-    for name, column in numbers.items():
-        low, high = constants.FREQUENCY_HZ if name == "frequency_hz" else constants.VALUE
-        wrong = ~column.between(low, high).to_numpy()
-        if wrong.any():
-            found = f"{_line(path, table, wrong)}: {name} is {table[name].iloc[wrong.argmax()]}"
-            raise BadStage(f"{found}; needed is a positive number, {low:g} to {high:g}")
-    unnamed = table["mode"].isna().to_numpy()
-    if unnamed.any():
-        raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
-    table = table.assign(**numbers, mode=table["mode"].astype(str))
-    twice = table.duplicated([*parameters, "mode"]).to_numpy()
-    if twice.any():
-        raise BadStage(f"{_line(path, table, twice)}: a mode occurs twice at one grid point")
-    return _fit(path, table, parameters)
+    # Blank lines count, and hold nothing.
+    rows = {
+        line: dict(zip_longest(header, map(str.strip, cells), fillvalue=""))
+        for line, cells in enumerate(records, start=2)
+        if any(map(str.strip, cells))
+    }
+    grid = [_column(path, rows, name, constants.VALUE) for name in parameters]
+    frequency = _column(path, rows, "frequency_hz", constants.FREQUENCY_HZ)
+    seen = set[tuple[str, ...]]()
+    for (line, row), *point in zip(rows.items(), *grid, strict=True):
+        if not row["mode"]:
+            raise BadStage(f"{path}: line {line}: a mode without a name")
+        if (one := (row["mode"], *point)) in seen:
+            raise BadStage(f"{path}: line {line}: a mode occurs twice at one grid point")
+        seen.add(one)
+    return _fit(path, parameters, np.array(grid), [row["mode"] for row in rows.values()], frequency)
 
 
-def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
-    """Name the line of the first wrong row; line 1 holds the column names."""
-    return f"{path}: line {table.index[wrong][0] + 2}"
+def _column(
+    path: str, rows: Mapping[int, Mapping[str, str]], name: str, limits: tuple[float, float]
+) -> FloatArray:
+    """Return the numbers of a column, ``(n_rows,)``; refuse those out of their limits."""
+    low, high = limits
+    found = []
+    for line, row in rows.items():
+        try:
+            number = float(row[name].replace("_", "?"))  # which Python takes for a part of a number
+        except ValueError:
+            number = np.nan
+        if not low <= number <= high:
+            what = f"{path}: line {line}: {name} is {row[name] or 'nan'}"
+            raise BadStage(f"{what}; needed is a positive number, {low:g} to {high:g}")
+        found.append(number)
+    return np.array(found)
 
 
-def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMap:
-    modes = tuple(table["mode"].unique())
-    wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
-    axes = [np.unique(table[name]) for name in parameters]
-    n_grid = int(np.prod([axis.size for axis in axes]))
-    values = wide[list(modes)].to_numpy(dtype=float)
-    if values.shape[0] != n_grid or np.isnan(values).any():
+def _fit(
+    path: str,
+    parameters: tuple[str, ...],
+    grid: FloatArray,
+    names: Sequence[str],
+    frequency: FloatArray,
+) -> ModalMap:
+    """Fit the surrogate to frequencies ``(n_rows,)`` at grid points ``(n_parameters, n_rows)``."""
+    modes = tuple(dict.fromkeys(names))
+    axes = [np.unique(values) for values in grid]
+    sizes = [axis.size for axis in axes]
+    n_grid = math.prod(sizes)
+    if len(names) != n_grid * len(modes):  # no mode is twice at a point
         raise BadStage(
-            f"{path}: {np.isfinite(values).sum()} values where a full grid of {n_grid} points "
+            f"{path}: {len(names)} values where a full grid of {n_grid} points "
             f"with modes {list(modes)} needs {n_grid * len(modes)}"
         )
-    if min(axis.size for axis in axes) < 3:
-        found = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+    if min(sizes) < 3:
+        found = dict(zip(parameters, sizes, strict=True))
         raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {found}")
     for name, axis in zip(parameters, axes, strict=True):
         if (axis[1:] / axis[:-1]).min() < constants.LEAST_STEP:
             raise BadStage(f"{path}: grid values of {name} are equal but for rounding")
-    points = np.log(wide.index.to_frame().to_numpy(dtype=float))
+    order = np.lexsort((*grid[::-1], [modes.index(name) for name in names]))
+    values = frequency[order].reshape(len(modes), n_grid).T
+    points = np.log(grid[:, order[:n_grid]].T)
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
-    sizes, miss = _choose_sizes(unit, np.log(values), [axis.size for axis in axes])
-    basis = _basis(unit, sizes)
+    degrees, miss = _choose_sizes(unit, np.log(values), sizes)
+    basis = _basis(unit, degrees)
     coefficients = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
-    coefficients = coefficients.reshape(*sizes, len(modes))
+    coefficients = coefficients.reshape(*degrees, len(modes))
     return ModalMap(parameters, modes, low, high, coefficients, miss)
 
 
