@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -311,6 +311,8 @@ def _all_digests(
         size=constants.FILES_PER_HASH_TASK,
     )
     left = [path for path in files if path not in known]
+    if len(left) <= constants.FILES_PER_HASH_TASK:  # a process takes longer to start
+        resources = replace(resources, pool=Pool())
     for _, part in hashing.values(left, resources):
         digests |= part
         new = {files[path]: digest for path, digest in part.items() if isinstance(digest, str)}
