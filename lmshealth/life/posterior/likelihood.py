@@ -272,7 +272,7 @@ class LifeLikelihood:
         # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of map errors of 1, ``(n_rows, n_rows, 1, n_points, n)``.
         gram = np.moveaxis(rows @ np.swapaxes(rows, 2, 3), (2, 3), (0, 1))[:, :, None]
         scale = np.array([std for std, _ in self.data.stage.map_errors])[:, None, None]
-        scaled = gram * scale**2
+        scaled = np.multiply(gram, scale**2, order="C")  # lives last, for `_pivots`
         scaled[-1] = scaled[:, -1] = gram[-1] * scale
         scaled[-1, -1] = gram[-1, -1]
         for own in range(len(scaled)):

@@ -237,7 +237,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
 
     arrived = even(np.random.default_rng(1).multivariate_normal(MEAN, COV, size=500))
 
-    def doubtful(_: str, chains: FloatArray, **__: object) -> FloatArray:
+    def doubtful(chains: FloatArray) -> FloatArray:
         return np.full(chains.shape[-1], 2.0)
 
     def counted(chain: FloatArray, **options: object) -> FloatArray:
@@ -245,7 +245,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
         return integrated_time(chain, **options)
 
     monkeypatch.setattr(sampling, "_FIRST_STEPS", first)
-    monkeypatch.setattr(sampling, "_diagnose", doubtful)
+    monkeypatch.setattr(sampling, "rank_r_hat", doubtful)
     monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", most)
     monkeypatch.setattr(constants, "MIN_AUTOCORRELATION_TIMES", 0)
     monkeypatch.setattr(autocorr, "integrated_time", counted)
