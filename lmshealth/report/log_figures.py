@@ -10,8 +10,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import isotonic_regression
-from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
@@ -198,6 +196,8 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     ground = np.c_[rest[:, :2], np.full(len(rest), rest[:, 2].min())] @ _ISOMETRIC
     for foot, point in zip(ground, start, strict=True):
         ax.plot(*np.c_[foot, point], color=figures.GRID, lw=0.8)
+    from scipy.sparse.csgraph import minimum_spanning_tree  # late, as matplotlib
+
     # Neighbours are joined: the shortest tree.
     apart = np.linalg.norm(rest[:, None] - rest, axis=2)
     for a, b in zip(*minimum_spanning_tree(apart).nonzero(), strict=True):
@@ -492,6 +492,8 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     bottom = ax.get_ylim()[0]
     points = ax.transData.transform([(f, bottom) for f, _, _ in labels])
     places = ax.transAxes.inverted().transform(points)[:, 0]
+    from scipy.optimize import isotonic_regression  # late, as matplotlib
+
     moved = isotonic_regression(places - steps).x.clip(0, None) + steps
     style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 9}
     across, ends = ax.get_xaxis_transform(), ("axes fraction", "offset points")
