@@ -6,9 +6,6 @@ import os
 # Matrices are small: threads of the linear algebra library only slow down the worker processes.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-# Imports and figures make many objects that stay: looking for cycles more often takes an eighth of
-# their time.
-gc.set_threshold(50_000)
 
 import signal
 import threading
@@ -23,6 +20,9 @@ from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli.streams import standard_streams
 from lmshealth.cli.terminal import print_errors
 from lmshealth.errors import LmshealthError
+
+# What is imported and drawn stays: looking for cycles more often takes an eighth of its time.
+gc.set_threshold(50_000)
 
 # Module of each command, and the text of the list of commands, which is printed without scipy.
 _COMMANDS = {

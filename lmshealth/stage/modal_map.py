@@ -161,7 +161,8 @@ def _column(
         except ValueError:
             number = np.nan
         if not low <= number <= high:
-            what = f"{path}: line {line}: {name} is {row[name] or 'nan'}"
+            shown = row[name] or "nan" if np.isnan(number) else number
+            what = f"{path}: line {line}: {name} is {shown}"
             raise BadStage(f"{what}; needed is a positive number, {low:g} to {high:g}")
         found.append(number)
     return np.array(found)

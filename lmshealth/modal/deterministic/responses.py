@@ -252,8 +252,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     # Of two half overlapping Hann windows the spectra correlate by 1/6.
     n = (2 * size / length - 1) / (1 + 2 / 6**2)
     (frequency, auto_in), (_, cross), (_, auto_out) = (
-        csd(x, y, rate, nperseg=length)
-        for x, y in combinations_with_replacement(pair.signals, 2)
+        csd(x, y, rate, nperseg=length) for x, y in combinations_with_replacement(pair.signals, 2)
     )
     inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
     frequency = frequency[inside]
