@@ -198,8 +198,8 @@ def _fit(
     unit = 2 * (points - low) / (high - low) - 1
     degrees, miss = _choose_sizes(unit, np.log(values), sizes)
     basis = _basis(unit, degrees)
-    found = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
-    coefficients = np.asarray(found, dtype=float).reshape(*degrees, len(modes))
+    solved = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
+    coefficients = np.asarray(solved, dtype=float).reshape(*degrees, len(modes))
     return ModalMap(parameters, modes, low, high, coefficients, miss)
 
 
