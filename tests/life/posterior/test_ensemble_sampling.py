@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arviz_stats.base.array import array_stats
 from emcee import autocorr
 from emcee.autocorr import integrated_time
 from scipy import stats
@@ -320,3 +321,16 @@ def test_too_few_draws_are_refused() -> None:
     with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed.*widen") as caught:
         sample(gaussian, even(BEGIN.points[:7]), stream(3))
     assert np.asarray(caught.value.chains).shape == (7, 2)
+
+
+def test_r_hat_is_that_of_arviz() -> None:
+    """Of draws that differ between ensembles in mean or spread, have ties, or are all equal."""
+    draws = np.random.default_rng(5).standard_normal((4, 501, 4))
+    draws[1, :, 0] += 0.3
+    draws[2, :, 1] *= 1.5
+    draws[..., 2] = draws[..., 2].round(1)
+    draws[..., 3] = 7.0
+    found = sampling.rank_r_hat(draws)
+    known = [array_stats.rhat(draws[..., j], chain_axis=0, draw_axis=1) for j in range(3)]
+    np.testing.assert_allclose(found, [*known, 1.0], rtol=1e-12)
+    assert found[0] > 1.005 and found[1] > 1.005
