@@ -179,6 +179,22 @@ def test_what_is_asked_for_brings_no_database() -> None:
     assert not set(told.split()) & {"sqlalchemy", "jinja2", "matplotlib", "h5py", "arviz_base"}
 
 
+def test_help_and_refusals_import_nothing_slow(tmp_path: Path) -> None:
+    """Of all commands, and of a log that cannot be read: waiting for it helps nobody."""
+    (tmp_path / "log.csv").write_text("no,log\n")
+    calls = [[name, "--help"] for name in ("modes", "track", "stage", "run")]
+    calls.append(["modes", str(tmp_path / "log.csv"), "--stage", "lms-y"])
+    lines = (
+        "import sys",
+        "from lmshealth.cli.main import main",
+        f"print([main(call, standalone_mode=False) for call in {calls}], file=sys.stderr)",
+        "print(*sys.modules)",
+    )
+    found = set(_run("-c", "\n".join(lines)).split())
+    assert "lmshealth.cli.log_commands" in found
+    assert not found & {"scipy.stats", "scipy.signal", "pandas", "sqlalchemy", "matplotlib"}
+
+
 def test_the_command_line_keeps_linear_algebra_to_one_thread() -> None:
     """It says so before numpy is loaded, which is too late for one that is loaded already."""
     lines = (

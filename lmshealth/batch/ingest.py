@@ -6,7 +6,7 @@ import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from datetime import date, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
@@ -28,12 +28,8 @@ from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_m
 from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
-from lmshealth.modal.identification import read_modes
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.modal.mode_shapes import mode_shapes
-from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
 from lmshealth.report.language import Language
-from lmshealth.signal.following_error import loop_error
 from lmshealth.stage.description import Stage
 
 NOT_LISTED = "not-listed"
@@ -321,6 +317,8 @@ def _all_digests(
         size=constants.FILES_PER_HASH_TASK,
     )
     left = [path for path in files if path not in known]
+    if len(left) <= constants.FILES_PER_HASH_TASK:  # a process takes longer to start
+        resources = replace(resources, pool=Pool())
     for _, part in hashing.values(left, resources):
         digests |= part
         new = {files[path]: digest for path, digest in part.items() if isinstance(digest, str)}
@@ -434,6 +432,12 @@ def identify_log(
     It is read with `max_memory` and `latest` of `read_log`; the identification may take ``limit``
     seconds of processor time.
     """
+    # Late: only workers need them, and only where a log is new.
+    from lmshealth.modal.identification import read_modes
+    from lmshealth.modal.mode_shapes import mode_shapes
+    from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
+    from lmshealth.signal.following_error import loop_error
+
     by, stage, asked = "", None, None
     try:
         read = partial(read_log, columns=task.columns, overrides=task.overrides)

@@ -5,6 +5,7 @@ module imports little, because the processes import it before the batch begins; 
 with the tasks.
 """
 
+import gc
 import logging
 import multiprocessing
 import os
@@ -16,7 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
 from contextlib import contextmanager
 from functools import partial
-from itertools import islice
+from itertools import chain, islice
 from multiprocessing import connection, resource_tracker
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
@@ -72,14 +73,18 @@ class Pool:
 
 
 class _ProcessPool(Pool):
-    """Processes on this machine, restarted when one of them dies."""
+    """Processes on this machine, restarted when one of them dies.
+
+    They start with the first tasks, and no more of them than there are tasks: a process takes a
+    second to import what it needs.
+    """
 
     def __init__(self, size: int) -> None:
-        self.size = size
-        self.start()
+        self.size, self._n_started = size, 0
 
-    def start(self) -> None:
-        """Start processes; where one is killed meanwhile, try again."""
+    def start(self, n: int) -> None:
+        """Start processes in place of fewer; where one is killed meanwhile, try again."""
+        self.close()
         for _ in range(constants.START_ATTEMPTS):
             # The processes exit when the other end of this pipe is closed, by us or by our own end.
             parent_exit, self._open_end = multiprocessing.Pipe(duplex=False)
@@ -88,8 +93,9 @@ class _ProcessPool(Pool):
             with _interrupts_blocked():
                 resource_tracker.ensure_running()
                 self.executor: ProcessPoolExecutor = ProcessPoolExecutor(
-                    self.size, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
+                    n, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
                 )
+            self._n_started = n
             try:
                 with _interrupts_blocked():
                     first = self.executor.submit(os.getpid)
@@ -105,19 +111,27 @@ class _ProcessPool(Pool):
 
     def kill(self) -> None:
         """End all processes at once, whatever they are doing."""
-        self.executor.shutdown(kill_workers=True)
-        self._open_end.close()
+        self._end(kill_workers=True)
 
     def close(self) -> None:
         """Wait for the tasks that are running, and end the processes."""
-        self.executor.shutdown()
-        self._open_end.close()
+        self._end()
+
+    def _end(self, **how: bool) -> None:
+        if self._n_started:
+            self._n_started = 0
+            self.executor.shutdown(**how)
+            self._open_end.close()
 
     def map_unordered(
         self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
         left = iter(items)
-        while True:
+        first = list(islice(left, self.size))
+        if len(first) > self._n_started:
+            self.start(len(first))
+        left = chain(first, left)
+        while first:
             interrupted: list[Item] = []
             for item, future in _completed(self.executor, function, left, self.size):
                 try:
@@ -131,7 +145,7 @@ class _ProcessPool(Pool):
             # One of these items ended its process, and with it the pool. Each is run again alone,
             # so that only that one is lost.
             self.kill()
-            self.start()
+            self.start(len(first))
             with _process_pool(1) as single:
                 for item in interrupted:
                     yield item, single.run_alone(function, item, on_crash)
@@ -141,12 +155,13 @@ class _ProcessPool(Pool):
     ) -> Result:
         """Run a task that may have ended its process; a process may also be killed from outside."""
         for _ in range(constants.ATTEMPTS_ALONE):
+            if not self._n_started:
+                self.start(1)
             try:
                 result: Result = self.executor.submit(function, item).result()
                 return result
             except BrokenExecutor:
                 self.kill()
-                self.start()
         ended = f"the process that worked on it alone ended {constants.ATTEMPTS_ALONE} times"
         return on_crash(item, ended)
 
@@ -217,6 +232,7 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _initialise(parent_exit: Connection) -> None:
     """Set up a worker process: no interrupts, one thread for linear algebra, exit with parent."""
+    gc.set_threshold(50_000)  # as `lmshealth.cli.main`
     ignore_interrupts()
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)

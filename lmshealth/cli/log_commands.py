@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
-import pandas as pd
 from msgspec.structs import replace
 
 from lmshealth._private.files import write_text
@@ -27,7 +26,6 @@ from lmshealth.io.refusal import shown
 from lmshealth.modal.acceleration_survey import survey
 from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf, read_measured
 from lmshealth.modal.deterministic.measured import MeasuredResponse, read_responses
-from lmshealth.modal.identification import ModalReading, read_ambient, read_decays, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
@@ -36,6 +34,9 @@ from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
 from lmshealth.stage.description import ModeSpec
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
+
+if TYPE_CHECKING:
+    from lmshealth.modal.identification import ModalReading
 
 Result = TypeVar("Result")
 
@@ -123,6 +124,8 @@ def init(ctx: click.Context, /, logs: tuple[Path, ...], out: Path, **given: Any)
 
 def _propose_manifest(sheet: Path, rows: list[Row]) -> None:
     """Write a manifest with what the files state; a manifest names no file out of its folder."""
+    import pandas as pd  # late: only this needs it
+
     folder = sheet.absolute().parent
     if outside := [row["file"] for row in rows if not row["file"].is_relative_to(folder)]:
         why = f"not written, {outside[0]} is not in its folder: choose --out with the logs in it"
@@ -155,6 +158,8 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
     Its clock is the time if no log has an odometer.
     Return a band in Hz around the clear ones.
     """
+    from lmshealth.modal.identification import read_modes
+
     used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
@@ -255,8 +260,11 @@ def _names(listed: str) -> list[str]:
     return list(names)
 
 
-def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> ModalReading:
+def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> "ModalReading":
     """Identify the modes of a log by the chosen part of it."""
+    # Late, as below: help and refusals of files need none of it.
+    from lmshealth.modal.identification import read_ambient, read_decays, read_modes
+
     chosen: Any = {"channels": given["channels"], "band": given["band"]}
     if given["part"] == "settling":
         return read_decays(log, given["stage"], **chosen)

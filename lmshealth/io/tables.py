@@ -9,10 +9,9 @@ import io
 from collections.abc import Iterable, Iterator, Sequence
 from datetime import datetime
 from pathlib import Path
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
-import pandas as pd
 
 from lmshealth._private.files import read_table
 from lmshealth.errors import BadTable
@@ -20,6 +19,9 @@ from lmshealth.io import constants
 from lmshealth.io.log import low_high, possible
 from lmshealth.io.metadata import parse_moment
 from lmshealth.io.refusal import Unusable, listed, repeated
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _MOST_LISTED = 3
 
@@ -87,8 +89,10 @@ def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
             yield where, cells, trouble
 
 
-def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
+def read_rows(path: Path, needed: Sequence[str]) -> "pd.DataFrame":
     """Read a table of estimates as text; `BadTable` if a column is missing or it cannot be read."""
+    import pandas as pd  # late, as below: tables next to logs need none of it
+
     try:
         table = pd.read_csv(path, dtype=str, keep_default_na=False)
     except (OSError, ValueError) as error:
@@ -99,7 +103,7 @@ def read_rows(path: Path, needed: Sequence[str]) -> pd.DataFrame:
     return table
 
 
-def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
+def name_machine(path: Path, table: "pd.DataFrame") -> list[str]:
     """Fill in a missing column stage, in place, and return a note of it."""
     if "stage" in table.columns:
         return []
@@ -107,18 +111,20 @@ def name_machine(path: Path, table: pd.DataFrame) -> list[str]:
     return [f"no column stage: all rows are taken for one machine, {path.stem}"]
 
 
-def lines(table: pd.DataFrame, wrong: "pd.Series[bool]") -> str:
+def lines(table: "pd.DataFrame", wrong: "pd.Series[bool]") -> str:
     """Name the lines of the file that are marked, at most three of them."""
     found = [str(int(i) + 2) for i in table.index[wrong]]
     more = f" and {len(found) - _MOST_LISTED} more" if len(found) > _MOST_LISTED else ""
     return f"line {', '.join(found[:_MOST_LISTED])}{more}"
 
 
-def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
+def to_numbers(path: Path, table: "pd.DataFrame", names: Iterable[str]) -> None:
     """Convert columns to numbers, in place; missing columns are ignored, empty cells are NaN.
 
     Any other cell raises `BadTable`, and so does a number out of the range of its column.
     """
+    import pandas as pd
+
     for name in [name for name in names if name in table.columns]:
         text = table[name]
         given = text.str.strip() != ""
@@ -136,11 +142,13 @@ def to_numbers(path: Path, table: pd.DataFrame, names: Iterable[str]) -> None:
                 raise BadTable(f"{path}, {lines(table, wrong)}: {what}")
 
 
-def to_moments(path: Path, table: pd.DataFrame, latest: datetime | None = None) -> None:
+def to_moments(path: Path, table: "pd.DataFrame", latest: datetime | None = None) -> None:
     """Convert the column recorded_at to dates with time zone, in place, or raise `BadTable`.
 
     Those after `latest` are refused, too (`parse_moment`).
     """
+    import pandas as pd
+
     moments = []
     for index, text in zip(table.index, table["recorded_at"], strict=True):
         try:

@@ -9,8 +9,7 @@ from itertools import pairwise
 
 import msgspec
 import numpy as np
-from scipy.special import betainc, logsumexp, softmax
-from scipy.stats import binom
+from scipy.special import bdtrc, betainc, logsumexp, softmax
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import fingerprint
@@ -396,5 +395,5 @@ def calibrate(prognosis: Prognosis, lives: Sequence[EndedLife]) -> Calibration |
         coverage=1 - k / (n + 1),
         travel=np.inf if left > prognosis.horizon else max(left, 0.0),
         early=early,
-        p_value=float(binom.sf(early - 1, n, constants.CALIBRATED_RISK)),
+        p_value=float(bdtrc(early - 1, n, constants.CALIBRATED_RISK)),
     )

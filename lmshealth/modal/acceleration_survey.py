@@ -5,7 +5,6 @@ from dataclasses import dataclass
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
-from lmshealth.modal.identification import identify
 from lmshealth.modal.targets import check_band
 from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.constants import LEVEL_BAND_RANGE
@@ -37,6 +36,8 @@ def survey(
     identified: dict[str, float] | None = None
     if stage is not None and accelerometers:
         # Otherwise accelerations are read at the described frequencies.
+        from lmshealth.modal.identification import identify  # late: only this needs it
+
         with suppress(BadLog):
             found = identify(log, stage, channels=[c.name for c in accelerometers])
             identified = dict(zip(found.names, found.frequency.tolist(), strict=True))

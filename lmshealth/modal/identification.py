@@ -10,6 +10,7 @@ what was found.
 """
 
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import chain, pairwise
@@ -190,7 +191,10 @@ def read_modes(
     except BadLog as why:
         if why.reason != "too-short":
             raise
-        if not select_segments(log, "settling"):
+        stops: Sequence[Segment] = ()
+        with suppress(BadLog):  # without a set point nobody knows when a machine stops
+            stops = select_segments(log, "settling")
+        if not stops:
             raise
         try:
             reading = read_decays(log, stage, **chosen)

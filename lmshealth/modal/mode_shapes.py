@@ -14,7 +14,6 @@ from scipy.linalg import eigh
 
 from lmshealth._private.arrays import ComplexArray, FloatArray, freeze
 from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
-from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.naming import assurance
 
@@ -94,6 +93,8 @@ def _distance_from_ends(fit: FittedSpectrum, f: float) -> float:
 
 def _direction(fit: FittedSpectrum, modes: Modes, i: int, shapes: ComplexArray) -> ComplexArray:
     """Return the shape of mode i, given shapes of all modes, ``(n_modes, n_channels)``."""
+    from lmshealth.modal.ambient.whittle import response  # late: reading a result needs none of it
+
     frequency, f, zeta = fit.spectrum.frequency, modes.frequency, modes.damping_ratio
     known = np.flatnonzero(np.isfinite(fit.density[:, 0]))  # no line
     off = np.abs(frequency[known] - f[i])

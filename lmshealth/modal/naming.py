@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import norm
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.io.log import Refusal
@@ -95,7 +94,8 @@ def pairing_probability(
     reach = float(np.log1p(search.max()))
     common = np.linspace(-reach, reach, _COMMON_SHIFTS)
     scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
-    prior = norm.pdf(common[:, None], scale=scales) @ [1.0, float(standing)]
+    # Normal densities up to a factor, which cancels.
+    prior = np.exp(-0.5 * (common[:, None] / scales) ** 2) / scales @ [1.0, float(standing)]
     apart = (shift - common[:, None, None]) / (search * constants.OWN_SHIFT)
     weight = np.where(admissible, np.exp(gain - 0.5 * apart**2), 0.0)
     before = _sums_before(weight, complete=complete)

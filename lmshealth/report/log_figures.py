@@ -10,18 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-from scipy.optimize import isotonic_regression
-from scipy.sparse.csgraph import minimum_spanning_tree
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_bytes, write_text
 from lmshealth.io.log import SI_UNITS, Log, Refusal
-from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
-from lmshealth.modal.ambient.search import Found
-from lmshealth.modal.deterministic.frequency_response import FrfReading
-from lmshealth.modal.deterministic.measured import MeasuredResponse
-from lmshealth.modal.identification import ModalReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import ModeShapes, mode_shapes
 from lmshealth.modal.modes import Modes
@@ -36,6 +29,12 @@ from lmshealth.stage.description import ChannelSpec, Stage
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
+
+    from lmshealth.modal.ambient.cluster_modes import FittedSpectrum
+    from lmshealth.modal.ambient.search import Found
+    from lmshealth.modal.deterministic.frequency_response import FrfReading
+    from lmshealth.modal.deterministic.measured import MeasuredResponse
+    from lmshealth.modal.identification import ModalReading
 
 _WIDTH, _NOTE_COLUMNS = 8.0, 112
 # Heights of a panel, of legend and labels, of upright labels and of a line of notes, in inches.
@@ -200,6 +199,8 @@ def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpe
     ground = np.c_[rest[:, :2], np.full(len(rest), rest[:, 2].min())] @ _ISOMETRIC
     for foot, point in zip(ground, start, strict=True):
         ax.plot(*np.c_[foot, point], color=figures.GRID, lw=0.8)
+    from scipy.sparse.csgraph import minimum_spanning_tree  # late, as matplotlib
+
     # Neighbours are joined: the shortest tree.
     apart = np.linalg.norm(rest[:, None] - rest, axis=2)
     for a, b in zip(*minimum_spanning_tree(apart).nonzero(), strict=True):
@@ -248,7 +249,7 @@ def plot_spectra(
     level, fitted, singular = map(density, (summary.level, summary.fitted, summary.singular))
     refused = {one.channel: one.reason for one in modes.refused if not one.mode}
     count = summary.count.astype(float)
-    range_ = gamma.ppf([[0.025], [0.975]], count) / count
+    range_ = gammaincinv(count, [[0.025], [0.975]]) / count
     for ax, name, derived, own, fit in zip(
         panels, summary.channels, summary.derived, level, fitted, strict=False
     ):
@@ -503,6 +504,8 @@ def _write_labels(ax: Axes, labels: list[tuple[float, str, str]]) -> None:
     bottom = ax.get_ylim()[0]
     points = ax.transData.transform([(f, bottom) for f, _, _ in labels])
     places = ax.transAxes.inverted().transform(points)[:, 0]
+    from scipy.optimize import isotonic_regression  # late, as matplotlib
+
     moved = isotonic_regression(places - steps).x.clip(0, None) + steps
     style: Any = {"rotation": 90 if upright else 0, "ha": "center", "va": "bottom", "size": 9}
     across, ends = ax.get_xaxis_transform(), ("axes fraction", "offset points")

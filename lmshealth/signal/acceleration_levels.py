@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
-from scipy.stats import linregress
 
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
@@ -208,6 +207,8 @@ def find_growth(magnitudes: Iterable[Magnitude]) -> tuple[Growth, ...]:
 
 
 def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float]]) -> Growth:
+    from scipy.stats import linregress  # late: half a second
+
     x, y = np.array(points).reshape(-1, 2).T
     # Set velocities that differ by a percent are equal.
     n_velocities = np.unique(np.round(x / 0.02)).size

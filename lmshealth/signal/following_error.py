@@ -4,7 +4,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.signal import detrend, periodogram
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import BadLog
@@ -104,6 +103,8 @@ def loop_error(log: Log) -> float | None:
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
     """Return the mean square of a segment in the band of the loop."""
+    from scipy.signal import detrend, periodogram  # late: it imports scipy.stats, half a second
+
     # The window prevents leakage of drift below the band and of lines above it.
     frequency, density = periodogram(values, sample_rate, "hann", detrend=detrend)
     low, high = constants.LOOP_BAND

@@ -9,8 +9,7 @@ from typing import Self
 import numpy as np
 from scipy import fft
 from scipy.linalg import toeplitz
-from scipy.stats import f as fisher
-from scipy.stats import gamma
+from scipy.special import fdtri, gammainccinv
 
 from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.signal import constants
@@ -116,7 +115,7 @@ def _search(
         ratio, squared = _line_test(transform, octave.n, octave.start, octave.stop)
         evidence += _noise_evidence(ratio)
         power += squared
-    threshold = float(gamma.isf(p_value, sum(map(len, octave.blocks))))
+    threshold = float(gammainccinv(sum(map(len, octave.blocks)), p_value))
     passed = np.flatnonzero(evidence > threshold)
     centres: list[int] = []
     for index in passed[np.argsort(-power[passed])].tolist():
@@ -281,7 +280,8 @@ class _LineFit:
         # The lower of two levels further away: another resonance may raise either. Below zero
         # frequency the spectrum is its mirror image.
         dof = 2 * _TAPERS * len(noise)
-        limit = float(fisher.isf(np.sqrt(constants.RISE_FALSE_ALARM) / 2, dof, dof))
+        # The upper quantile of F is the inverse of the lower one.
+        limit = float(1 / fdtri(dof, dof, np.sqrt(constants.RISE_FALSE_ALARM) / 2))
         sides = (-1, 1) if periods > 24 else (1,)
         return all(level(4 * k) > limit * min(level(12 * k), level(20 * k)) for k in sides)
 

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 from scipy import fft
-from scipy.stats import gamma
+from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, freeze
 from lmshealth.io.buffers import MINUTE
@@ -169,7 +169,7 @@ class LogSpectra:
 
 def median_ordinate(count: int) -> float:
     """Return the median of the mean of ``count`` exponential variables of mean 1."""
-    return float(gamma.ppf(0.5, count)) / count
+    return float(gammaincinv(count, 0.5)) / count
 
 
 class ResonanceRange(NamedTuple):

@@ -371,8 +371,15 @@ class Stage:
 
         Shape ``(1 + n_parameters, n_points, n_modes)``.
         """
-        alone = (np.where(own, x, self.baseline_point) for own in np.eye(x.shape[1], dtype=bool))
-        return np.stack([self.drift(one, modes) for one in (x, *alone)])
+        assert self.modal_map is not None
+        columns = [self.modal_map.modes.index(name) for name in modes]
+        found = self.modal_map.ln_frequency_and_alone(x, self._alone)
+        return (found - self._ln_frequency_at_baseline)[..., columns]
+
+    @cached_property
+    def _alone(self) -> tuple[FloatArray, ...]:
+        assert self.modal_map is not None  # drifts() has checked
+        return self.modal_map.alone(self.baseline_point)
 
     @cached_property
     def _ln_frequency_at_baseline(self) -> FloatArray:

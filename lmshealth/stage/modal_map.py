@@ -1,13 +1,15 @@
 """Modal map: Chebyshev surrogate of ln frequency over ln health parameters (README.md, "Map")."""
 
-from collections.abc import Sequence
+import csv
+import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
-from io import BytesIO
+from io import StringIO
+from itertools import zip_longest
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from numpy.polynomial.chebyshev import chebder, chebvander
 
 from lmshealth._private.arrays import BoolArray, FloatArray
@@ -34,7 +36,9 @@ class ModalMap:
 
     def inside(self, x: FloatArray) -> BoolArray:
         """Return which points, shape ``(n_points, n_parameters)``, lie inside the grid."""
-        return np.asarray(np.all((x >= self.low) & (x <= self.high), axis=-1))
+        within = (x >= self.low) & (x <= self.high)
+        # Faster than a reduction over so short an axis.
+        return np.asarray(reduce(np.logical_and, np.moveaxis(within, -1, 0)))
 
     def ln_frequency(self, x: FloatArray) -> FloatArray:
         """Evaluate ln of frequency in Hz, ``(n_points, n_modes)``.
@@ -43,6 +47,36 @@ class ModalMap:
         the grid: there is no extrapolation.
         """
         return _evaluate(self.coefficients, self._unit(x))
+
+    def alone(self, base: FloatArray) -> tuple[FloatArray, ...]:
+        """Return the series of each parameter while all others are at a base ``(n_parameters,)``.
+
+        Chebyshev coefficients of each, ``(d + 1, n_modes)``.
+        """
+        at_base = [table[:, 0] for table in _tables(self._unit(base[None]), self._sizes)]
+
+        def of(j: int) -> FloatArray:
+            found = self.coefficients
+            for axis in reversed(range(len(at_base))):
+                if axis != j:
+                    found = np.tensordot(at_base[axis], found, (0, axis))
+            return np.asarray(found)
+
+        return tuple(map(of, range(len(at_base))))
+
+    def ln_frequency_and_alone(self, x: FloatArray, alone: Sequence[FloatArray]) -> FloatArray:
+        """Return `ln_frequency`, then that of each parameter by the series of `alone`.
+
+        Shape ``(1 + n_parameters, n_points, n_modes)``.
+        """
+        tables = _tables(self._unit(x), self._sizes)
+        whole = self.coefficients.reshape(-1, len(self.modes)).T @ reduce(_products, tables)
+        each = (own.T @ table for own, table in zip(alone, tables, strict=True))
+        return np.swapaxes([whole, *each], 1, 2)
+
+    @property
+    def _sizes(self) -> tuple[int, ...]:
+        return self.coefficients.shape[:-1]
 
     def gradient(self, x: FloatArray) -> FloatArray:
         """Differentiate ln frequency by the ln parameters, ``(n_points, n_modes, n_parameters)``.
@@ -58,9 +92,8 @@ class ModalMap:
 
     def _unit(self, x: FloatArray) -> FloatArray:
         """Scale points to the range -1 to 1; refuse those outside."""
-        inside = self.inside(x)
-        if not inside.all():
-            worst = np.exp(x[~inside][0])
+        if not ((x >= self.low) & (x <= self.high)).all():
+            worst = np.exp(x[~self.inside(x)][0])
             raise OutsideMap(
                 f"parameters {dict(zip(self.parameters, worst.tolist(), strict=True))} lie outside "
                 f"the modal map ({np.exp(self.low)} to {np.exp(self.high)}); make a wider map"
@@ -81,67 +114,92 @@ def read_map(path: str, parameters: tuple[str, ...]) -> ModalMap:
         why = getattr(error, "strerror", None) or error
         raise BadStage(f"{path}: cannot read the modal map: {why}") from error
     try:
-        # Blank lines are kept, so that the index of a row gives its line.
-        table = pd.read_csv(BytesIO(content), skip_blank_lines=False).dropna(how="all")
-    except ValueError:
+        header, *records = csv.reader(StringIO(content.decode("utf-8-sig"), newline=""))
+        if any(len(cells) > len(header) for cells in records):
+            raise ValueError
+    except (ValueError, csv.Error):
         # A description may name any file: nothing of one that is no table is quoted.
         raise BadStage(f"{path}: it is not a modal map: no table of numbers with commas") from None
-    needed = {*parameters, "mode", "frequency_hz"}
-    missing, extra = needed - set(table.columns), set(table.columns) - needed
+    header, needed = [name.strip() for name in header], {*parameters, "mode", "frequency_hz"}
+    missing, extra = needed - set(header), set(header) - needed
+    extra |= {name for name in header if header.count(name) > 1}
     if missing:
-        there = "it is not a modal map" if missing == needed else f"there are {list(table.columns)}"
+        there = "it is not a modal map" if missing == needed else f"there are {header}"
         raise BadStage(f"{path}: no column {sorted(missing)}; {there}")
     if extra:
         raise BadStage(
             f"{path}: columns {sorted(extra)} are not parameters of the stage description; "
             "describe them as [[parameter]] or make the map without them"
         )
-    numbers = table[[*parameters, "frequency_hz"]].apply(pd.to_numeric, errors="coerce")
-    for name, column in numbers.items():
-        low, high = constants.FREQUENCY_HZ if name == "frequency_hz" else constants.VALUE
-        wrong = ~column.between(low, high).to_numpy()
-        if wrong.any():
-            found = f"{_line(path, table, wrong)}: {name} is {table[name].iloc[wrong.argmax()]}"
-            raise BadStage(f"{found}; needed is a positive number, {low:g} to {high:g}")
-    unnamed = table["mode"].isna().to_numpy()
-    if unnamed.any():
-        raise BadStage(f"{_line(path, table, unnamed)}: a mode without a name")
-    table = table.assign(**numbers, mode=table["mode"].astype(str))
-    twice = table.duplicated([*parameters, "mode"]).to_numpy()
-    if twice.any():
-        raise BadStage(f"{_line(path, table, twice)}: a mode occurs twice at one grid point")
-    return _fit(path, table, parameters)
+    # Blank lines count, and hold nothing.
+    rows = {
+        line: dict(zip_longest(header, map(str.strip, cells), fillvalue=""))
+        for line, cells in enumerate(records, start=2)
+        if any(map(str.strip, cells))
+    }
+    grid = [_column(path, rows, name, constants.VALUE) for name in parameters]
+    frequency = _column(path, rows, "frequency_hz", constants.FREQUENCY_HZ)
+    seen = set[tuple[str, ...]]()
+    for (line, row), *point in zip(rows.items(), *grid, strict=True):
+        if not row["mode"]:
+            raise BadStage(f"{path}: line {line}: a mode without a name")
+        if (one := (row["mode"], *point)) in seen:
+            raise BadStage(f"{path}: line {line}: a mode occurs twice at one grid point")
+        seen.add(one)
+    return _fit(path, parameters, np.array(grid), [row["mode"] for row in rows.values()], frequency)
 
 
-def _line(path: str, table: pd.DataFrame, wrong: BoolArray) -> str:
-    """Name the line of the first wrong row; line 1 holds the column names."""
-    return f"{path}: line {table.index[wrong][0] + 2}"
+def _column(
+    path: str, rows: Mapping[int, Mapping[str, str]], name: str, limits: tuple[float, float]
+) -> FloatArray:
+    """Return the numbers of a column, ``(n_rows,)``; refuse those out of their limits."""
+    low, high = limits
+    found = []
+    for line, row in rows.items():
+        try:
+            number = float(row[name].replace("_", "?"))  # which Python takes for a part of a number
+        except ValueError:
+            number = np.nan
+        if not low <= number <= high:
+            shown = row[name] or "nan" if np.isnan(number) else number
+            what = f"{path}: line {line}: {name} is {shown}"
+            raise BadStage(f"{what}; needed is a positive number, {low:g} to {high:g}")
+        found.append(number)
+    return np.array(found)
 
 
-def _fit(path: str, table: pd.DataFrame, parameters: tuple[str, ...]) -> ModalMap:
-    modes = tuple(table["mode"].unique())
-    wide = table.pivot(index=list(parameters), columns="mode", values="frequency_hz")
-    axes = [np.unique(table[name]) for name in parameters]
-    n_grid = int(np.prod([axis.size for axis in axes]))
-    values = wide[list(modes)].to_numpy(dtype=float)
-    if values.shape[0] != n_grid or np.isnan(values).any():
+def _fit(
+    path: str,
+    parameters: tuple[str, ...],
+    grid: FloatArray,
+    names: Sequence[str],
+    frequency: FloatArray,
+) -> ModalMap:
+    """Fit the surrogate to frequencies ``(n_rows,)`` at grid points ``(n_parameters, n_rows)``."""
+    modes = tuple(dict.fromkeys(names))
+    axes = [np.unique(values) for values in grid]
+    sizes = [axis.size for axis in axes]
+    n_grid = math.prod(sizes)
+    if len(names) != n_grid * len(modes):  # no mode is twice at a point
         raise BadStage(
-            f"{path}: {np.isfinite(values).sum()} values where a full grid of {n_grid} points "
+            f"{path}: {len(names)} values where a full grid of {n_grid} points "
             f"with modes {list(modes)} needs {n_grid * len(modes)}"
         )
-    if min(axis.size for axis in axes) < 3:
-        found = {name: axis.size for name, axis in zip(parameters, axes, strict=True)}
+    if min(sizes) < 3:
+        found = dict(zip(parameters, sizes, strict=True))
         raise BadStage(f"{path}: every parameter needs at least 3 grid values, there are {found}")
     for name, axis in zip(parameters, axes, strict=True):
         if (axis[1:] / axis[:-1]).min() < constants.LEAST_STEP:
             raise BadStage(f"{path}: grid values of {name} are equal but for rounding")
-    points = np.log(wide.index.to_frame().to_numpy(dtype=float))
+    order = np.lexsort((*grid[::-1], [modes.index(name) for name in names]))
+    values = frequency[order].reshape(len(modes), n_grid).T
+    points = np.log(grid[:, order[:n_grid]].T)
     low, high = points.min(axis=0), points.max(axis=0)
     unit = 2 * (points - low) / (high - low) - 1
-    sizes, miss = _choose_sizes(unit, np.log(values), [axis.size for axis in axes])
-    basis = _basis(unit, sizes)
-    coefficients = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
-    coefficients = coefficients.reshape(*sizes, len(modes))
+    degrees, miss = _choose_sizes(unit, np.log(values), sizes)
+    basis = _basis(unit, degrees)
+    solved = np.linalg.lstsq(basis, np.log(values), rcond=None)[0]
+    coefficients = np.asarray(solved, dtype=float).reshape(*degrees, len(modes))
     return ModalMap(parameters, modes, low, high, coefficients, miss)
 
 
@@ -153,12 +211,17 @@ def _evaluate(coefficients: FloatArray, unit: FloatArray) -> FloatArray:
 
 def _basis(unit: FloatArray, sizes: Sequence[int]) -> FloatArray:
     """Return the products of the polynomials of all parameters at points, ``(n_points, n)``."""
+    return reduce(_products, _tables(unit, sizes)).T
 
-    def product(a: FloatArray, b: FloatArray) -> FloatArray:
-        return (a[:, :, None] * b[:, None]).reshape(len(a), a.shape[1] * b.shape[1])
 
-    each = (chebvander(x, size - 1) for x, size in zip(unit.T, sizes, strict=True))
-    return reduce(product, each)
+def _tables(unit: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
+    """Return the polynomials of each parameter at points, ``(d + 1, n_points)``."""
+    return [chebvander(x, size - 1).T for x, size in zip(unit.T, sizes, strict=True)]
+
+
+def _products(a: FloatArray, b: FloatArray) -> FloatArray:
+    """Return the products of two sets of polynomials, ``(n_a n_b, n_points)``."""
+    return (a[:, None] * b).reshape(-1, a.shape[1])
 
 
 def _choose_sizes(

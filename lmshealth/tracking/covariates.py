@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from datetime import datetime
 
 import numpy as np
-import pandas as pd
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.stage.description import Covariate, Stage
@@ -48,8 +47,9 @@ def regressors(
         if not offset.any():  # it never leaves its reference
             continue
         # Of the values up to each log: no log uses later ones.
-        std = pd.Series(values).expanding().std(ddof=0).fillna(0.0).clip(lower=1.0).to_numpy()
-        unknown = np.where(known, 0.0, (covariate.prior_std * std) ** 2)
+        n = np.maximum(np.cumsum(known), 1)
+        variance = np.cumsum(offset**2) / n - (np.cumsum(offset) / n) ** 2
+        unknown = np.where(known, 0.0, covariate.prior_std**2 * np.maximum(variance, 1.0))
         found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
         if covariate.curvature_std:
             square = (f"{covariate.name}^2", offset**2, covariate.curvature_std)

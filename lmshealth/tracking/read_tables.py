@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import pandas as pd
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
@@ -25,6 +25,9 @@ from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import History, build_history
 from lmshealth.tracking.maintenance import read_actions
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 _KM, _MILLI, _MICRO = 1000.0, 1e-3, 1e-6
 _NEEDED = ("recorded_at", "frequency_hz", "frequency_std_hz")
@@ -249,6 +252,8 @@ def _order_notes(table: pd.DataFrame) -> list[str]:
 
 def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
     """List cross terms that are not used, and logs that need some."""
+    import pandas as pd  # late: a run needs none of it
+
     notes, covered = [], set()
     if terms is not None:
         known = pd.MultiIndex.from_frame(table[["log", "mode", "source"]])

@@ -381,3 +381,21 @@ def test_a_pool_of_one_is_this_process() -> None:
         assert type(pool) is Pool
         assert pool.executor is None
         assert dict(pool.map_unordered(process_of, [1], lost)) == {1: os.getpid()}
+
+
+def test_no_more_processes_start_than_there_are_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None without a task, one for one, and more once there are more."""
+    started: list[int] = []
+    start = workers._ProcessPool.start
+
+    def counted(pool: workers._ProcessPool, n: int) -> None:
+        started.append(n)
+        start(pool, n)
+
+    monkeypatch.setattr(workers._ProcessPool, "start", counted)
+    with processes(2) as pool:
+        assert list(pool.map_unordered(double, [], lost)) == [] and not started
+        for _ in range(2):
+            assert list(pool.map_unordered(double, [4], lost)) == [(4, 8)] and started == [1]
+        assert dict(pool.map_unordered(double, range(5), lost)) == {k: 2 * k for k in range(5)}
+        assert started == [1, 2]

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from lmshealth.calibration.check import CalibrationCheck, check_calibration
@@ -21,7 +19,7 @@ def small(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 
 
 @pytest.fixture(scope="session")
-def checked(small: Stage) -> Iterator[CalibrationCheck]:
+def checked(small: Stage) -> CalibrationCheck:
     """Check it on eight lives and those that each kind lacks."""
     with four_settings():
-        yield check_calibration(small, SCHEDULE, lives=8, seed=2)
+        return check_calibration(small, SCHEDULE, lives=8, seed=2)

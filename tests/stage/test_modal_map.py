@@ -244,3 +244,23 @@ def test_the_x_stage_does_not_see_its_mount_and_the_y_stage_does() -> None:
     assert slopes["lms-x"][:, 1].max() < 0.1
     assert slopes["lms-y"][:, 1].max() > 0.15
     assert (slopes["lms-y"][:, 0].max()) > 0.05
+
+
+@pytest.mark.parametrize("name", ["lms-x", "lms-y"])
+def test_parameters_alone_are_points_with_all_others_at_their_base(name: str) -> None:
+    """Drifts along points and of each parameter alone are those at points made for each."""
+    stage = load_stage(name)
+    found = stage.modal_map
+    assert found is not None
+    x = np.random.default_rng(2).uniform(found.low, found.high, (50, found.low.size))
+    alone = (np.where(own, x, stage.baseline_point) for own in np.eye(x.shape[1], dtype=bool))
+    modes = found.modes[::-1]
+    known = [stage.drift(one, modes) for one in (x, *alone)]
+    np.testing.assert_allclose(stage.drifts(x, modes), known, rtol=0, atol=1e-13)
+
+
+def test_a_row_with_too_many_cells_is_no_table(tmp_path: Path) -> None:
+    """Cells without a column could be anything."""
+    rows = ["p,mode,frequency_hz", "1,roll,100,7"]
+    with pytest.raises(BadStage, match="no table of numbers with commas"):
+        read_map(write(tmp_path, rows), ("p",))

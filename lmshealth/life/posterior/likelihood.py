@@ -15,7 +15,7 @@ import numpy as np
 from scipy.linalg import qr, solve_triangular
 from scipy.special import softmax
 
-from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows, diagonal
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData
@@ -269,20 +269,17 @@ class LifeLikelihood:
 
     def _quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows = self._residuals(grid, x)
-        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of map errors of 1.
-        gram = rows @ np.swapaxes(rows, 2, 3)
-        n_rows = gram.shape[2]
-        shape = (len(self.data.stage.map_errors), *gram.shape[:2])
-        chi_square, log_det = np.empty(shape), np.empty(shape)
-        for i, (map_std, _) in enumerate(self.data.stage.map_errors):
-            scale = np.r_[np.full(n_rows - 1, map_std), 1.0]
-            # One Cholesky factor has both: its last element is that of χ², plus 1.
-            scaled = gram * np.outer(scale, scale)
-            diagonal(scaled)[:] += 1.0
-            root = diagonal(np.linalg.cholesky(scaled))
-            chi_square[i] = grid.rest[:, None] + root[..., -1] ** 2 - 1
-            log_det[i] = 2 * np.log(np.prod(root[..., :-1], axis=2))
-        return chi_square, log_det
+        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of map errors of 1, ``(n_rows, n_rows, 1, n_points, n)``.
+        gram = np.moveaxis(rows @ np.swapaxes(rows, 2, 3), (2, 3), (0, 1))[:, :, None]
+        scale = np.array([std for std, _ in self.data.stage.map_errors])[:, None, None]
+        scaled = np.multiply(gram, scale**2, order="C")  # lives last, for `_pivots`
+        scaled[-1] = scaled[:, -1] = gram[-1] * scale
+        scaled[-1, -1] = gram[-1, -1]
+        for own in range(len(scaled)):
+            scaled[own, own] += 1.0
+        # One decomposition has both: its last pivot is χ² plus 1.
+        pivots = _pivots(scaled)
+        return grid.rest[:, None] + pivots[-1] - 1, np.log(np.prod(pivots[:-1], axis=0))
 
     def conditional(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray
@@ -390,6 +387,18 @@ def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     n, n_moments, n_parameters = x.shape
     drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
     return np.moveaxis(drift.reshape(1 + n_parameters, n, n_moments, len(data.modes)), 3, 0)
+
+
+def _pivots(matrices: FloatArray) -> FloatArray:
+    """Return the pivots of the Cholesky decomposition of many small matrices, which are lost.
+
+    ``(n, ...)`` for matrices ``(n, n, ...)``: operations on all at once take a fraction of the time
+    of as many calls of LAPACK.
+    """
+    for k in range(len(matrices) - 1):
+        factors = matrices[k + 1 :, k] / matrices[k, k]
+        matrices[k + 1 :, k + 1 :] -= factors[:, None] * matrices[k, k + 1 :]
+    return np.asarray(np.moveaxis(matrices.diagonal(), -1, 0))
 
 
 def _reduced(

@@ -8,8 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
-from scipy.special import softmax
+from scipy.special import chdtrc, softmax
 
 from lmshealth._private.arrays import FloatArray, stack
 from lmshealth.modal import constants
@@ -266,7 +265,7 @@ def stationarity(found: PoleFit) -> float:
             # tr(A²) of the symmetric shift: half of the ordinates that have a neighbour, twice.
             spread = n_rows / 2 - n - 2 * np.sum(moved**2) + np.sum(inner * inner.T)
             variance[k] += 0.5 * n_segments * spread
-    return float(stats.chi2.sf(np.sum((seen - expected) ** 2 / variance), 2))
+    return float(chdtrc(2, np.sum((seen - expected) ** 2 / variance)))
 
 
 def _neighbours(rows: FloatArray, n: int, turn: complex) -> FloatArray:

@@ -9,7 +9,8 @@ from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
-from scipy import ndimage, stats
+from scipy import ndimage
+from scipy.special import gammainccinv, gammaincinv
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import BadLog
@@ -301,10 +302,10 @@ def _peaks(samples: FloatArray, sample_rate: float, limits: Range) -> list[float
     reach = (_AROUND + 2) * sample_rate / n_samples
     block = transform_decays(samples, sample_rate, limits[0] - reach, limits[1] + reach)
     power = np.mean(np.abs(block.ordinates) ** 2, axis=0)
-    middle = stats.gamma.median(n_segments) / n_segments
+    middle = gammaincinv(n_segments, 0.5) / n_segments
     level = ndimage.median_filter(power, (2 * _AROUND + 1, 1), mode="nearest") / middle
     excess = np.sum(power / np.maximum(level, 1e-300), axis=1) * n_segments
-    threshold = stats.gamma.isf(constants.DECAY_FALSE_ALARM / excess.size, n_segments * n)
+    threshold = gammainccinv(n_segments * n, constants.DECAY_FALSE_ALARM / excess.size)
     top = (excess == ndimage.maximum_filter1d(excess, 5)) & (excess > threshold)
     top &= (block.frequency >= limits[0]) & (block.frequency <= limits[1])
     return [float(f) for f in block.frequency[top]]

@@ -8,10 +8,10 @@ from itertools import combinations_with_replacement
 from typing import Self
 
 import numpy as np
-from scipy import fft, signal
+from scipy import fft
 from scipy.ndimage import uniform_filter1d
 from scipy.optimize import minimize_scalar
-from scipy.stats import f as fisher
+from scipy.special import fdtrc
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, ReadOnly, freeze
 from lmshealth.errors import BadLog
@@ -230,7 +230,7 @@ def _is_transient(answer: ComplexArray) -> bool:
     level = uniform_filter1d(scatter, min(_FREEDOM, n_lines), mode="nearest")
     level = np.maximum(level, np.finfo(float).tiny)
     ratio = np.sum(apart / level) / max(np.sum(scatter / level), np.finfo(float).tiny)
-    return bool(fisher.sf(ratio, 2 * n_lines, 2 * n_lines * (n - 2)) < constants.TRANSIENT)
+    return bool(fdtrc(2 * n_lines, 2 * n_lines * (n - 2), ratio) < constants.TRANSIENT)
 
 
 def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
@@ -238,6 +238,8 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
 
     `BadLog` if the band holds too few lines, or too many.
     """
+    from scipy.signal import csd  # late: it imports scipy.stats, half a second
+
     size, rate = pair.signals[0].size, pair.log.sample_rate
     step = rate / size
     first, last = max(1, int(np.ceil(band[0] / step))), int(band[1] / step)
@@ -250,8 +252,7 @@ def from_record(pair: Pair, band: tuple[float, float]) -> tuple[Frf, Ordinates]:
     # Of two half overlapping Hann windows the spectra correlate by 1/6.
     n = (2 * size / length - 1) / (1 + 2 / 6**2)
     (frequency, auto_in), (_, cross), (_, auto_out) = (
-        signal.csd(x, y, rate, nperseg=length)
-        for x, y in combinations_with_replacement(pair.signals, 2)
+        csd(x, y, rate, nperseg=length) for x, y in combinations_with_replacement(pair.signals, 2)
     )
     inside = (frequency >= band[0]) & (frequency <= band[1]) & (frequency > 0)
     frequency = frequency[inside]

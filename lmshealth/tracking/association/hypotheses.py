@@ -17,7 +17,6 @@ from itertools import combinations
 from typing import Self
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 from scipy.special import hyp1f1, ndtr
 
 from lmshealth._private.arrays import FloatArray
@@ -86,6 +85,8 @@ def best_assignments(
     allowed. Returned are gain and the column of each row, -1 for nothing, the best first; at most
     `most`, none below the best by more than `least` (negative).
     """
+    from scipy.optimize import linear_sum_assignment  # late: reading a result needs none of it
+
     n, m = score.shape
     cost = np.full((n, m + n), np.inf)
     cost[:, :m] = -score
@@ -395,6 +396,8 @@ def follow(
 
 def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | None]]:
     """Assign estimates to candidates, one to one, and update these."""
+    from scipy.optimize import linear_sum_assignment  # late, as above
+
     mine: list[int | None] = [None] * scan.rows.size
     if not len(candidates):
         return candidates, mine

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
-from scipy import stats
+from scipy.special import stdtrit
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.tracking import constants
@@ -199,7 +199,7 @@ def unexplained_loop_changes(loop_error: FloatArray, steps: tuple[Step, ...]) ->
     square = np.where(there, before - mean[:, None], 0.0) ** 2
     std = np.sqrt(square.sum(axis=1) / (n - 1) * (1 + 1 / n))
     enough = (there.sum(axis=1) >= constants.LOOP_FEWEST) & (std > 0)
-    reach = std * stats.t.isf(constants.LOOP_P_VALUE / 2, n - 1)
+    reach = -std * stdtrit(n - 1, constants.LOOP_P_VALUE / 2)
     off = np.stack([values[:-1], values[1:]]) - mean
     loop_changes = (np.abs(off) > reach).all(axis=0) & (off[0] * off[1] > 0) & enough
     return tuple(j for j in np.flatnonzero(loop_changes).tolist() if not _is_explained(steps, j))

@@ -10,7 +10,6 @@ from dataclasses import dataclass, replace
 from typing import Self
 
 import numpy as np
-from filterpy.kalman import KalmanFilter, predict, update
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
@@ -134,6 +133,8 @@ def prior(space: StateSpace) -> Gaussian:
 
 def filter_log(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
     """Predict to log k from the state before it, and update with its estimates."""
+    from filterpy.kalman import predict, update  # late: it imports scipy.stats, half a second
+
     move, noise = _transition(space, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
     given = space.observations[k]
@@ -148,6 +149,8 @@ def undecided(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Ga
     Half of the squared innovation is added to the variance of the error and of the quantity:
     both explanations are within two standard deviations.
     """
+    from filterpy.kalman import predict, update  # late, as above
+
     given, rows = space.observations[k], space.observations[k].rows
     move, noise = _transition(space, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
@@ -163,6 +166,8 @@ def undecided(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Ga
 
 def smooth_states(space: StateSpace, nuisances: Nuisances) -> tuple[FloatArray, FloatArray]:
     """Filter and smooth all logs: states ``(n_logs, size)`` and covariances [Rauch1965]."""
+    from filterpy.kalman import KalmanFilter  # late, as above
+
     n, size = len(space.observations), space.size
     means, covs = np.empty((n, size)), np.empty((n, size, size))
     moves, noises = np.empty((n, size, size)), np.empty((n, size, size))

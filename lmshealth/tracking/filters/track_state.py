@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 from typing import TypeVar, Union
 
 import numpy as np
-from scipy import stats
+from scipy.special import chdtri, ndtri
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.modal.credibility import dependence
@@ -368,7 +368,7 @@ def widening(state: TrackState) -> FloatArray:
     dof = degrees_of_freedom(state.space, innovations)
     nis = np.array([one.nis for one in epochs])
     total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
-    bound = stats.chi2.isf(constants.WIDENING_P_VALUE, np.maximum(degrees, 1.0))
+    bound = chdtri(np.maximum(degrees, 1.0), constants.WIDENING_P_VALUE)
     factor = np.where(total > bound, total / np.maximum(degrees, 1.0), 1.0)
     sums, counts = lagged_products(innovations)
     n = np.cumsum(counts)
@@ -376,7 +376,7 @@ def widening(state: TrackState) -> FloatArray:
     count = np.cumsum(np.isfinite(innovations).sum(axis=1))
     size = squares / np.maximum(count, 1)
     rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
-    bound = stats.norm.isf(constants.WIDENING_P_VALUE) * np.sqrt(np.cumsum(sums**2))
+    bound = -ndtri(constants.WIDENING_P_VALUE) * np.sqrt(np.cumsum(sums**2))
     factor = np.sqrt(factor * np.where(np.cumsum(sums) > bound, dependence(rho), 1.0))
     known = np.empty(0) if state.widening is None else state.widening
     return np.append(known, factor[known.size :])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from arviz_stats.base.array import array_stats
 from emcee import autocorr
 from emcee.autocorr import integrated_time
 from scipy import stats
@@ -237,7 +238,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
 
     arrived = even(np.random.default_rng(1).multivariate_normal(MEAN, COV, size=500))
 
-    def doubtful(_: str, chains: FloatArray, **__: object) -> FloatArray:
+    def doubtful(chains: FloatArray) -> FloatArray:
         return np.full(chains.shape[-1], 2.0)
 
     def counted(chain: FloatArray, **options: object) -> FloatArray:
@@ -245,7 +246,7 @@ def test_chains_grow_by_half_at_least(monkeypatch: pytest.MonkeyPatch) -> None:
         return integrated_time(chain, **options)
 
     monkeypatch.setattr(sampling, "_FIRST_STEPS", first)
-    monkeypatch.setattr(sampling, "_diagnose", doubtful)
+    monkeypatch.setattr(sampling, "rank_r_hat", doubtful)
     monkeypatch.setattr(constants, "MAX_CHAIN_STEPS", most)
     monkeypatch.setattr(constants, "MIN_AUTOCORRELATION_TIMES", 0)
     monkeypatch.setattr(autocorr, "integrated_time", counted)
@@ -320,3 +321,16 @@ def test_too_few_draws_are_refused() -> None:
     with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed.*widen") as caught:
         sample(gaussian, even(BEGIN.points[:7]), stream(3))
     assert np.asarray(caught.value.chains).shape == (7, 2)
+
+
+def test_r_hat_is_that_of_arviz() -> None:
+    """Of draws that differ between ensembles in mean or spread, have ties, or are all equal."""
+    draws = np.random.default_rng(5).standard_normal((4, 501, 4))
+    draws[1, :, 0] += 0.3
+    draws[2, :, 1] *= 1.5
+    draws[..., 2] = draws[..., 2].round(1)
+    draws[..., 3] = 7.0
+    found = sampling.rank_r_hat(draws)
+    known = [array_stats.rhat(draws[..., j], chain_axis=0, draw_axis=1) for j in range(3)]
+    np.testing.assert_allclose(found, [*known, 1.0], rtol=1e-12)
+    assert found[0] > 1.005 and found[1] > 1.005

@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from arviz_stats.base.array import array_stats
 from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
@@ -234,3 +235,17 @@ def test_draws_of_a_proposal_follow_its_density(n_dim: int) -> None:
         fine = own.mean[0] + own.factor[0, 0] * np.sinh(np.linspace(-9, 9, 40_001))
         cdf = np.cumsum(np.exp(own.log_density(fine[:, None])) * np.gradient(fine))
         assert stats.kstest(grid, lambda v: np.interp(v, fine, cdf)).pvalue > 1e-4
+
+
+@pytest.mark.parametrize("n", [60, 226, 3000])
+@pytest.mark.parametrize("scale", [0.3, 1.0, 3.0])
+def test_pareto_k_is_that_of_arviz(n: int, scale: float) -> None:
+    """Few and many weights, whose tail is light or so heavy that they fail."""
+    weight = np.exp(scale * np.random.default_rng(n).standard_t(4, n))
+    found = WeightedDraws(np.zeros((n, 1)), weight / weight.sum(), 0.0).pareto_k
+    assert found == pytest.approx(float(array_stats.psislw(-np.log(weight))[1]), abs=1e-10)
+
+
+def test_pareto_k_of_few_weights_is_unknown() -> None:
+    """Of 24 weights the tail would have four."""
+    assert np.isnan(WeightedDraws(np.zeros((24, 1)), np.full(24, 1 / 24), 0.0).pareto_k)
