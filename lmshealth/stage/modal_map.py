@@ -221,7 +221,7 @@ def _tables(unit: FloatArray, sizes: Sequence[int]) -> list[FloatArray]:
 
 def _products(a: FloatArray, b: FloatArray) -> FloatArray:
     """Return the products of two sets of polynomials, ``(n_a n_b, n_points)``."""
-    return (a[:, None] * b).reshape(-1, a.shape[1])
+    return (a[:, None] * b).reshape(len(a) * len(b), a.shape[1])
 
 
 def _choose_sizes(
