@@ -106,9 +106,8 @@ class JointModel:
 
     def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
-        rows = {"floor": self.floor, "phi": self.phi, "rho": self.rho}
-        own = {name: values[list(kept)] for name, values in rows.items()}
-        return replace(self, data=self.data.of_channels(kept), **own)
+        floor, phi, rho = (own[list(kept)] for own in (self.floor, self.phi, self.rho))
+        return replace(self, data=self.data.of_channels(kept), floor=floor, phi=phi, rho=rho)
 
     def on(self, data: BandData) -> JointModel:
         """Return the model of other bins of the same channels, which have units of their own."""
