@@ -17,7 +17,7 @@ PHASES = np.radians([(0.0, 20.0, -10.0), (0.0, 0.0, 15.0)])
 @pytest.mark.slow
 def test_shapes_of_neighbours_have_their_amplitudes_and_phases() -> None:
     """Two modes two bandwidths apart, of which one moves one channel 20° late."""
-    rng = np.random.default_rng(2)
+    rng = np.random.default_rng(3)
     frequency = np.fft.rfftfreq(2 * N, 1 / RATE)
     frequency[0] = frequency[1]
     channels = white(rng, 5.0, 3 * N, RATE).reshape(3, N)

@@ -13,7 +13,7 @@ from functools import partial
 
 import numpy as np
 from scipy.ndimage import binary_dilation, find_objects, label, median_filter
-from scipy.stats import gamma
+from scipy.special import gammainccinv
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
@@ -462,10 +462,10 @@ def _mask_above(
     false_alarm = constants.LINE_FALSE_ALARM / ((n + (whitened is not None)) * n_free)
     masks = []
     for k, (spectrum, mask) in enumerate(zip(data.spectra.spectra, data.masks, strict=True)):
-        highest = gamma.isf(false_alarm, spectrum.count) / spectrum.count
+        highest = gammainccinv(spectrum.count, false_alarm) / spectrum.count
         above = (spectrum.powers() > highest * levels[k]).any(axis=1)
         if whitened is not None:
-            above |= whitened[k] > gamma.isf(false_alarm, spectrum.count * n) / spectrum.count
+            above |= whitened[k] > gammainccinv(spectrum.count * n, false_alarm) / spectrum.count
         lines = mask & above
         reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
         masks.append(mask & ~reached)
