@@ -7,8 +7,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.cluster.hierarchy import fcluster, linkage
-from scipy.signal import czt
-from scipy.signal.windows import tukey
 from scipy.spatial.distance import squareform
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
@@ -73,6 +71,9 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[
 
 def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
     """Return the correlations of the channels at the rate of a band, (n_lags, n, n)."""
+    from scipy.signal import czt  # late: it imports scipy.stats, half a second
+    from scipy.signal.windows import tukey
+
     n, width = len(spectra.channels), high - low
     rows = int(min(_MOST_ROWS, width * spectra.duration / 10))
     lags = np.arange(2 * rows + 2)
