@@ -17,7 +17,7 @@ from lmshealth._private.result import Result
 from lmshealth.batch.workers import processes
 from lmshealth.calibration import constants
 from lmshealth.calibration.lives import KINDS, Kind, Life, Schedule, draw
-from lmshealth.calibration.ranks import N_DRAWS, Row, judge, judge_places, place, share_row
+from lmshealth.calibration.ranks import N_DRAWS, Row, judge, judge_places, place, share_row, uniform
 from lmshealth.errors import BadQuestion, NotConverged, NotEnoughData
 from lmshealth.life.health import health_of
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
@@ -141,7 +141,7 @@ class CalibrationCheck(Result):
     @property
     def blind(self) -> tuple[str, ...]:
         """Controls that the check does not find wrong: it could not find such a fault."""
-        return tuple(name for name, row in self.controls.items() if _fine(row))
+        return tuple(name for name, row in self.controls.items() if uniform({name: row}))
 
 
 def check_calibration(
@@ -411,10 +411,6 @@ def summarise(
         controls=controls,
         passed=passed,
     )
-
-
-def _fine(row: Row) -> bool:
-    return bool(row["inside_band"] and all(level["holds"] for level in row["coverage"]))
 
 
 def _coverage(

@@ -392,7 +392,7 @@ def _covariates(rng: np.random.Generator, stage: Stage, n: int) -> dict[str, Flo
     effect, found = constants.COVARIATE_EFFECT, {}
     for one in stage.description.covariate:
         values = one.reference + effect / one.prior_std * rng.standard_normal(n)
-        # Without a covariate that a unit of moves modes far, a log has no use.
+        # A log without the value of a covariate of large effect has no use: it is never missing.
         if one.prior_std <= effect:
             values[rng.random(n) < constants.MISSING] = np.nan
         found[one.name] = values

@@ -140,17 +140,19 @@ def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
         return (
             "bad",
             "The stated uncertainty is wrong",
-            [f"By {drawn}, not so: {'; '.join(check.wrong)}."],
+            [f"By {drawn}, not so: {'; '.join(map(_spelled, check.wrong))}."],
         )
     if check.blind:
-        why = f"By {drawn} these faults would not be found: {'; '.join(check.blind)}."
+        faults = "; ".join(map(_spelled, check.blind))
+        why = f"By {drawn} these faults would not be found: {faults}."
         return "open", "No fault found, in too few lives to be sure", [f"{why} Draw more lives."]
     why = f"Intervals and ranks of {drawn} agree with what is stated; wrong ones would be found."
     return "good", "The stated uncertainty is right", [why]
 
 
-def _spelled(quantity: str) -> str:
-    return "date of the first limit" if quantity == DAYS else quantity
+def _spelled(name: str) -> str:
+    """Return the name of a quantity, or of a check or control of it, as the page has it."""
+    return name.replace(DAYS, "date of the first limit")
 
 
 def _width(one: Coverage) -> str:
@@ -339,7 +341,7 @@ def _controls(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
         for factor, word in words.items()
     ]  # fmt: skip
     rows = [
-        {"control": name, "found": "no: more lives are needed"
+        {"control": _spelled(name), "found": "no: more lives are needed"
          if name in check.blind else "yes"}
         for name in check.controls
     ]  # fmt: skip

@@ -45,10 +45,9 @@ class Finite(click.FloatRange):
         self, value: Any, param: click.Parameter | None, ctx: click.Context | None
     ) -> float:
         """Reject NaN and infinity."""
-        number = float(super().convert(value, param, ctx))
-        if not math.isfinite(number):
+        if not math.isfinite(click.FLOAT.convert(value, param, ctx)):
             self.fail(f"{value} is not a finite number.", param, ctx)
-        return number
+        return float(super().convert(value, param, ctx))
 
 
 def day(value: str) -> date:
@@ -71,8 +70,8 @@ def _band(
     if len(given) > 1:
         raise click.BadParameter("is given several times; needed is one band", param_hint="--band")
     for low, high in given:
-        if not 0 <= low < high:
-            detail = f"needs 0 <= LOW < HIGH, got {low:g} {high:g}"
+        if low >= high:
+            detail = f"needs LOW < HIGH, got {low:g} {high:g}"
             raise click.BadParameter(detail, param_hint="--band")
     return next(iter(given), None)
 
@@ -287,7 +286,7 @@ def band_option(text: str) -> Callable[[Any], Any]:
     return click.option(
         "--band",
         nargs=2,
-        type=Finite(),
+        type=Finite(0),
         multiple=True,
         metavar="LOW HIGH",
         callback=_band,

@@ -192,7 +192,7 @@ def read_modes(
         if why.reason != "too-short":
             raise
         stops: Sequence[Segment] = ()
-        with suppress(BadLog):  # without a set point nobody knows when a machine stops
+        with suppress(BadLog):  # stops are found by the set point, which may be missing
             stops = select_segments(log, "settling")
         if not stops:
             raise
@@ -200,7 +200,8 @@ def read_modes(
             reading = read_decays(log, stage, **chosen)
             if reading.modes.names:
                 return reading
-            decays = "; ".join(row.detail for row in reading.modes.refused if row.mode)
+            refused = [row.detail for row in reading.modes.refused if row.mode]
+            decays = "; ".join(refused) or "no mode was found"
         except BadLog as error:
             decays = error.detail
         detail = f"{why.detail}; of its decays after stops: {decays}"

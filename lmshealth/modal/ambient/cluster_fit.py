@@ -36,8 +36,8 @@ from lmshealth.stage.constants import BAND_HALF_WIDTH
 _UPDATES, _STRIDE = 25, 1.8
 # So many channels are fitted as they are; of more, directions that leave so much of each mode.
 _FEW, _SEEN = 4, 0.9
-# Ordinates at which directions are compared, at least.
-_LOOKED_AT = 200
+# Ordinates at which directions are compared, at most.
+_MOST_COMPARED = 200
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
 _COLLAPSED = 0.1
 # That with which a pole begins anew beside a line.
@@ -370,7 +370,7 @@ def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArra
     shapes = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
     phi = np.stack(shapes, axis=1) / np.linalg.norm(shapes, axis=1)
     foreign = [
-        s.foreign[:: 1 + s.frequency.size // _LOOKED_AT]
+        s.foreign[:: 1 + s.frequency.size // _MOST_COMPARED]
         for s in spectra.spectra
         if s.foreign is not None
     ]
