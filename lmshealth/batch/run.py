@@ -244,7 +244,9 @@ def _others(folder: Path, logs: frozenset[str]) -> str:
     files = (path for path in folder.rglob("*") if path.is_file() and path.name not in NOT_LOGS)
     counts = Counter(path.suffix for path in files if path.name[0] != ".")
     found = ", ".join(f"{n} {visible(suffix)}" for suffix, n in counts.most_common(3))
-    return f" (files: {found}; `lmshealth init FILE` tries one)" if found else ""
+    if not found:
+        return " (the folder has no files; name the one that has the logs)"
+    return f" (files: {found}; `lmshealth init FILE` tries one)"
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:

@@ -128,7 +128,9 @@ def content_digest(path: str | Path, *, name: str | None = None) -> str:
         found = Path(path).stat()
         # Opening a named pipe would wait until somebody writes to it.
         if not stat.S_ISREG(found.st_mode):
-            raise BadLog(label, "missing-file", "is no regular file")
+            folder = stat.S_ISDIR(found.st_mode)
+            other = "is a folder; name its files, or give it to `lmshealth run`"
+            raise BadLog(label, "missing-file", other if folder else "is no regular file")
         if not found.st_size:
             raise BadLog(label, "empty", "0 bytes; copy the file again")
         with Path(path).open("rb") as stream:

@@ -232,9 +232,9 @@ def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
         return ""
     names = ", ".join(dict.fromkeys(history.series[k].mode for k in columns))
     return fact(
-        "None of the modes of the map ({names}) was found in the last {missed} logs, so that no "
-        "health is published: look into their spectra for where the modes are now; search there, "
-        "or excite more.",
+        "None of the modes of the map ({names}) was found in the last {missed} logs, or none "
+        "agreed with the logs before, so that no health is published: look into their spectra for "
+        "where the modes are now; search there, or excite more.",
         names=names,
         missed=missed,
     )

@@ -279,7 +279,9 @@ class LifeLikelihood:
             scaled[own, own] += 1.0
         # One decomposition has both: its last pivot is χ² plus 1.
         pivots = _pivots(scaled)
-        return grid.rest[:, None] + pivots[-1] - 1, np.log(np.prod(pivots[:-1], axis=0))
+        if (pivots <= 0).any():
+            raise np.linalg.LinAlgError("the covariance of the errors of a map is not positive")
+        return grid.rest[:, None] + pivots[-1] - 1, np.log(pivots[:-1]).sum(axis=0)
 
     def conditional(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray

@@ -482,3 +482,28 @@ def test_segments_of_one_length_make_one_block() -> None:
     long = spectrum(9)
     short = replace(long.band(LOW, 100.0), duration=30.0)
     assert group_lengths([long, short, long]) == [[0, 2], [1]]
+
+
+@pytest.mark.parametrize("seen", [0.9, 0.3])
+def test_directions_leave_most_of_a_mode_beside_a_strong_harmonic(
+    seen: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A harmonic nearly at a right angle to a mode hides it in half of the band (0.3: control)."""
+    monkeypatch.setattr(cluster_fit, "_SEEN", seen)
+    phi, v = np.zeros((2, 6))
+    phi[0], v[:2] = 1.0, np.array([0.1, np.sqrt(0.99)])
+    n = 300
+    foreign = np.zeros((n, 6, 1), dtype=complex)
+    foreign[: n // 2, :, 0] = 300 * v
+    transforms = np.ones((1, n, 6), dtype=complex)
+    free = np.ones(n, dtype=bool)
+    f = np.linspace(90.0, 110.0, n)
+    spectrum = CrossSpectrum(f, transforms, 15.0, 0.1, free, foreign=foreign)
+    names = tuple("abcdef")
+    basis = cluster_fit._directions(
+        [phi.astype(complex)], LogSpectra(names, ("acc",) * 6, (spectrum,))
+    )
+    share = cluster_fit._seen(basis, phi[:, None], foreign).ravel()
+    assert basis.shape[1] == (2 if seen == 0.9 else 1)
+    assert share[n // 2 :].min() > 0.95
+    assert (share[: n // 2].min() > 0.9) == (seen == 0.9)

@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 
 from lmshealth import Modes, identify
+from lmshealth.modal.ambient import search
 from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
 from lmshealth.modal.ambient.whittle import response
+from lmshealth.modal.identification import read_ambient
 from lmshealth.signal.spectra import CrossSpectrum
 from studies.modes.without_description.worlds import FAMILIES, World, log_of
 from tests.signals import Mode, accelerations, make_log
@@ -221,3 +223,29 @@ def test_harmonics_of_one_shaft_are_recognised_by_their_phases(wander: float) ->
     assert second.follows(fifth)
     assert not noise.follows(second)
     assert not fifth.follows(replace(second, frequency=8.8))  # no ratio of small numbers
+
+
+@pytest.mark.parametrize("base_moves", [True, False])
+def test_the_static_response_is_that_of_what_moves(
+    base_moves: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of absolute acceleration over a moving base it is -1, of a force 0; else poles take it."""
+    rng = np.random.default_rng(3)
+    rate, n = 500.0, 60_000
+    f = np.fft.rfftfreq(n, 1 / rate)
+    shapes = np.array([[1.0, 0.7, -0.4, 0.9], [0.6, -1.0, 0.8, 0.5]])
+    x = 0.02 * rng.standard_normal((4, n))
+    for frequency, zeta, shape in zip((60.0, 95.0), (0.012, 0.01), shapes, strict=True):
+        moved = response(frequency, zeta, f.clip(f[1])) - base_moves
+        moved *= np.fft.rfft(rng.standard_normal(n))
+        x += shape[:, None] * np.fft.irfft(moved, n)
+    log = make_log({f"acc_{c}": row for c, row in enumerate(x)}, rate)
+    (found,) = read_ambient(log, band=(40.0, 130.0)).sought
+    assert found.model.static == -float(base_moves)
+    assert found.model.f.size == 2
+    # The share of φ in the static response of the other kind is what ρ has to find.
+    other = float(base_moves) - 1.0
+    monkeypatch.setattr(search, "_STATICS", (other,))
+    (control,) = read_ambient(log, band=(40.0, 130.0)).sought
+    assert control.model.static == other
+    assert control.model.misfit > found.model.misfit + 20 or control.model.f.size > 2
