@@ -316,7 +316,7 @@ def test_modes_that_have_left_their_searches_withhold_health(stage: Stage) -> No
         seen = np.resize(seen, (12, len(history.series)))
         found = replace(history, ln_frequency=seen)
         doubt = doubt_of_names(stage, found, track)
-        assert ("in the last 5 logs, so that no health" in doubt) is lost
+        assert ("in the last 5 logs, or none agreed" in doubt) is lost
     stray = replace(found, ln_frequency=np.where(np.arange(12)[:, None] == 9, ln_f, seen))
     assert doubt_of_names(stage, stray, track) == ""
     outliers = replace(track, outliers=tuple((9, mode) for mode in track.modes))
