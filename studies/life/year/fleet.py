@@ -175,7 +175,7 @@ def _log(one: Machine, k: int, day: float, folder: Path, seconds: float) -> Row:
 
 
 def _moment(day: float) -> str:
-    moment = datetime.combine(BEGIN, time(8)) + timedelta(days=day)
+    moment = datetime.combine(BEGIN, time()) + timedelta(days=day)
     return moment.replace(microsecond=0).isoformat() + "+00:00"
 
 
