@@ -50,6 +50,19 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             "Record a log at once; check work, payload, sensor and servo tuning since then."
         )
         yield Notice("large-drift", "serious", mode, what, to_do)
+    outliers = () if track is None else track.outliers
+    last, drifted = len(assessment.history.logs) - 1, assessment.drifted
+    jumped = [mode for epoch, mode in outliers if epoch == last and mode not in drifted]
+    if jumped:
+        names = " and ".join(map(spell, jumped))
+        what = fact(
+            "The last log is far from those before it at {names}, and health is without it.",
+            names=names,
+        )
+        to_do = fact(
+            "The next log decides: record it now, and enter work since then in maintenance.csv."
+        )
+        yield Notice("last-log-jumps", "caution", names, what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
         widened = track.widening[-1]

@@ -38,7 +38,7 @@ def test_a_machine_that_its_model_fits_has_no_notices(make: Maker) -> None:
 
 @pytest.mark.parametrize("code", [
     "names-in-doubt", "filter-inconsistent", "unexplained-drifts", "end-of-map",
-    "limit-not-included", "laws-do-not-fit",
+    "limit-not-included", "laws-do-not-fit", "last-log-jumps",
 ])  # fmt: skip
 def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     """What is wrong is noticed by its code, in words, and with the place."""
@@ -55,6 +55,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
             "prognosis": replace(prognosis, unidentifiable=("mount_stiffness",))
         },
         "laws-do-not-fit": {"prognosis": replace(prognosis, chi_square=1e4)},
+        "last-log-jumps": {"track": replace(track, outliers=((len(track.logs) - 1, "roll"),))},
     }
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
