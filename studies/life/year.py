@@ -280,18 +280,20 @@ def main() -> None:
     """Run the study; ``--quick`` has three machines for three months and records nothing."""
     study = Study(__file__, __doc__)
     names, months = ("AFG", 3) if study.quick else ("".join(name[0] for name in NAMES), MONTHS)
-    rows = study.trials.once(played, names, months, SECONDS)
+    rows = study.trials.once(played, names, months, SECONDS, also=("lmshealth.cli.main",))
     study.conclude(judged(rows), not_met=NOT_MET, quick_may_fail=True)
 
 
 def judged(rows: list[Row]) -> Row:
     """Return the table of sentences, those that are false, events, and the checks."""
     (table, wrong), (shifted, _) = tabled(rows), tabled(rows, len(FLEET) // 2)
-    sentences, odds, control = (total(own for own in found if own["odds"] is kind) for found, kind in
-                                ((table, False), (table, True), (shifted, False)))  # fmt: skip
+    kinds = ((table, False), (table, True), (shifted, False))
+    sentences, odds, control = (total(own for own in found if own["odds"] is kind)
+                                for found, kind in kinds)  # fmt: skip
     events = [announced(rows, *event) for event in EVENTS if rows[-1]["month"] == MONTHS]
-    alarms = Counter(row["said"].split(":")[1].strip() for row in rows if row["source"] == "alert"
-                     and NAMES[row["machine"]].role == "healthy" and row["said"][:4] != "note")  # fmt: skip
+    told = [row["said"] for row in rows if row["source"] == "alert"
+            and NAMES[row["machine"]].role == "healthy"]  # fmt: skip
+    alarms = Counter(said.split(":")[1].strip() for said in told if not said.startswith("note"))
     passed = {
         "no sentence is false": not sentences["false"],
         "odds hold": odds["false"] <= 0.1 * (odds["true"] + odds["false"]),
