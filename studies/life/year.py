@@ -224,7 +224,7 @@ class Truth:
         """Judge an end of the 90 % interval of the remaining life."""
         left, told = KM_PER_DAY * (self.end - self.last), re.sub(r"\D", "", text.split("km")[0])
         km = inf if "beyond" in text else 0.0 if "passed" in text else float(told)
-        return left >= min(km, 20_000) - 12 if which == "Early" else left <= km + 12
+        return max(left, 0) >= min(km, 20_000) - 12 if which == "Early" else left <= km + 12
 
 
 # What a sentence says (regular expression), whether it states odds, and its test.
@@ -249,14 +249,13 @@ RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
      f"{_DAY}", True, lambda m, t: at(m[1] or m[2]) <= t.end),
     (f"(?:Service: )?Overdue since {_DAY}", False,
      lambda m, t: at(m[1]) < t.today and t.end < inf),
-    ("Order and plan", False, lambda m, t: t.end < inf),
+    ("Order and plan|Do .* now: its date", False, lambda m, t: t.end < inf),
     ("No work is needed yet|(?:Service: )?No service needed yet", False,
      lambda m, t: t.end > t.today),
     ("No service is needed within", False, lambda m, t: t.end == inf),
     ("Do .* now|(?:Service: )?Now$", False, lambda m, t: t.end < t.today + 31),
     ("Inspect guide and mount now", False, lambda m, t: t.changed),
     ("Find out what moved the mode", False, lambda m, t: t.unexplained),
-    ("Record a log now: without one nothing", False, lambda m, t: t.machine.role == "silent"),
     (_NE + "normal|NORMAL$", False, lambda m, t: t.sound),
     (_NE + "failure|FAILURE$|serious: limit-reached", False,
      lambda m, t: any(t.at(x, t.today) <= LIMITS[x] + EDGE for x in LIMITS)),
@@ -268,11 +267,12 @@ RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
 
 # True events: machine, what, its day or the bounds that health falls below, its alert.
 EVENTS: tuple[tuple[str, str, Any, str], ...] = (
-    *((name, "loss", LOST, "serious: verdict: .*→ (?:preload|mount|both)") for name in "ABCD"),
+    *((name, "loss", LOST, "serious: verdict: .*→ (?:preload|mount)") for name in "ABCD"),
+    ("C", "loss of mount", {"mount stiffness": 0.925}, "serious: verdict: .*→ both"),
     *((name, "limit", LIMITS, "serious: limit-reached") for name in "ABC"),
-    ("D", "repair, entered", ENTERED, "note: (?:recovered|verdict): .*→ (?:healthy|not)"),
+    ("D", "repair, entered", ENTERED, "note: (?:recovered|verdict): preload →"),
     ("E", "silence", SILENT + SILENT_AFTER - 15, "caution: silent"),
-    ("F", "lone mode", FOREIGN, "serious: (?:verdict|alarm)"),
+    ("F", "lone mode", FOREIGN, "serious: verdict"),
 )
 
 
@@ -343,7 +343,7 @@ def announced(rows: list[Row], letter: str, what: str, when: Any, pattern: str) 
     name = f"{letter}-Y"
     if isinstance(when, dict):
         when = next(day for day in range(400) if any(
-            NAMES[name].health(part, day, 0) <= when[part] for part in LIMITS))  # fmt: skip
+            NAMES[name].health(part, day, 0) <= when[part] for part in when))  # fmt: skip
     told = [run_day(row["month"]) for row in rows if row["machine"] == name
             and row["source"] == "alert" and re.match(pattern, row["said"])]  # fmt: skip
     late = told[0] - when if told else None
