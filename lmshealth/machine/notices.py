@@ -80,7 +80,9 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
 def _left_out(assessment: Assessment) -> dict[str, int]:
     """Return the modes whose last logs are outliers of the track, and how many of these."""
     track, left = assessment.track, dict[str, int]()
-    for epoch, mode in sorted(track.outliers, reverse=True) if track is not None else ():
+    if track is None:
+        return left
+    for epoch, mode in sorted(track.outliers, reverse=True):
         if epoch == len(track.logs) - 1 - left.get(mode, 0) and mode not in assessment.drifted:
             left[mode] = left.get(mode, 0) + 1
     return left
