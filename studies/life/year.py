@@ -1,11 +1,10 @@
 """Is every sentence true that the pages and alerts of a fleet say in a year of monthly runs?
 
 Method
-    Twelve simulated stages Y, two logs of 6 s a month: three wear, one wears and is repaired, which
-    is entered 25 days later, one falls silent, of one yaw moves alone, six are sound. `run --today`
-    monthly over the growing archive, lives by importance sampling. Sentences of pages and alerts
-    that a rule knows are judged by the truth of that day, odds (intervals, days of an accepted
-    risk) apart. Control: another machine's truth.
+    Twelve simulated stages Y, two logs a month: three wear, one wears and is repaired (entered 25
+    days later), one falls silent, yaw of one moves alone, six are sound. Monthly `run --today`,
+    lives by importance sampling. What pages and alerts say is judged by rules on the truth of the
+    day; odds (intervals, days of a risk) apart. Control: another machine's truth.
 Run time
     A quarter of an hour on one processor.
 """
@@ -207,13 +206,12 @@ class Truth:
 
     def verdict(self, text: str) -> bool | None:
         """Judge a verdict in words, or that of a table."""
-        if "ealthy" in text:
-            return self.sound
         if re.search("oss of|preload$|mount$|both$", text):
             told = [x for x in LIMITS if x.split()[x[0] == "g"] in text or "both" in text]
             return all(self.lost[x] is not (x not in told) for x in LIMITS)
         alone, step = re.search("alone|outside", text), re.search("udden|step", text)
-        return self.lone if alone else self.unexplained if step else None
+        known = self.lone if alone else self.unexplained if step else None
+        return self.sound if "ealthy" in text else known
 
 
 # What a sentence says (regular expression), whether it states odds, and its test.
