@@ -358,6 +358,14 @@ def test_kinds_of_lives(root: Path) -> None:
     assert kinds["yaw alone, 2 %"]["left_90"] is None
 
 
+def test_year_of_a_fleet(root: Path) -> None:
+    """Of three machines nothing false is said in three months; much is, by another's truth."""
+    answer = json.loads(run_study(root, "studies.life.year"))
+    assert answer["passed"]["no sentence is false"]
+    assert answer["control"]["false"] > 20
+    assert answer["sentences"]["true"] > 30
+
+
 def test_calibration_by_ended_lives(root: Path) -> None:
     """A fleet with one ended life and one machine is predicted, and too small to be judged."""
     answer = json.loads(run_study(root, "studies.life.fleet.conformal"))

@@ -137,13 +137,15 @@ class Assessment:
         return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
-        """Return a sort key: day of the service; without a verdict before safe machines.
+        """Return a sort key: day of the service; sudden changes first, no verdict before safe ones.
 
         Days of the calendar: a machine whose last log is old may be overdue.
         """
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
             return (0 if self.alarmed or self.drifted else 1), 0.0, 0.0, identity
+        if verdict == "step":  # until its cause is known, no day of a service counts
+            return 0, 0.0, 0.0, identity
         if verdict == OUTSIDE_MAP:
             return 1, 0.0, 0.0, identity
         if self.prognosis is None:

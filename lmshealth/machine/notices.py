@@ -1,6 +1,7 @@
 """Notices: what was noticed about a machine that its reader must take into account."""
 
 from collections.abc import Iterator
+from typing import Literal
 
 import numpy as np
 from scipy.special import gammaincinv
@@ -50,6 +51,18 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             "Record a log at once; check work, payload, sensor and servo tuning since then."
         )
         yield Notice("large-drift", "serious", mode, what, to_do)
+    for mode, n in _left_out(assessment).items():
+        one = fact(
+            "The last log is far from those before it at {mode}, and left out.", mode=spell(mode)
+        )
+        more = fact(
+            "The last {n} logs are far from those before them at {mode}, and left out: health is "
+            "that of then.",
+            **{"n": n, "mode": spell(mode)},
+        )
+        to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
+        severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
+        yield Notice("last-logs-left-out", severity, mode, more if n > 1 else one, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
         widened = track.widening[-1]
@@ -62,6 +75,17 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         what = wide if widened > 1 else narrow
         to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
         yield Notice("filter-inconsistent", "caution", "", what, to_do)
+
+
+def _left_out(assessment: Assessment) -> dict[str, int]:
+    """Return the modes whose last logs are outliers of the track, and how many of these."""
+    track, left = assessment.track, dict[str, int]()
+    if track is None:
+        return left
+    for epoch, mode in sorted(track.outliers, reverse=True):
+        if epoch == len(track.logs) - 1 - left.get(mode, 0) and mode not in assessment.drifted:
+            left[mode] = left.get(mode, 0) + 1
+    return left
 
 
 def _of_health(assessment: Assessment) -> Iterator[Notice]:

@@ -86,7 +86,9 @@ _STEPS = {
         "Record a log at once: a mode has moved by more than logs scatter. If it stays, look for "
         "work, payload, sensor or tuning as the cause."
     ),
-    "log-now": mark("Record a log now: without one nothing is known of this machine."),
+    "log-now": mark(
+        "Record a log now: it is overdue, and the state since the last one is unknown."
+    ),
     "none": "",
     "record": mark("Record further logs; the reasons are below."),
     "service-now": mark(

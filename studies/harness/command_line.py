@@ -40,7 +40,7 @@ def call(program: str, *arguments: object, quick: bool, some_refused: bool = Fal
 
 def no_pictures() -> AbstractContextManager[object]:
     """Let pages have no pictures: drawing them is most of making them."""
-    return patch.object(plots, "svg", lambda *_, **__: "")
+    return patch.object(plots, "inline", lambda *_, **__: "")
 
 
 def call_here(program: str, words: Sequence[str], *, some_refused: bool = False) -> str:

@@ -52,6 +52,7 @@ from lmshealth.life.prognosis import prognose
 from lmshealth.machine import assessment as machine_assessment
 from lmshealth.machine.assessment import Assessment, LifeState, assess_from
 from lmshealth.machine.summary import Summary, summarise
+from lmshealth.modal import identification
 from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.machine_page import make_page
@@ -666,7 +667,7 @@ def test_what_the_computer_failed_at_is_tried_again(
         return read_modes(log, stage, **options)
 
     with monkeypatch.context() as patch:
-        patch.setattr(ingesting, "read_modes", fail)
+        patch.setattr(identification, "read_modes", fail)
         first = run(logs, [modes_only], tmp_path / "out")
     assert (first.n_refused, first.n_remembered) == (1, 0)
     refused = rows(tmp_path / "out" / "refused.csv")

@@ -38,7 +38,7 @@ def test_a_machine_that_its_model_fits_has_no_notices(make: Maker) -> None:
 
 @pytest.mark.parametrize("code", [
     "names-in-doubt", "filter-inconsistent", "unexplained-drifts", "end-of-map",
-    "limit-not-included", "laws-do-not-fit",
+    "limit-not-included", "laws-do-not-fit", "last-logs-left-out",
 ])  # fmt: skip
 def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     """What is wrong is noticed by its code, in words, and with the place."""
@@ -55,6 +55,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
             "prognosis": replace(prognosis, unidentifiable=("mount_stiffness",))
         },
         "laws-do-not-fit": {"prognosis": replace(prognosis, chi_square=1e4)},
+        "last-logs-left-out": {"track": replace(track, outliers=((len(track.logs) - 1, "roll"),))},
     }
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
@@ -152,3 +153,18 @@ def test_scatter_is_no_large_drift(tmp_path: Path) -> None:
     stage = make_stage(tmp_path, parameters=(), tail="")
     logs = [few_logs(2 + seed % 3, 0.0, seed, scale=2.0) for seed in range(60)]
     assert not [found for found in (assess(one, stage) for one in logs) if found.drifted]
+
+
+@pytest.mark.parametrize(("epochs", "severity"), [((-1,), "caution"), ((-2, -1), "serious")])
+def test_last_logs_that_are_left_out_are_counted(
+    make: Maker, epochs: tuple[int, ...], severity: str
+) -> None:
+    """One outlier may be chance; of several the page would state a health of long ago."""
+    good = make()
+    assert good.track is not None
+    n = len(good.track.logs)
+    outliers = ((n - 4, "roll"), *((n + epoch, "roll") for epoch in epochs))
+    bad = replace(good, track=replace(good.track, outliers=outliers))
+    (told,) = (one for one in notices(bad) if one.code == "last-logs-left-out")
+    assert (told.severity, told.where) == (severity, "roll")
+    assert ("last 2 logs" in told.what) == (len(epochs) > 1)

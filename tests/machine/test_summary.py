@@ -99,6 +99,13 @@ def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
     assert summary(assessment).urgency < found.urgency < healthy.urgency
 
 
+def test_a_sudden_change_comes_first(make: Maker) -> None:
+    """Until its cause is known it stands before worn machines, though no service is due."""
+    assessment = make("sound", wear_km=400000, floor=0.98)
+    jumped = replace(assessment, judgement=replace(assessment.judgement, verdict="step"))
+    assert jumped.urgency(jumped.service()) < make().urgency(make().service())
+
+
 def test_machines_are_sorted_by_the_calendar(make: Maker) -> None:
     """A service on an earlier day comes first, whatever the days since the last log are."""
     assessment = make()
