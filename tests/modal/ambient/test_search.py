@@ -236,7 +236,7 @@ def test_the_static_response_is_that_of_what_moves(
     shapes = np.array([[1.0, 0.7, -0.4, 0.9], [0.6, -1.0, 0.8, 0.5]])
     x = 0.02 * rng.standard_normal((4, n))
     for frequency, zeta, shape in zip((60.0, 95.0), (0.012, 0.01), shapes, strict=True):
-        moved = response(frequency, zeta, f.clip(f[1])) - base_moves
+        moved = response(np.array(frequency), np.array(zeta), f.clip(f[1])) - base_moves
         moved *= np.fft.rfft(rng.standard_normal(n))
         x += shape[:, None] * np.fft.irfft(moved, n)
     log = make_log({f"acc_{c}": row for c, row in enumerate(x)}, rate)
