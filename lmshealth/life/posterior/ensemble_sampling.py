@@ -151,24 +151,9 @@ def _diagnose(what: str, chains: FloatArray, **options: Any) -> FloatArray:
 
 
 def rank_r_hat(draws: FloatArray) -> FloatArray:
-    """Return R-hat of draws ``(n_ensembles, n_draws, n_dim)``, 1 of those that are all equal.
-
-    The larger of those of ranks and of distances from the median, between halves of all ensembles
-    [Vehtari2021]; as in ArviZ, whose import takes longer than an update of a posterior.
-    """
-    half = draws.shape[1] // 2
-    halves = np.concatenate([draws[:, :half], draws[:, -half:]])
+    """Return R-hat of draws ``(n_ensembles, n_draws, n_dim)``, 1 of those that are all equal."""
+    spread = np.ptp(draws, axis=(0, 1)) > 0
     found = np.ones(draws.shape[2])
-    for j in np.flatnonzero(np.ptp(draws, axis=(0, 1)) > 0):
-        x = halves[..., j]
-        found[j] = max(_r_hat_of_ranks(x), _r_hat_of_ranks(np.abs(x - np.median(x))))
+    if spread.any():
+        found[spread] = _diagnose("rhat", draws[:, :, None, spread])
     return found
-
-
-def _r_hat_of_ranks(x: FloatArray) -> float:
-    """Return R-hat of the normal scores of draws, ``(n_chains, n_draws)``."""
-    _, which, counts = np.unique(x, return_inverse=True, return_counts=True)
-    rank = (np.cumsum(counts) - (counts - 1) / 2)[which].reshape(x.shape)
-    scores, n = ndtri((rank - 0.375) / (x.size + 0.25)), x.shape[1]
-    between, within = scores.mean(axis=1).var(ddof=1), scores.var(axis=1, ddof=1).mean()
-    return float(np.sqrt(between / within + 1 - 1 / n))

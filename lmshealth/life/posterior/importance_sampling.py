@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Self
 
 import numpy as np
-from scipy.special import gammaln, softmax
+from scipy.special import gammaln
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
@@ -45,24 +45,16 @@ class WeightedDraws(ReadOnly):
 
     @property
     def pareto_k(self) -> float:
-        """Shape of the Pareto distribution of the largest weights [Vehtari2024], NaN of too few.
+        """Shape of the Pareto distribution of the largest weights [Vehtari2024], NaN of too few."""
+        from arviz_stats.base.array import array_stats  # late: it costs more than numpy to import
 
-        As ArviZ estimates it, whose import takes longer than an update of a posterior.
-        """
-        n = self.weight.size
-        m = int(3 * np.sqrt(n) if n > 225 else n / 5)
-        if m < 5:
+        diagnostic: Any = array_stats  # the library has no types
+        # A weight may be too small for a float.
+        weight = np.maximum(self.weight, np.finfo(float).tiny)
+        try:
+            return float(diagnostic.psislw(-np.log(weight))[1])
+        except ValueError:  # the tail has fewer than five weights
             return float("nan")
-        *_, cutoff = weight = np.sort(self.weight / self.weight.max())[-m - 1 :][::-1]
-        tail = weight[-2::-1] - cutoff
-        rates = 1 - np.sqrt((30 + int(m**0.5)) / (np.arange(30 + int(m**0.5)) + 0.5))
-        with np.errstate(divide="ignore", invalid="ignore"):
-            rates = rates / (3 * tail[int(m / 4 + 0.5) - 1]) + 1 / tail[-1]
-            shapes = np.log1p(-rates[:, None] * tail).mean(axis=1)
-            share = softmax(m * (np.log(-rates / shapes) - shapes - 1))
-            shape = np.log1p(-(share @ rates) * tail).mean()
-        # A weak prior about 0.5.
-        return float((m * shape + 5) / (m + 10))
 
     def resampled(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw points of equal weight, shape ``(n, n_dim)``."""
