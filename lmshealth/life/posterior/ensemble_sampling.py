@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.random import MT19937, RandomState
-from scipy.special import ndtri
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
