@@ -182,7 +182,8 @@ def prognosis_of(life: LifePosterior, history: History, stage: Stage) -> Prognos
             fact(
                 "{stage}: the modes {names} identify no parameter that has a limit, however many "
                 "logs there are; `lmshealth stage` lists what they identify",
-                **{"stage": history.stage, "names": ", ".join(life.modes)},
+                stage=history.stage,
+                names=", ".join(life.modes),
             )
         )
     history = with_clock(history, stage)

@@ -196,7 +196,9 @@ def doubt_of_names(
             "found at the baseline: {values}. Plausible are differences up to {most:.0f} % "
             "(damping: a factor of {factor:g}): correct the description, or describe the modes "
             "that it lacks.",
-            **{"values": values, "most": 100 * OFF_FREQUENCY, "factor": OFF_DAMPING},
+            values=values,
+            most=100 * OFF_FREQUENCY,
+            factor=OFF_DAMPING,
         )
     flags = Counter(
         name
@@ -278,7 +280,8 @@ def _judge_step(
     why = fact(
         "The frequencies jumped before the log of {day} ({sizes}), and no declared maintenance "
         "explains it.",
-        **{"day": when, "sizes": moved},
+        day=when,
+        sizes=moved,
     )
     if health is not None and health.publishable_parameters().any():
         why += " " + _parameter_sentences(stage, health)
@@ -319,7 +322,10 @@ def lone_sentence(lone: LoneMode, stage: Stage) -> str:
     return fact(
         "{name} has moved by {size} ± {std:.1f} % alone; no state of {states} does this. Check "
         "its sensor and cables, and what the platform carries.",
-        **{"name": name, "size": size, "std": std, "states": states},
+        name=name,
+        size=size,
+        std=std,
+        states=states,
     )
 
 
@@ -337,15 +343,21 @@ def _parameter_sentences(stage: Stage, health: Health) -> str:
         elif parameter.unit:
             text = fact(
                 "{name} is {middle:.4g} {unit} (90 %: {low:.4g} to {high:.4g}).",
-                **{"name": name, "unit": parameter.unit},
-                **{"low": low, "middle": middle, "high": high},
+                name=name,
+                unit=parameter.unit,
+                low=low,
+                middle=middle,
+                high=high,
             )
         else:
             low, middle, high = (100 * q / parameter.baseline for q in (low, middle, high))
             text = fact(
                 "{name} is at {middle:.0f} % of its baseline value (90 %: {low:.0f} to "
                 "{high:.0f} %).",
-                **{"name": name, "low": low, "middle": middle, "high": high},
+                name=name,
+                low=low,
+                middle=middle,
+                high=high,
             )
         sentences.append(text)
     return " ".join(sentences)

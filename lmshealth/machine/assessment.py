@@ -263,7 +263,8 @@ def assess_from(
         why = fact(
             "{stage}: its logs lead to a singular matrix ({error}); please report this with "
             "modes.csv",
-            **{"stage": history.stage, "error": error},
+            stage=history.stage,
+            error=error,
         )
     notice = Notice("no-result", "serious", "", why)
     return replace(made, notices=(*made.notices, notice)), None

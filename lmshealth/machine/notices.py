@@ -45,7 +45,10 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         what = fact(
             "{mode} has moved by {size} % in {n} logs, {n_std:.0f} standard deviations: no scatter "
             "explains it.",
-            **{"mode": spell(mode).capitalize(), "size": moved, "n": n_logs, "n_std": n_std},
+            mode=spell(mode).capitalize(),
+            size=moved,
+            n=n_logs,
+            n_std=n_std,
         )
         to_do = fact(
             "Record a log at once; check work, payload, sensor and servo tuning since then."
@@ -58,7 +61,8 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         more = fact(
             "The last {n} logs are far from those before them at {mode}, and left out: health is "
             "that of then.",
-            **{"n": n, "mode": spell(mode)},
+            n=n,
+            mode=spell(mode),
         )
         to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
         severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
@@ -70,7 +74,8 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         wide = fact(
             "The logs do not vary as the filter of the modes expects (p = {p}); its intervals are "
             "{factor:.1f} times as wide.",
-            **{"p": p, "factor": widened},
+            p=p,
+            factor=widened,
         )
         what = wide if widened > 1 else narrow
         to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
@@ -150,8 +155,10 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
         what = fact(
             "{early} of the {n} ended lives of this fleet ended before the travel predicted for "
             "{share:.0%} of them (p = {p:.1g}).",
-            **{"early": fleet.early, "n": fleet.n_lives},
-            **{"share": CALIBRATED_RISK, "p": fleet.p_value},
+            early=fleet.early,
+            n=fleet.n_lives,
+            share=CALIBRATED_RISK,
+            p=fleet.p_value,
         )
         to_do = fact(
             "Plan by the calibrated travel instead of the service date; add a law that fits."

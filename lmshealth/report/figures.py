@@ -650,7 +650,9 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
         f"{title(track, k)}\n"
         + tr(
             "NIS {value}; expected {low} to {high}",
-            **{"value": fixed(value, 1), "low": fixed(a, 1), "high": fixed(b, 1)},
+            value=fixed(value, 1),
+            low=fixed(a, 1),
+            high=fixed(b, 1),
         )
         for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
     ]

@@ -465,7 +465,8 @@ def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[N
         what = fact(
             "{names}: the estimates of the last {n} logs are ambiguous, so that nothing new is "
             "known; logs with more channels would distinguish modes by their shapes.",
-            **{"names": names, "n": least},
+            names=names,
+            n=least,
         )
         notices.append(Notice("ambiguous-modes", "caution", names, what))
     for name in history.modes:

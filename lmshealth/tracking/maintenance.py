@@ -136,7 +136,8 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
             fact(
                 "{file} cannot be read completely ({detail}): work on this machine that it lists "
                 "there is not used.",
-                **{"file": one.refusal.log, "detail": one.refusal.detail},
+                file=one.refusal.log,
+                detail=one.refusal.detail,
             ),
             fact("Correct the row and run again."),
         )

@@ -246,7 +246,8 @@ def track(history: History, stage: Stage | None = None) -> Track:
             fact(
                 "{stage}: no modal estimate in {n} logs is of a known mode; a mode without a name "
                 "is known once three logs show it",
-                **{"stage": history.stage, "n": len(history.logs)},
+                stage=history.stage,
+                n=len(history.logs),
             )
         )
     space = StateSpace(history, stage, history.steps)

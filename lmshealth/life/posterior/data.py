@@ -65,8 +65,10 @@ class LifeData(ReadOnly):
                 fact(
                     "{stage}: {n} logs with a mode of the map over {travel:.4g} km; a life needs "
                     "at least {least} logs and some travel",
-                    **{"stage": history.stage, "n": n_logs},
-                    **{"travel": now / 1000, "least": min_logs},
+                    stage=history.stage,
+                    n=n_logs,
+                    travel=now / 1000,
+                    least=min_logs,
                 )
             )
         series_of, log_of = np.nonzero(np.isfinite(ln_f.T))
@@ -218,7 +220,8 @@ def clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
             fact(
                 "{stage}: the modes jumped {n} times since the baseline; no law of a life holds "
                 "over so many; maintenance.csv can declare a new baseline",
-                **{"stage": history.stage, "n": len(first)},
+                stage=history.stage,
+                n=len(first),
             )
         )
     return clock, tuple(float((clock[k - 1] + clock[k]) / 2) for k in first)
