@@ -7,14 +7,11 @@ from typing import Generic, TypeVar
 
 from lmshealth.batch import constants
 from lmshealth.batch.store import Store
-from lmshealth.batch.workers import OnCrash, Pool, Task
+from lmshealth.batch.workers import OnCrash, Pool, Progress, Task
 
 Piece = TypeVar("Piece")
 Job = TypeVar("Job")
 Value = TypeVar("Value")
-
-Progress = Callable[[str, int, int], None]
-"""Callback: name of the step, how many items are done, how many there are."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from lmshealth.batch.store import unpack_or_none
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Status, judge_at, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
-from lmshealth.report.language import Language, speaking
+from lmshealth.report.language import Language, in_language
 from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.report.tables import csv_text, join_csv, machine_tables
 from lmshealth.tracking.contradictions import LEFT_OUT
@@ -65,7 +65,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         return None
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
-    with _DRAWING, speaking(record.language):
+    with _DRAWING, in_language(record.language):
         page = make_page(found, summary, before=record.before)
     rows = machine_tables(found) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
@@ -96,7 +96,7 @@ class Judging:
         today = self.moment.date()
         status = judge_at(before, output.status, self.moment, self.silent_days)
         summary = on_day(output.summary, status, today)
-        with speaking(self.language):
+        with in_language(self.language):
             write_text(path, date_page(output.page, summary, status))
         return summary
 

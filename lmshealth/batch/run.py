@@ -15,7 +15,7 @@ from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.cache import Cached, Progress, Resources
+from lmshealth.batch.cache import Cached, Resources
 from lmshealth.batch.dashboard import put_points, put_status
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
 from lmshealth.batch.outputs import (
@@ -26,6 +26,7 @@ from lmshealth.batch.outputs import (
     write_tables,
 )
 from lmshealth.batch.store import Store, default_url, unpack_or_none
+from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import NOT_LOGS
@@ -33,7 +34,7 @@ from lmshealth.io.refusal import visible
 from lmshealth.machine.status import Change, Status
 from lmshealth.machine.summary import Summary
 from lmshealth.report.fleet_page import by_urgency, file_names, write_index
-from lmshealth.report.language import Language, speaking
+from lmshealth.report.language import Language, in_language
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -135,7 +136,7 @@ def run(
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
-            with speaking(settings.language):
+            with in_language(settings.language):
                 write_index(out, done.rows, refused, today=judging.moment.date())
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
@@ -190,7 +191,7 @@ def report(
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     refused = store.refused(one.refused for one in present)
-    with speaking(settings.language):
+    with in_language(settings.language):
         index = write_index(out, ranked, refused, today=judging.moment.date())
     return RunResult(
         index=index,

@@ -36,6 +36,8 @@ Item = TypeVar("Item")
 Result = TypeVar("Result")
 Task = Callable[[Item], Result]
 OnCrash = Callable[[Item, str], Result]
+Progress = Callable[[str, int, int], None]
+"""Callback: name of the step, how many items are done, how many there are."""
 
 # Of worker processes: loky restarts a process that has grown by 300 MB, which logs of unequal
 # length do without any leak, and prints a traceback of native code for every crash.

@@ -1,7 +1,7 @@
 """Calibration of a stage description: lives drawn from it, through the chain of real logs."""
 
 from collections import Counter
-from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from itertools import pairwise
@@ -14,7 +14,7 @@ from numpy.linalg import LinAlgError
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.names import spell
 from lmshealth._private.result import Result
-from lmshealth.batch.workers import processes
+from lmshealth.batch.workers import Progress, processes
 from lmshealth.calibration import constants
 from lmshealth.calibration.lives import KINDS, Kind, Life, Schedule, draw
 from lmshealth.calibration.ranks import N_DRAWS, Row, judge, judge_places, place, share_row, uniform
@@ -37,7 +37,6 @@ from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import accepted_estimates, track
 
-Progress = Callable[[str, int, int], None]
 DRAWN = "as described"
 """Population of the lives of all kinds, with the probabilities of the description."""
 DAYS = "days left"
@@ -389,7 +388,7 @@ def summarise(
     ranks = judged_ranks([one.places for one in drawn])
     controls = {
         f"{name}, {words}": row
-        for factor, words in zip(constants.WRONG_WIDTHS, ("too narrow", "too wide"), strict=True)
+        for factor, words in constants.WRONG_WIDTHS.items()
         for name, row in judged_ranks([o.controls.get(f"{factor:g}", {}) for o in drawn]).items()
     }
     rates = [row for kind, own in groups.items() for row in _rates(kind, own, stage)]

@@ -38,5 +38,5 @@ LEAST_OF_KIND = 0.25
 """Lives of each kind, at least, as a share of those drawn from the description."""
 LOSSES = (0.0, 0.02, 0.05, 0.1, 0.2, 1.0)
 """Edges of the groups of true losses whose detection is reported, as shares of the baseline."""
-WRONG_WIDTHS = (0.5, 2.0)
-"""Factors on the widths of intervals of the controls, which the check must find wrong."""
+WRONG_WIDTHS = {0.5: "too narrow", 2.0: "too wide"}
+"""Factors on the widths of intervals of the controls, which the check must find wrong, and how."""

@@ -178,7 +178,7 @@ class Life:
 
 
 def _paces(rng: np.random.Generator, n: int, scatter: float) -> FloatArray:
-    """Draw the travel of intervals over its mean; it never stands still."""
+    """Draw the travel of intervals over its mean, always positive."""
     return np.maximum(1 + scatter * rng.standard_normal(n), constants.LEAST_PACE)
 
 

@@ -36,7 +36,7 @@ _FLAT = "Good: bars of equal height, none beyond the grey band."
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """A figure with its caption, which says what good looks like."""
+    """A figure with its caption, which states how a right result appears."""
 
     title: str
     svg: str
@@ -200,16 +200,25 @@ def rate_rows(rates: Iterable[Rate]) -> list[dict[str, str]]:
 
 
 def _blocks(check: CalibrationCheck) -> Iterator[Block]:
-    schedule, n = check.schedule, len(check.outcomes)
+    """Yield the parts of the page, in their order."""
     quantities = list(dict.fromkeys(one.quantity for one in check.coverage))
-    drawn = [one for one in check.outcomes if one.drawn]
-    yield Block(
+    yield _expectations(check, quantities)
+    yield _ranks(check, quantities)
+    yield _detection(check)
+    yield _controls(check, quantities)
+    yield _assumptions(check)
+
+
+def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
+    """Show coverage and width of intervals by kind of life."""
+    n = len(check.outcomes)
+    return Block(
         "What you may expect",
         (
             f"{n} lives of {check.stage} were drawn from its description, and each was analysed as "
             "real logs are. A 90 % interval is right if it contains the true value in 90 of 100 "
-            "lives: in fewer it is too narrow and promises too much, in more it is too wide and "
-            "tells less than the logs do.",
+            "lives: in fewer it is too narrow, and its uncertainty is too small; in more it is too "
+            "wide, and its uncertainty too large.",
             "“as described” has lives of all kinds as often as the description expects them; only "
             "there coverage must be as stated. In lives of one kind alone it may be higher or "
             "lower, which is shown beside it. In brackets: 95 % Monte-Carlo interval.",
@@ -231,7 +240,12 @@ def _blocks(check: CalibrationCheck) -> Iterator[Block]:
         ],
         expectation_rows(check),
     )  # fmt: skip
-    yield Block(
+
+
+def _ranks(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
+    """Show the ranks of truths in lives drawn from the description, and tests of them."""
+    drawn = [one for one in check.outcomes if one.drawn]
+    return Block(
         "Is the uncertainty neither too small nor too large?",
         (
             "In each life the true value is ranked among 127 values that the analysis considers "
@@ -262,12 +276,15 @@ def _blocks(check: CalibrationCheck) -> Iterator[Block]:
             for name, row in check.ranks.items()
         ],
     )
-    yield _detection(check)
-    yield _controls(check, quantities)
+
+
+def _assumptions(check: CalibrationCheck) -> Block:
+    """State schedule, errors of the estimates, and what was not checked."""
+    schedule = check.schedule
     errors = "the Cramér-Rao bound with the SNR of the description"
     if schedule.frequency_std is not None:
         errors = f"{percent(schedule.frequency_std, 3)} of the frequency"
-    yield Block(
+    return Block(
         "What was assumed",
         (
             f"{schedule.logs} logs, one every {schedule.every:g} days, {schedule.seconds:g} s "
@@ -327,7 +344,6 @@ def _detection(check: CalibrationCheck) -> Block:
 
 def _controls(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
     """Show the same check of intervals that are wrong on purpose."""
-    words = dict(zip(constants.WRONG_WIDTHS, ("too narrow", "too wide"), strict=True))
     where = dict(zip(constants.WRONG_WIDTHS, ("at both ends", "in the middle"), strict=True))
     pictures = [
         histogram_picture(
@@ -338,7 +354,7 @@ def _controls(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
             salt=f"control-{factor:g}".replace(".", "-"),
         )
         for name in quantities[:1]
-        for factor, word in words.items()
+        for factor, word in constants.WRONG_WIDTHS.items()
     ]  # fmt: skip
     rows = [
         {"control": _spelled(name), "found": "no: more lives are needed"

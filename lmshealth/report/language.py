@@ -1,7 +1,7 @@
 """Language of pages and figures: one catalogue (gettext), numbers and dates of its locale (Babel).
 
-A thread has one language at a time, English unless `speaking` sets another. English has the formats
-of the tables: ISO dates, a decimal point.
+A thread has one language at a time, English unless `in_language` sets another. English has the
+formats of the tables: ISO dates, a decimal point.
 """
 
 import gettext
@@ -28,7 +28,7 @@ _DAY = re.compile(r"\b\d{4}-\d\d-\d\d\b")
 
 
 @contextmanager
-def speaking(chosen: Language) -> Iterator[None]:
+def in_language(chosen: Language) -> Iterator[None]:
     """Write pages and figures in a language."""
     token = _language.set(chosen)
     try:
@@ -104,10 +104,10 @@ def label(text: str) -> str:
     chosen = language()
     if (known := tr(text)) != text:
         return known
-    for own, said in _labels(chosen):
+    for own, translation in _labels(chosen):
         if found := own.fullmatch(text):
             values = {name: _value(chosen, one) for name, one in found.groupdict().items()}
-            return said.format(**values)
+            return translation.format(**values)
     return _value(chosen, text)
 
 
@@ -148,7 +148,10 @@ def _templates(chosen: Language) -> list[tuple[str, str, str]]:
 def _facts(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
     """Return a pattern of each template of a sentence, and its translation."""
     found = [own for own in _templates(chosen) if own[0] == FACT]
-    return [(re.compile(_pattern(template) + r"(?=\s|$)"), said) for _, template, said in found]
+    return [
+        (re.compile(_pattern(template) + r"(?=\s|$)"), translation)
+        for _, template, translation in found
+    ]
 
 
 @cache
@@ -156,7 +159,7 @@ def _labels(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
     """Return the messages with values as `_facts`, those with most text of their own first."""
     found = [own[1:] for own in _templates(chosen) if "{" in own[1]]
     found.sort(key=lambda own: len(re.sub(r"{\w*}", "", own[0])), reverse=True)
-    return [(re.compile(_pattern(template)), said) for template, said in found]
+    return [(re.compile(_pattern(template)), translation) for template, translation in found]
 
 
 def _pattern(template: str) -> str:
@@ -177,13 +180,15 @@ def _sentences(chosen: Language, text: str) -> str | None:
     """Translate a text that consists of known sentences; None for another."""
     if len(text) > _MOST_TEXT:
         return None
-    matches = [(found, said) for own, said in _facts(chosen) if (found := own.match(text))]
-    for found, said in sorted(matches, key=lambda one: one[0].end()):
+    matches = [
+        (found, translation) for own, translation in _facts(chosen) if (found := own.match(text))
+    ]
+    for found, translation in sorted(matches, key=lambda one: one[0].end()):
         rest = text[found.end() :].strip()
         further = _sentences(chosen, rest) if rest else ""
         if further is not None:
             values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
-            return f"{re.sub(r':[^{}]*}', '}', said).format(**values)} {further}".rstrip()
+            return f"{re.sub(r':[^{}]*}', '}', translation).format(**values)} {further}".rstrip()
     return None
 
 

@@ -56,7 +56,7 @@ def _environment() -> Any:
         lstrip_blocks=True,
         extensions=["jinja2.ext.i18n"],
     )
-    pages.install_gettext_callables(_said, _counted)  # type: ignore[attr-defined]
+    pages.install_gettext_callables(_translated, _counted)  # type: ignore[attr-defined]
     pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
     pages.filters |= {"place": place, "sha256": sha256, "translated_svg": translated_svg}
     pages.filters |= {"sentence": language.sentence, "is_known": language.is_known}
@@ -65,7 +65,7 @@ def _environment() -> Any:
     return pages
 
 
-def _said(message: str, /, **values: Any) -> Any:
+def _translated(message: str, /, **values: Any) -> Any:
     """Translate a message of a template, which may have marks of HTML; its values are escaped."""
     from markupsafe import Markup
 
@@ -73,7 +73,7 @@ def _said(message: str, /, **values: Any) -> Any:
 
 
 def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
-    """Translate a message of a template by number, as `_said` does."""
+    """Translate a message of a template by number, as `_translated` does."""
     from markupsafe import Markup
 
     return Markup(language.tr_either(one, many, n)).format(n=n, **values)  # noqa: S704

@@ -29,7 +29,7 @@ from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures, text
 from lmshealth.report.fleet_page import _WORDS, write_index
-from lmshealth.report.language import LANGUAGES, is_known, label, sentence, speaking, tr
+from lmshealth.report.language import LANGUAGES, in_language, is_known, label, sentence, tr
 from lmshealth.report.machine_page import date_page, make_page
 from lmshealth.report.rendering import read
 from tests.assessments import Maker, blind, leaves, make, nothing, worn
@@ -76,9 +76,9 @@ def test_every_message_is_translated(language: str) -> None:
         if not message.id:
             continue
         assert not message.fuzzy, message.id
-        originals, said = texts(message.id), texts(message.string)
-        assert all(said) and len(said) == len(originals), message.id
-        for one, other in zip(originals, said, strict=True):
+        originals, translations = texts(message.id), texts(message.string)
+        assert all(translations) and len(translations) == len(originals), message.id
+        for one, other in zip(originals, translations, strict=True):
             assert places(one) == places(other), (one, other)
             edges = (one[:1] == " ", one[-1:] == " ")
             assert edges == (other[:1] == " ", other[-1:] == " "), one
@@ -187,7 +187,7 @@ def test_sentences_of_results_are_translated_by_their_templates(language: Any) -
         fields = [(name, form) for _, name, form, _ in Formatter().parse(template) if name]
         values: dict[str, Any] = {name: 3.25 if form else f"x{name}" for name, form in fields}
         made.append(fact(template, **values))
-    with speaking(language):
+    with in_language(language):
         for one, other in pairwise(made):
             assert is_known(one), one
             assert sentence(f"{one} {other}") == f"{sentence(one)} {sentence(other)}"
@@ -203,7 +203,7 @@ def test_a_sentence_has_the_formats_of_german() -> None:
         "The frequencies jumped before the log of 2026-09-01 (pitch +1.5 %, roll −0.3 %), and no "
         "declared maintenance explains it."
     )
-    with speaking("de"):
+    with in_language("de"):
         assert sentence(f"{jump} {why}") == (
             "Die Frequenzen sind vor der Aufzeichnung vom 01.09.2026 gesprungen (Nicken +1,5 %, "
             "Wanken −0,3 %), und keine angegebene Instandhaltung erklärt dies. Vorspannung der "
@@ -219,19 +219,19 @@ def test_a_sentence_has_the_formats_of_german() -> None:
 def test_the_words_of_the_script_are_there() -> None:
     """Each is in the script, and replaced by German ones."""
     script = read("index.js")
-    with speaking("de"):
+    with in_language("de"):
         assert [words_ for words_ in _WORDS if words_ not in script or tr(words_) == words_] == []
 
 
 def vocabulary(language: str) -> set[str]:
     """Return the words of English messages that are in no message of a language."""
-    found, said = set[str](), set[str]()
+    found, translations = set[str](), set[str]()
     for message in catalogue.stored(language):
         if message.id and "${" not in texts(message.id)[0]:
             found |= _words_of(" ".join(texts(message.id)))
-            said |= _words_of(" ".join(texts(message.string)))
+            translations |= _words_of(" ".join(texts(message.string)))
     codes = {word for code in REFUSALS for word in code.split("-")}
-    return found - said - codes - NO_ENGLISH
+    return found - translations - codes - NO_ENGLISH
 
 
 def _words_of(message: str) -> set[str]:
@@ -287,7 +287,7 @@ def test_pages_have_no_english_words(make: Maker, tmp_path: Path, language: Any)
         before = replace(summary, n_logs=30, verdict="healthy", probability=0.9, life=None)
         status = make_status(made, summary)
         of_day = on_day(summary, status, summary.recorded_at.date() + timedelta(days))
-        with speaking(language):
+        with in_language(language):
             page = date_page(make_page(made, summary, before=before), of_day, status)
             index = write_index(tmp_path, [of_day], made.refused)
         row = english(index.read_text(encoding="utf-8"), known)
@@ -296,7 +296,7 @@ def test_pages_have_no_english_words(make: Maker, tmp_path: Path, language: Any)
         if name == "worn":
             as_it_was = date_page(make_page(made, summary), of_day, status)
             assert len(english(as_it_was, known)) > 150
-    with speaking(language):
+    with in_language(language):
         index = write_index(tmp_path, make_rows(24), make_refused(30))
     found["fleet"] = english(index.read_text(encoding="utf-8"), known)
     found["reading"] = english((tmp_path / "how-to-read.html").read_text(encoding="utf-8"), known)
