@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from lmshealth.io.covariates import OTHER_KEYS, _checked, covariates, metadata_keys
+from tests.installed import install, run_script
 
-ROOT = Path(__file__).parents[2]
 SHIPPED = [(key, *ends) for key, ends in covariates().items()]
 # The package offers a law as well, whose module imports the package that looks for covariates.
 _MODULE = """
@@ -71,25 +68,15 @@ def test_an_object_that_is_no_covariate_is_refused(given: Any, why: str) -> None
 @pytest.mark.slow
 def test_a_covariate_of_another_package_is_read(tmp_path: Path) -> None:
     """From a file, within its range; without the package its key is unknown and left out."""
-    package = tmp_path / "package"
-    info = package / "my_plant-1.0.dist-info"
-    info.mkdir(parents=True)
-    (package / "my_plant.py").write_text(_MODULE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: my_plant\nVersion: 1.0\n")
     entries = "[lmshealth.covariates]\nhumidity = my_plant:HUMIDITY\nwrong = my_plant:WRONG\n"
-    (info / "entry_points.txt").write_text(entries)
+    package = install(tmp_path, "my_plant", _MODULE, entries)
     samples = "\n".join(str((7 * k) % 31) for k in range(400))
     for name, humidity in (("dry.csv", 40), ("odd.csv", 140)):
         (tmp_path / name).write_text(_LOG.format(humidity=humidity) + samples + "\n")
-    for paths, known in (([ROOT, package], True), ([ROOT], False)):
-        done = subprocess.run(
-            [sys.executable, "-c", _SCRIPT, "dry.csv", "odd.csv"],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": os.pathsep.join(map(str, paths))},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
+    for known in (True, False):
+        own = package if known else None
+        done = run_script(_SCRIPT, "dry.csv", "odd.csv", cwd=tmp_path, package=own)
+        assert done.returncode == 0, done.stderr
         dry, odd = done.stdout.splitlines()
         if known:
             assert dry == "{'temperature_c': 21.5, 'humidity_percent': 40.0}"

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import subprocess
-import sys
 from collections.abc import Callable
 from itertools import pairwise
 from pathlib import Path
@@ -28,7 +25,7 @@ from lmshealth.stage.degradation_laws import (
     Unchanging,
 )
 from lmshealth.stage.priors import Lognormal, Normal, Prior, Uniform
-from tests.conftest import ROOT
+from tests.installed import install, run_script
 from tests.lives import FADING, map_rows, stage_text
 
 NOW = 1.7e6
@@ -345,23 +342,10 @@ def test_a_law_of_another_package_is_one_of_a_description(tmp_path: Path) -> Non
     law = FADING.replace('kind = "linear"', 'kind = "swelling"')
     (tmp_path / "small.toml").write_text(stage_text((law,)))
     (tmp_path / "map.csv").write_text("\n".join(map_rows(("guide_preload",))) + "\n")
-    package = tmp_path / "package"
-    info = package / "swelling-1.0.dist-info"
-    info.mkdir(parents=True)
-    (package / "swelling.py").write_text(_MODULE)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: swelling\nVersion: 1.0\n")
     entries = "[lmshealth.laws]\nswelling = swelling:Swelling\nother = swelling:nothing\n"
-    (info / "entry_points.txt").write_text(entries)
-    for paths, known in (([ROOT, package], True), ([ROOT], False)):
-        path = os.pathsep.join(map(str, paths))
-        done = subprocess.run(
-            [sys.executable, "-c", _SCRIPT],
-            cwd=tmp_path,
-            env=os.environ | {"PYTHONPATH": path},
-            capture_output=True,
-            text=True,
-            check=False,
-        )
+    package = install(tmp_path, "swelling", _MODULE, entries)
+    for known in (True, False):
+        done = run_script(_SCRIPT, cwd=tmp_path, package=package if known else None)
         if known:
             assert done.returncode == 0, done.stderr
             kind, kinds, median = done.stdout.splitlines()
