@@ -487,15 +487,17 @@ class LifeSetting:
     lone: int | None = None
 
 
-def lone_drift(t: float, u: float, now: float) -> float:
+def lone_drift(t: float, u: float, now: float, steps: Sequence[float] = ()) -> float:
     """Covariance of the drift of a mode that moves alone, between two travels.
 
-    A quarter each: powers ½, 1 and 2 of the travel, and an integrated random walk.
+    Equal parts: powers ½, 1 and 2 of the travel, an integrated random walk, a jump at each step.
     """
+    before = [min(t, u) < step for step in steps]
     t, u = t / now, u / now
     low, high = min(t, u), max(t, u)
     parts = [(t * u) ** 0.5, t * u, (t * u) ** 2, low**2 * (3 * high - low) / 2]
-    return 0.02**2 * sum(parts) / 4
+    parts += [0.0 if one else 1.0 for one in before]
+    return 0.02**2 * sum(parts) / len(parts)
 
 
 def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, FloatArray]:
@@ -507,6 +509,12 @@ def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, Flo
     centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
     values = np.array([ln_f[k, i] - centre[i] for k, i in where])
     return where, values, (history.travel - history.travel[first])[first:]
+
+
+def _steps(history: History) -> list[float]:
+    """Travel since the baseline of each step of the modes: midway between two logs."""
+    clock = history.travel - history.travel[history.baseline]
+    return [(clock[s.first - 1] + clock[s.first]) / 2 for s in history.steps if s.kind == "step"]
 
 
 def life_covariance(
@@ -537,7 +545,7 @@ def life_covariance(
                 cov[a, c] += belief.intercept_std**2 + belief.b_std**2 * offset[k] * offset[o]
                 cov[a, c] += setting.walk**2 * shared / clock.max()
                 if i == setting.lone:
-                    cov[a, c] += lone_drift(clock[k], clock[o], clock.max())
+                    cov[a, c] += lone_drift(clock[k], clock[o], clock.max(), _steps(history))
                 for own in alone:
                     cov[a, c] += belief.model_std**2 * own[k, i] * own[o, i]
     return cov

@@ -123,6 +123,15 @@ class Assessment:
         return {mode: (size, n_std) for mode, size, n_std in found if DRIFT_SIGMA < n_std < np.inf}
 
     @property
+    def left_out(self) -> dict[str, int]:
+        """Modes whose last logs are outliers of the track, and how many of these."""
+        track, left = self.track, dict[str, int]()
+        for epoch, mode in sorted(track.outliers, reverse=True) if track else ():
+            if epoch == len(self.history.logs) - 1 - left.get(mode, 0):
+                left[mode] = left.get(mode, 0) + 1
+        return left
+
+    @property
     def compared(self) -> LogEstimates | None:
         """The first log of the baseline, beside which the last is shown; None if it is the last."""
         latest, before = self.latest, self.at_baseline

@@ -24,8 +24,9 @@ service date by further logs, plan the service of a sound or of a worn machine, 
 the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside``, ``drift`` (large, without a verdict), ``open`` (none), ``healthy`` or
-# ``loss``. A day is ``overdue`` after that of the service, else ``late`` where a log is. "" is any.
+# step), ``outside``, ``drift`` (large, without a verdict, or a last log that is left out), ``open``
+# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
+# where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),
@@ -98,7 +99,7 @@ def _class_of(assessment: Assessment) -> str:
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
         return "alarm"
-    if assessment.drifted:
+    if assessment.drifted or (assessment.left_out and verdict != OUTSIDE_MAP):
         return "drift"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     return known.get(verdict, "loss")

@@ -54,7 +54,9 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             "Record a log at once; check work, payload, sensor and servo tuning since then."
         )
         yield Notice("large-drift", "serious", mode, what, to_do)
-    for mode, n in _left_out(assessment).items():
+    for mode, n in assessment.left_out.items():
+        if mode in assessment.drifted:
+            continue
         one = fact(
             "The last log is far from those before it at {mode}, and left out.", mode=spell(mode)
         )
@@ -80,17 +82,6 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         what = wide if widened > 1 else narrow
         to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
         yield Notice("filter-inconsistent", "caution", "", what, to_do)
-
-
-def _left_out(assessment: Assessment) -> dict[str, int]:
-    """Return the modes whose last logs are outliers of the track, and how many of these."""
-    track, left = assessment.track, dict[str, int]()
-    if track is None:
-        return left
-    for epoch, mode in sorted(track.outliers, reverse=True):
-        if epoch == len(track.logs) - 1 - left.get(mode, 0) and mode not in assessment.drifted:
-            left[mode] = left.get(mode, 0) + 1
-    return left
 
 
 def _of_health(assessment: Assessment) -> Iterator[Notice]:

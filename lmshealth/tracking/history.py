@@ -52,6 +52,7 @@ class Step(ReadOnly):
     there: BoolArray  # logs that it applies to, ``(n_logs,)``
     source: str = ""  # of a sensor; empty for all sources
     name: str = ""  # its ``servo_id``, or a date
+    mode: str = ""  # the only one that jumps; empty for all modes
     declared: bool = True  # else it was detected
 
     @property
@@ -60,9 +61,11 @@ class Step(ReadOnly):
         return self.kind in ("step", "regreasing", "reset")
 
     @classmethod
-    def found(cls, kind: StepKind, first: int, n_logs: int, source: str = "") -> Self:
+    def found(
+        cls, kind: StepKind, first: int, n_logs: int, source: str = "", mode: str = ""
+    ) -> Self:
         """Make a detected step, which applies to all logs from the first on."""
-        return cls(kind, first, np.arange(n_logs) >= first, source, declared=False)
+        return cls(kind, first, np.arange(n_logs) >= first, source, mode=mode, declared=False)
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)

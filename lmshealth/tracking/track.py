@@ -5,9 +5,12 @@ Declared steps are in the model from the start; a detected step is added, and th
 are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import reduce
+from itertools import groupby
+from operator import itemgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -25,6 +28,7 @@ from lmshealth.tracking.filters.change_detection import Event
 from lmshealth.tracking.filters.published_filter import Nuisances
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.filters.track_state import (
+    Epoch,
     TrackState,
     degrees_of_freedom,
     initial_state,
@@ -282,12 +286,7 @@ def _published(state: TrackState) -> Track:
         effects=_effects(state),
         events=tuple(events),
         steps=space.steps,
-        outliers=tuple(
-            (k, mode)
-            for k, epoch in enumerate(epochs)
-            for mode in history.modes
-            if not set(epoch.outlying).isdisjoint(history.columns(mode))
-        ),
+        outliers=tuple(_outliers(history, epochs)),
         nis=np.array([epoch.nis for epoch in epochs]),
         nis_dof=degrees_of_freedom(state.space, innovations),
         innovations=innovations,
@@ -295,6 +294,29 @@ def _published(state: TrackState) -> Track:
         widening=factor,
         nuisances=Nuisances.stacked([epoch.nuisances for epoch in epochs]),
     )
+
+
+def _outliers(history: History, epochs: Sequence[Epoch]) -> Iterator[tuple[int, str]]:
+    """Yield the logs and modes that are outliers, except of modes that have changed.
+
+    Two or more last logs that deviate to the same side have something in common, even if it cannot
+    be told yet what: they are no outliers.
+    """
+    n_series = len(history.series)
+    for mode in history.modes:
+        own = [*history.columns(mode), *(n_series + i for i in history.columns(mode))]
+        sides: list[tuple[int, int, float]] = []  # log, and the row and side that deviates most
+        for k, epoch in enumerate(epochs):
+            away = epoch.standardised[own]
+            if epoch.outlying[own].any():
+                worst = int(np.nanargmax(np.abs(away)))
+                sides.append((k, worst, float(np.sign(away[worst]))))
+            elif np.isfinite(away).any():
+                sides.append((k, -1, 0.0))
+        runs = [list(run) for _, run in groupby(sides, key=itemgetter(1, 2))]
+        if runs and len(runs[-1]) > 1:
+            runs.pop()
+        yield from ((k, mode) for run in runs for k, worst, _ in run if worst >= 0)
 
 
 def _undetected(history: History) -> BoolArray:
@@ -319,8 +341,9 @@ def _step_events(state: TrackState) -> list[Event]:
         own = slice(first, first + m)
         size, size_cov = mean[own], cov[own, own]
         std = np.sqrt(np.maximum(np.diag(size_cov), 0.0))
-        evidence, found_at = _evidence(one, size, size_cov), one.first
-        if j >= n_declared:
+        if j < n_declared:
+            evidence, found_at = _evidence(one, size, size_cov), one.first
+        else:
             change, found_at = state.changes[j - n_declared]
             evidence = change.log_bayes_factor
         events += [
@@ -336,6 +359,7 @@ def _step_events(state: TrackState) -> list[Event]:
                 found_at=found_at,
             )
             for i, mode in enumerate(space.history.modes)
+            if one.mode in ("", mode)
         ]
     return events
 

@@ -168,3 +168,6 @@ def test_last_logs_that_are_left_out_are_counted(
     (told,) = (one for one in notices(bad) if one.code == "last-logs-left-out")
     assert (told.severity, told.where) == (severity, "roll")
     assert ("last 2 logs" in told.what) == (len(epochs) > 1)
+    # Before a service is planned by the logs that are left, the jump is confirmed or refuted.
+    steps = [summarise(one, one.service()).step.kind for one in (good, bad)]
+    assert steps[0] != steps[1] == "check-drift"

@@ -6,7 +6,7 @@ logs), `LifeLikelihood` (the data whitened at every point of a grid of nuisance 
 `LifeDensity`.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Self
@@ -52,7 +52,7 @@ class LifeCovariance(ReadOnly):
 
     `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
     of the estimates; `walk` the random walk of ln f with variance 1 at the last log; `deviation`
-    that of ln health, likewise; `smooth` the drift of a mode by a cause of its own, of all modes as
+    that of ln health, likewise; `lone` the drift of a mode by a cause of its own, of all modes as
     if each had one.
     """
 
@@ -60,7 +60,7 @@ class LifeCovariance(ReadOnly):
     noise: FloatArray
     walk: FloatArray
     deviation: FloatArray
-    smooth: FloatArray
+    lone: FloatArray
     mode_of: np.ndarray  # index of the mode of each datum, ``(n_data,)``
 
     @classmethod
@@ -94,7 +94,7 @@ class LifeCovariance(ReadOnly):
             noise=np.where(same_log, reported, 0.0),
             walk=same_mode * shared,
             deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
-            smooth=same_mode * lone_kernel(clock, clock, now),
+            lone=same_mode * lone_kernel(clock, clock, now, data.steps),
             mode_of=data.mode_of,
         )
 
@@ -105,20 +105,24 @@ class LifeCovariance(ReadOnly):
         total = self.fixed + noise_scale**2 * self.noise + walk**2 * self.walk
         if lone != NO_MODE:
             own = (self.mode_of == lone).astype(float)
-            total += constants.LONE_STD**2 * np.outer(own, own) * self.smooth
+            total += constants.LONE_STD**2 * np.outer(own, own) * self.lone
         return np.asarray(np.linalg.cholesky(total + deviation**2 * self.deviation))
 
 
-def lone_kernel(moments: FloatArray, clock: FloatArray, now: float) -> FloatArray:
-    """Return the covariance of the smooth drift of a mode that moves alone, of variance 1 now.
+def lone_kernel(
+    moments: FloatArray, clock: FloatArray, now: float, steps: Sequence[float] = ()
+) -> FloatArray:
+    """Return the covariance of the drift of a mode that moves alone, of variance 1 now.
 
     Between moments ``(n,)`` and ``(m,)`` in m since the baseline: ``(n, m)``. It is a sum of powers
-    of the travel and of an integrated random walk, which begins and ends where it likes.
+    of the travel, of an integrated random walk, which begins and ends where it likes, and of jumps
+    at the `steps` of the modes.
     """
     a, b = (np.maximum(one, 0.0) / now for one in (moments, clock))
     least, most = np.minimum.outer(a, b), np.maximum.outer(a, b)
     parts = [np.outer(a**p, b**p) for p in constants.LONE_EXPONENTS]
     parts.append(1.5 * least**2 * (most - least / 3))
+    parts += [(least >= step / now).astype(float) for step in steps]
     return np.asarray(np.mean(parts, axis=0))
 
 
@@ -342,7 +346,8 @@ class LifeLikelihood:
         Of the k-th point of a grid, given a life and all data.
         """
         data, variance = self.data, constants.LONE_STD**2
-        kernel = lone_kernel(np.array([data.now]), data.clock[data.log_of], data.now)
+        clock = data.clock[data.log_of]
+        kernel = lone_kernel(np.array([data.now]), clock, data.now, data.steps)
         cross = variance * kernel * (data.mode_of == grid.lone[k])
         mean, known = self.conditional(grid, k, map_std, x, cross[None])
         return mean[:, 0, 0], np.maximum(variance - known[:, 0, 0, 0], 0.0)

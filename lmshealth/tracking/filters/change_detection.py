@@ -23,6 +23,9 @@ from lmshealth.tracking.history import Step, StepKind
 ChangeKind = StepKind | Literal["drift"]
 EventKind = Literal["step", "regreasing", "servo", "sensor", "alarm"]
 
+# Kind, source and mode of a change, and the first log after it.
+_Change = tuple[ChangeKind, str, str, int]
+
 # Lengths of the windows, in logs, and the number of checkpoints that they need.
 _WINDOWS = (2, 4, 8, 16, 32, 64)
 N_CHECKPOINTS = _WINDOWS[-1] + 4
@@ -100,6 +103,7 @@ class ChangeHypothesis:
     first: int  # first log after it
     log_bayes_factor: float  # against no change, with the prior of the unknown place
     log_odds: float  # against all other kinds of change together
+    mode: str = ""  # the only one that jumps; empty for all
 
     @property
     def significant(self) -> bool:
@@ -125,61 +129,68 @@ def threshold(routes: int = constants.ALARM_ROUTES) -> float:
 
 
 def weigh_changes(
-    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, suspected: int
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, suspected: int, lone: str
 ) -> ChangeHypothesis | None:
     """Weigh all kinds of change about a suspected log by their evidence.
 
-    `checkpoints` are the banks after each of the last logs, `now` is the present log. Returned is
-    the most likely change, or None where no checkpoint is before it.
+    `checkpoints` are the banks after each of the last logs, `now` is the present log; `lone` is the
+    mode that deviates most, which may have jumped alone. Returned is the most likely change, or
+    None where no checkpoint is before it.
     """
     # The suspected log is first: where it gains nothing, its neighbours gain nothing.
     about = sorted((suspected + _ABOUT).tolist(), key=lambda j: abs(j - suspected))
-    gains: dict[tuple[ChangeKind, str, int], float] = {}
+    gains: dict[_Change, float] = {}
     for j in about:
         if j - 1 not in checkpoints or not 0 < j < now:
             continue
-        gains |= _gains(space, checkpoints, now, j)
+        gains |= _gains(space, checkpoints, now, j, lone)
         if max(gains.values()) < 0:
             break
     if not gains:
         return None
-    (best, source, first), gain = max(gains.items(), key=lambda item: item[1])
+    (best, source, mode, first), gain = max(gains.items(), key=lambda item: item[1])
     others = [0.0] + [g for key, g in gains.items() if key[:2] != (best, source)]
     # A step and a drift that begins there are both damage.
     if best in ("step", "drift"):
         others = [0.0] + [g for key, g in gains.items() if key[0] not in ("step", "drift")]
-    return ChangeHypothesis(best, source, first, gain, gain - float(np.logaddexp.reduce(others)))
+    odds = gain - float(np.logaddexp.reduce(others))
+    return ChangeHypothesis(best, source, first, gain, odds, mode)
 
 
 def _gains(
-    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, j: int
-) -> dict[tuple[ChangeKind, str, int], float]:
+    space: StateSpace, checkpoints: Mapping[int, FilterBank], now: int, j: int, lone: str
+) -> dict[_Change, float]:
     """Return the log Bayes factors of all kinds of change at log j."""
     kinds: list[tuple[StepKind, str]] = [("step", ""), ("regreasing", ""), ("servo", "")]
     if len(space.sources) > 1:
         kinds += [("sensor", source) for source in space.sources]
+    chances = {(*kind, ""): 1 / len(kinds) for kind in kinds}
+    if space.n_modes > 1:
+        # Half of all steps are of one mode, each as probable as the others.
+        chances["step", "", ""] /= 2
+        chances["step", "", lone] = chances["step", "", ""] / space.n_modes
     history, before = space.history, checkpoints[j - 1]
     place = -float(np.log(j * (j + 1)))
-    gains: dict[tuple[ChangeKind, str, int], float] = {}
+    gains: dict[_Change, float] = {}
     # A step that is in the model already explains the following error there.
     known = _is_explained(space.steps, j)
-    for kind, source in kinds:
+    for (kind, source, mode), chance in chances.items():
         loop = None if known else loop_evidence(history.loop_error, j, now, kind)
         # Without a change of the following error, or without data of it, there is no retuning.
         if kind == "servo" and (loop is None or loop < 0):
             continue
-        stepped = space.with_step(Step.found(kind, j, len(history.logs), source))
+        stepped = space.with_step(Step.found(kind, j, len(history.logs), source, mode))
         after = advance(stepped, before.padded(stepped.size), j, now)
         gain = after.log_evidence - checkpoints[now].log_evidence + (loop or 0.0)
-        gains[kind, source, j] = gain + place - float(np.log(len(kinds)))
-    gains["drift", "", j] = -np.inf
+        gains[kind, source, mode, j] = gain + place + float(np.log(chance))
+    gains["drift", "", "", j] = -np.inf
     if before.hyperparameters.healthy.any():
         # A healthy machine begins to change.
         anew = restart(space, before[before.hyperparameters.healthy])
         anew = anew[~anew.hyperparameters.healthy]
         gain = advance(space, anew, j, now).log_evidence - anew.log_evidence
         unchanged = checkpoints[now].log_evidence - before.log_evidence
-        gains["drift", "", j] = gain - unchanged + place
+        gains["drift", "", "", j] = gain - unchanged + place
     return gains
 
 

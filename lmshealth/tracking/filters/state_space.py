@@ -225,7 +225,8 @@ class StateSpace:
         noise, places = np.zeros((self.size, self.size)), np.arange(self.size)
         moved = np.r_[places[self.level], places[self.damping]]
         for j, step in begun:
-            variance = np.repeat(np.square(constants.JUMP_STD[step.kind]), self.n_modes)
+            jumps = np.array([step.mode in ("", mode) for mode in self.history.modes])
+            variance = np.outer(np.square(constants.JUMP_STD[step.kind]), jumps).ravel()
             own = places[self.jump(j)]
             for row, column in product((own, moved) if step.changes_modes else (own,), repeat=2):
                 noise[row, column] += variance

@@ -59,10 +59,13 @@ class Epoch:
 
     nuisances: Nuisances
     nis: float  # normalised innovation squared, without outliers
-    # Standardised innovations of ``[ln f, ln ζ]``, NaN of outliers and where there is none,
-    # ``(2 n_series,)``.
-    innovations: FloatArray
-    outlying: tuple[int, ...]  # rows of outliers
+    standardised: FloatArray  # innovations of ``[ln f, ln ζ]``, NaN for none, ``(2 n_series,)``
+    outlying: BoolArray  # whether each is an outlier, ``(2 n_series,)``
+
+    @property
+    def innovations(self) -> FloatArray:
+        """Standardised innovations, NaN of outliers too, ``(2 n_series,)``."""
+        return np.where(self.outlying, np.nan, self.standardised)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -154,19 +157,17 @@ def _filter(state: TrackState, k: int) -> TrackState:
     What is outlying in three logs in a row has changed, by more than any prior allows for.
     """
     space = state.space
-    recent = [set(one.epoch.outlying) for one in state.checkpoints[-3:]]
-    stays = len(recent) == 3 and bool(set.intersection(*recent))
+    recent = [one.epoch.outlying for one in state.checkpoints[-3:]]
+    stays = len(recent) == 3 and bool(np.logical_and.reduce(recent).any())
     bank, found = update(space, predict(space, state.bank, k), k, outliers=not stays)
     bank = bank.pruned()
     state, nuisances, credit = _with_nuisances(state, select_nuisances(space, bank, found, k), k)
     before = state.published.padded(space.size)
-    kept = found.kept
-    innovations = np.full(space.mode_of.size, np.nan)
-    innovations[found.rows[kept]] = found.standardised[kept]
-    outlying = () if kept.size == found.rows.size else tuple(np.delete(found.rows, kept).tolist())
-    epoch = Epoch(nuisances, found.nis, innovations, outlying)
+    standardised, outlying = np.full(space.mode_of.size, np.nan), np.zeros(space.mode_of.size, bool)
+    standardised[found.rows], outlying[found.rows] = found.standardised, found.outlying > 0.5
+    epoch = Epoch(nuisances, found.nis, standardised, outlying)
     most, last = constants.MOST_INNOVATION, state.checkpoints[-1:]
-    sums = last[0].sums if last else np.zeros((2, innovations.size + 2))
+    sums = last[0].sums if last else np.zeros((2, standardised.size + 2))
     innovation = np.minimum(np.maximum(found.standardised, -most), most)
     sums = add_to_sums(sums, found.rows, innovation)
     checkpoints, settled = state.checkpoints, state.settled
@@ -222,7 +223,7 @@ def _filtered_again(
 def _reopened(state: TrackState, window: int) -> TrackState:
     """Give the rates their prior again before a log, unless they have had it since then."""
     since = [one.epoch for one in state.checkpoints if one.index >= window]
-    if any(epoch.outlying or epoch.nuisances.reopened for epoch in since):
+    if any(epoch.outlying.any() or epoch.nuisances.reopened for epoch in since):
         return state
     return _filtered_again(
         state, window, lambda k, own: replace(own, reopened=np.array(k == window))
@@ -253,7 +254,7 @@ def _detect(state: TrackState, k: int, window: int, size: float) -> TrackState:
     if suspected is not None and (abs(before - suspected) > 2 or k - when >= (k - suspected) / 4):
         banks = {one.index: one.bank for one in state.checkpoints if one.index >= state.start}
         state = replace(state, weighed=(suspected, k), open=None)
-        change = weigh_changes(state.space, banks, k, suspected)
+        change = weigh_changes(state.space, banks, k, suspected, _lone(state, suspected))
         if change is not None and change.significant:
             if not change.settled(k):
                 state = replace(state, open=change)
@@ -270,6 +271,15 @@ def _detect(state: TrackState, k: int, window: int, size: float) -> TrackState:
     return state
 
 
+def _lone(state: TrackState, first: int) -> str:
+    """Return the mode whose ln f deviates most in the logs from one on."""
+    history = state.space.history
+    at = max(first - state.checkpoints[0].index, 1)
+    total, number = state.checkpoints[-1].sums - state.checkpoints[at - 1].sums
+    series = np.abs(total / np.sqrt(np.maximum(number, 1)))[: len(history.series)]
+    return history.series[int(series.argmax())].mode
+
+
 def _adopted(state: TrackState, change: ChangeHypothesis, k: int) -> TrackState:
     """Add a change to the model and filter again from the checkpoint before it."""
     j, space = change.first, state.space
@@ -279,7 +289,8 @@ def _adopted(state: TrackState, change: ChangeHypothesis, k: int) -> TrackState:
     state = replace(state, widening=widening(state)[:k])
     if change.kind != "drift":
         history = space.history
-        space = space.with_step(Step.found(change.kind, j, len(history.logs), change.source))
+        found = Step.found(change.kind, j, len(history.logs), change.source, change.mode)
+        space = space.with_step(found)
         bank = bank.padded(space.size)
         state = replace(
             state,
@@ -317,7 +328,7 @@ def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
 def _publish(state: TrackState, k: int) -> TrackState:
     """Publish the state after log k."""
     last, own = state.checkpoints[-1], state.published
-    if last.epoch.outlying:
+    if last.epoch.outlying.any():
         own = undecided(state.space, last.before, last.epoch.nuisances, k)
     return replace(state, rows=(_row(state, own), state.rows))
 

@@ -597,6 +597,20 @@ def test_a_mode_that_moves_alone_is_found_with_its_drift(alone: Stage) -> None:
             assert np.median(life.health[..., 0]) == pytest.approx(0.8, abs=0.05)
 
 
+def test_a_mode_that_jumps_alone_at_a_step_is_no_health(alone: Stage) -> None:
+    """Yaw by −2 % between two logs: health of 1; control: a jump of all modes as of the map."""
+    noise = 5e-4 * np.random.default_rng(1).standard_normal((TRAVEL.size, 3))
+    n, first = TRAVEL.size, TRAVEL.size // 2
+    after = (np.arange(n) >= first)[:, None]
+    wear = true_drift(NAMES, np.log(1 - 0.2 * after) * [1.0, 0.0])
+    for own, health in ((after * [0.0, 0.0, -0.02], 1.0), (wear, 0.8)):
+        history = make_history(np.log(FREQUENCY) + own + noise, travel=TRAVEL, std=5e-4)
+        history = replace(history, steps=(Step.found("step", first, n),))
+        life = fit_life(history, alone, 1, chains=False)
+        assert np.median(life.health[..., 0]) == pytest.approx(health, abs=0.05)
+        assert (np.mean(life.lone == 2) > 0.9) == (health == 1.0)
+
+
 @pytest.mark.slow
 def test_the_probability_of_fit_is_uniform_on_lives_of_the_model(alone: Stage) -> None:
     """Of forty drawn lives p is not far from uniform; of doubled noise all are small."""

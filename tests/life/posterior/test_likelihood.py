@@ -239,7 +239,7 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
     if what == "deviation":
         monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.151))
     if what == "lone mode":
-        monkeypatch.setattr("tests.oracles.lone_drift", lambda t, u, now: 4e-4 * t * u / now**2)
+        monkeypatch.setattr("tests.oracles.lone_drift", lambda t, u, now, _: 4e-4 * t * u / now**2)
     model_std = 0.0501 if what == "map error" else 0.05
     known = np.array([book(history, density, point, model_std) for point in y])
     assert np.abs(found - known).max() > 1e-5
