@@ -153,10 +153,8 @@ class Assessment:
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
             return (0 if self.alarmed or self.drifted else 1), 0.0, 0.0, identity
-        if verdict == "step":  # until its cause is known, no day of a service counts
+        if verdict in ("step", OUTSIDE_MAP):  # until the cause is known, no day of a service counts
             return 0, 0.0, 0.0, identity
-        if verdict == OUTSIDE_MAP:
-            return 1, 0.0, 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
         day = np.inf if service.by is None else float(service.by.toordinal())
