@@ -44,6 +44,7 @@ if TYPE_CHECKING:
     from lmshealth.modal.identification import identify as identify
     from lmshealth.modal.log_estimates import LogEstimates as LogEstimates
     from lmshealth.modal.modes import Modes as Modes
+    from lmshealth.modal.setups import merge_setups as merge_setups
     from lmshealth.stage.description import Stage as Stage
     from lmshealth.stage.description import load_stage as load_stage
     from lmshealth.stage.planning import Plan as Plan
@@ -68,6 +69,7 @@ _HOMES = {
     "decide": "machine.service",
     "fit_life": "life.posterior.fit",
     "identify": "modal.identification",
+    "merge_setups": "modal.setups",
     "identify_decays": "modal.deterministic.free_decays",
     "infer": "life.health",
     "infer_drifts": "life.health",

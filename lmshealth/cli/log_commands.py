@@ -29,10 +29,11 @@ from lmshealth.modal.deterministic.measured import MeasuredResponse, read_respon
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
+from lmshealth.modal.setups import merge_setups
 from lmshealth.report import log_figures, tables
 from lmshealth.signal.acceleration_levels import find_growth
 from lmshealth.signal.following_error import loop_error, read_error
-from lmshealth.stage.description import ModeSpec
+from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
 
 if TYPE_CHECKING:
@@ -203,6 +204,11 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
 @_OVERWRITE
 @_PLOT
 @click.option("--shapes", is_flag=True, help="Print mode shapes, their complexity and their MAC.")
+@click.option(
+    "--merge",
+    is_flag=True,
+    help="Merge logs of several set-ups of one machine, whose sensors rove, to one shape per mode.",
+)
 @_FORMAT
 @click.pass_context
 def modes(ctx: click.Context, /, **given: Any) -> None:
@@ -214,42 +220,49 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     stage, band = given["stage"], given["band"]
     _check_outputs(given)
 
-    content: dict[str, list[Row]] = {"modes": [], "lines": [], "shapes": [], "mac": []}
-
     def estimate(log: Log) -> LogEstimates:
         reading = _read_modes(log, given, ctx.obj)
-        shapes, mac = tables.shapes_rows(log.name, mode_shapes(reading.modes, reading.fitted))
-        content["shapes"] += shapes
-        content["mac"] += mac
         if given["plot"]:
             figure = log_figures.modes_figure(log, reading, stage, band=band)
             log_figures.write_figure(given["plot"], figure)
+        shapes = mode_shapes(reading.modes, reading.fitted)
         own = log.name, log.digest, log.metadata, reading.modes, loop_error(log)
-        return LogEstimates(*own, sample_rate=log.sample_rate)
+        return LogEstimates(*own, shapes=shapes, sample_rate=log.sample_rate)
 
     found, lost = _each(ctx, estimate)
-    rows = [row for one in found for row in tables.modes_rows(one)]
+    if given["merge"] and found:
+        found = [merge_setups(found)]
+    content = _modes_content(found, stage)
     refused = [refusal for one in found for refusal in one.modes.refused]
-    content["modes"] = rows
-    content["lines"] = [row for r in found for row in tables.lines_rows(r.log, r.modes.lines)]
-    content["std_factors"] = [row for r in found for row in tables.factor_rows(r.log, r.modes)]
-    off: list[Row] = []
-    for one in found if stage else ():
-        off += TABLES["off_description"].rows_of(compare(one.modes, stage), log=one.log)
-    if off:
-        content["off_description"] = off
 
     def show(rejected: list[Row]) -> None:
-        views.print_modes(rows, rejected, off)
+        views.print_modes(content["modes"], rejected, content.get("off_description", ()))
         if given["shapes"]:
             views.print_shapes(content["shapes"], content["mac"])
-        if rows and stage is None and band is None:
+        if content["modes"] and stage is None and band is None:
             terminal.print_text(_NO_BAND)
 
     _print(ctx, content, refused, found, lost, show)
     if given["save"] and found:
         _save(given["save"], found[0])
     _exit(ctx, found, lost)
+
+
+def _modes_content(found: Sequence[LogEstimates], stage: Stage | None) -> dict[str, list[Row]]:
+    """Return the rows of what the command `modes` prints, by table."""
+    names = "modes", "lines", "shapes", "mac", "std_factors"
+    content: dict[str, list[Row]] = {name: [] for name in names}
+    for one in found:
+        assert one.shapes is not None, "as the command estimates them"
+        shapes, mac = tables.shapes_rows(one.log, one.shapes)
+        content["modes"] += tables.modes_rows(one)
+        content["lines"] += tables.lines_rows(one.log, one.modes.lines)
+        content["shapes"] += shapes
+        content["mac"] += mac
+        content["std_factors"] += tables.factor_rows(one.log, one.modes)
+    off = TABLES["off_description"]
+    rows = [row for r in found if stage for row in off.rows_of(compare(r.modes, stage), log=r.log)]
+    return content | ({"off_description": rows} if rows else {})
 
 
 def _names(listed: str) -> list[str]:
@@ -280,7 +293,7 @@ def _check_outputs(given: dict[str, Any]) -> None:
         path, logs = given.get(option), given["logs"]
         if path is None:
             continue
-        if len(logs) != 1:
+        if len(logs) != 1 and not (option == "save" and given["merge"]):
             raise click.UsageError(f"--{option} needs exactly one log; got {len(logs)}.")
         why = None
         if path.suffix not in re.findall(r"\.\w+", endings):

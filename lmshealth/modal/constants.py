@@ -174,3 +174,12 @@ DECAY_DAMPING_SIGMAS, LEAST_FADING = 3.0, 0.6
 # Largest damping ratio, and least mean square of a vibration after the stops over that of the
 # ambient response.
 DECAY_MOST_DAMPING, DECAY_EXCITATION = 0.1, 16.0
+
+# Several set-ups
+
+# Largest difference in ln f and least MAC over common channels of one mode in two set-ups.
+SETUP_LN_F, SETUP_MAC = 0.02, 0.8
+# Probability of the scatter of frequencies and dampings below which they are widened.
+SETUP_P_VALUE = 0.01
+# Least share of a shape, squared, in the channels that set its scale.
+SETUP_EIGENVALUE = 0.01

@@ -4,7 +4,8 @@ A likelihood states the covariance of ``[ln f, ln ζ]`` under assumptions. Where
 show that one does not hold, a method replaces the covariance, and records by how much that has
 multiplied the standard deviation of ln f (`widened`), and for which cause. README.md lists the
 causes: ``unsteady``, ``coloured`` and ``cluster`` of ambient vibration, ``noise-estimate`` and
-``dependent-lines`` of frequency responses, ``ambient-level`` of free decays.
+``dependent-lines`` of frequency responses, ``ambient-level`` of free decays,
+``set-ups`` of merged logs.
 """
 
 from __future__ import annotations

@@ -264,6 +264,27 @@ def test_saved_modes_are_a_description_that_finds_them_again(folder: Path, tmp_p
     assert path.read_text() == written and list(tmp_path.iterdir()) == [path]
 
 
+def test_set_ups_are_merged_to_one_shape(tmp_path: Path) -> None:
+    """Two logs with a common sensor: one row and one saved description; one log is refused."""
+    mode, rate = (0.6, 1.0, -0.8), 500.0
+    for k, at in enumerate(((0, 1), (0, 2))):
+        own = [Mode(40.0, 0.01, 1.0, tuple(mode[i] for i in at))]
+        values = accelerations(np.random.default_rng(k), own, 30_000, rate, 1e-3)
+        head = "# sample_rate_hz: 500\n" + ",".join(f"acc_{i}_m_s2" for i in at)
+        np.savetxt(tmp_path / f"{k}.csv", values.T, header=head, comments="", delimiter=",")
+    logs, how = [tmp_path / f"{k}.csv" for k in (0, 1)], ("--merge", "--band", 20, 80)
+    save = "--save", tmp_path / "my.toml"
+    result = call("modes", *logs, *how, *save, "--format", "json")
+    assert result.exit_code == 0
+    content = strict(result.stdout)
+    (row,), (shape,) = content["modes"], content["shapes"]
+    assert row["frequency_hz"] == pytest.approx(40, abs=4 * row["frequency_std_hz"])
+    assert [shape[f"amplitude_acc_{i}"] for i in range(3)] == pytest.approx([0.6, 1, 0.8], abs=0.02)
+    assert load_stage(str(save[1])).modes[0].name == row["mode"]
+    alone = call("modes", logs[0], *how)
+    assert alone.exit_code == 1 and "two or more" in alone.stderr
+
+
 def test_nothing_is_saved_without_modes(tmp_path: Path) -> None:
     """A log that shows no mode gives no description, and the exit status says so."""
     noise = np.random.default_rng(1).standard_normal(8000)
