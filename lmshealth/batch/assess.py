@@ -9,9 +9,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
-from lmshealth.batch.cache import Cached, Resources
 from lmshealth.batch.ingest import LogKey, unexpected
-from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
+from lmshealth.batch.store import (
+    Cached,
+    Identified,
+    PackedAssessment,
+    Resources,
+    Store,
+    unpack_or_none,
+)
 from lmshealth.errors import LmshealthError
 from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
 from lmshealth.machine.assessment import (

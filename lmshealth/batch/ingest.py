@@ -15,17 +15,14 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.cache import Cached, Resources
-from lmshealth.batch.store import Identified, Store
+from lmshealth.batch.store import Cached, Identified, Resources, Store
 from lmshealth.batch.workers import Pool, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
-from lmshealth.io.covariates import SHIPPED, covariates
 from lmshealth.io.formats.registry import format_name
-from lmshealth.io.log import Metadata, Refusal
+from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
 from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
-from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates

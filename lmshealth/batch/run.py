@@ -1,10 +1,13 @@
-"""Run over an archive: from a folder of logs to tables and a report."""
+"""Run over an archive, once or whenever logs arrive: from logs to tables and a report."""
 
+import os
+import time
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, time
+from datetime import UTC, datetime
+from datetime import time as day_time
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -15,17 +18,17 @@ from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.cache import Cached, Resources
-from lmshealth.batch.dashboard import put_points, put_status
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
 from lmshealth.batch.outputs import (
     Judging,
     MachineOutput,
     MachineRecord,
     output_or_reason,
+    put_points,
+    put_status,
     write_tables,
 )
-from lmshealth.batch.store import Store, default_url, unpack_or_none
+from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -33,8 +36,8 @@ from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.io.refusal import visible
 from lmshealth.machine.status import Change, Status
 from lmshealth.machine.summary import Summary
-from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.language import Language, in_language
+from lmshealth.report.pages import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -204,7 +207,7 @@ def report(
 def _judging(store: Store, settings: Settings = Settings()) -> Judging:
     """Return when pages and statuses are judged: at the end of a day, by default now (UTC)."""
     today = settings.today
-    moment = datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
+    moment = datetime.now(UTC) if today is None else datetime.combine(today, day_time.max, UTC)
     before = {stage: one.status for stage, one in store.announced().items()}
     return Judging(moment, settings.alerts.silent_days, before, settings.language)
 
@@ -378,3 +381,50 @@ def _record(
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
     return MachineRecord(machine, file, assessment, rows, before, language)
+
+
+_Files = dict[Path, tuple[int, int]]
+
+
+def watch(
+    folder: Path, stages: Sequence[Stage], out: Path, settings: Settings, *, interval: float
+) -> Iterator[RunResult | LmshealthError]:
+    """Yield the result of `run`, or its error, whenever it has something to do; never end.
+
+    Files whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
+    a later run. The folder is polled, because network shares report no changes. There is a run on
+    every new day (UTC) too: services fall due, and machines fall silent, without a new log.
+    """
+    before, done, day = _files(folder, out), _Files(), None
+    while True:
+        time.sleep(interval)
+        now, today = _files(folder, out), datetime.now(UTC).date()
+        settled = {path: seen for path, seen in now.items() if before.get(path) == seen}
+        before = now
+        new = settled.items() - done.items() or done.keys() - now.keys()
+        # A folder without files may be a share that is not mounted now: tables stay as they are.
+        if settled and (new or today != day):
+            done, day = settled, today
+            growing = frozenset(now.keys() - settled.keys())
+            try:
+                yield run(folder, stages, out, replace(settings, growing=growing))
+            except LmshealthError as error:
+                yield error
+
+
+def _files(folder: Path, out: Path) -> _Files:
+    """Return size in bytes and time of change in ns of all files outside of the output."""
+    found: _Files = {}
+    inside = out.resolve()
+    for parent, folders, files in os.walk(folder.absolute()):
+        here = Path(parent)
+        folders[:] = [
+            name for name in folders if name[0] != "." and (here / name).resolve() != inside
+        ]
+        for path in (here / name for name in files if name[0] != "."):
+            try:
+                seen = path.stat()
+            except OSError:  # removed meanwhile
+                continue
+            found[path] = seen.st_size, seen.st_mtime_ns
+    return found

@@ -3,18 +3,19 @@
 The key of a value is a fingerprint of everything that it depends on. A change of any of it gives
 another key, so that only stale values are computed again. A value that is damaged is removed and
 counts as absent, and so does one that this version cannot decode. Every write may be repeated, and
-may be made by two runs at once: runs may be killed, and may share a store.
+may be made by two runs at once: runs may be killed, and may share a store. `Cached` functions are
+computed where the store lacks their values; the runs on a store divide that work.
 """
 
 import hashlib
 import logging
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Generic, Self, TypeVar
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql
@@ -33,6 +34,7 @@ from lmshealth.batch.database import (
     next_step,
     reason,
 )
+from lmshealth.batch.workers import OnCrash, Pool, Progress, Task
 from lmshealth.io.log import Refusal
 from lmshealth.machine.status import Change, Status
 from lmshealth.machine.summary import Summary
@@ -555,3 +557,74 @@ def _seal(content: bytes, *place: Any) -> bytes:
     return hashlib.blake2b(
         content, digest_size=_SEAL_BYTES, key=hashlib.sha256(subject).digest()
     ).digest()
+
+
+Piece = TypeVar("Piece")
+Job = TypeVar("Job")
+Value = TypeVar("Value")
+
+
+@dataclass(frozen=True, slots=True)
+class Resources:
+    """Store, workers and progress callback of a batch."""
+
+    store: Store
+    pool: Pool
+    progress: Progress = lambda step, done, total: None
+
+
+@dataclass(frozen=True, slots=True)
+class Cached(Generic[Piece, Job, Value]):
+    """A pure function of pieces of work, whose values a store keeps.
+
+    A run claims pieces, ``size`` at a time, and makes a ``job`` of those that it gets, of which a
+    worker computes the function; ``on_crash`` makes the value of a job that ends its worker.
+    ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` takes
+    values of pieces from the store, and yields those pieces whose value was there.
+    """
+
+    function: Task[Job, Value]
+    on_crash: OnCrash[Job, Value]
+    key: Callable[[Piece], str] = field(kw_only=True)
+    fetch: Callable[[Sequence[Piece]], Iterable[Piece]] = field(kw_only=True)
+    job: Callable[[Sequence[Piece]], Job] = field(kw_only=True)
+    size: int = field(default=1, kw_only=True)
+
+    def values(self, pieces: Sequence[Piece], resources: Resources) -> Iterator[tuple[Job, Value]]:
+        """Compute the values of all pieces that no other run does; yield each job with its value.
+
+        What other runs have claimed is looked at again in the end: they store its value, or end
+        without. The caller stores a value before it asks for the next.
+        """
+        left = pieces
+        while left:
+            others = yield from self._unclaimed(left, resources)
+            if len(others) == len(left):
+                time.sleep(constants.OTHERS_POLL_S)
+            left = others
+
+    def _unclaimed(
+        self, pieces: Sequence[Piece], resources: Resources
+    ) -> Generator[tuple[Job, Value], None, list[Piece]]:
+        """Compute the values of unclaimed pieces; return the pieces that others have claimed."""
+        store, others, claimed = resources.store, list[Piece](), dict[int, list[str]]()
+
+        def jobs() -> Iterator[Job]:
+            for first in range(0, len(pieces), self.size):
+                part = [(self.key(piece), piece) for piece in pieces[first : first + self.size]]
+                own = store.claim([key for key, _ in part])
+                others.extend(piece for key, piece in part if key not in own)
+                mine = [piece for key, piece in part if key in own]
+                if store.is_divided:  # another run may have done it since this one began
+                    done = {self.key(piece) for piece in self.fetch(mine)}
+                    store.release(list(done))
+                    mine = [piece for piece in mine if self.key(piece) not in done]
+                if mine:
+                    job = self.job(mine)
+                    claimed[id(job)] = [self.key(piece) for piece in mine]
+                    yield job
+
+        for job, value in resources.pool.map_unordered(self.function, jobs(), self.on_crash):
+            yield job, value
+            store.release(claimed.pop(id(job)))
+        return others

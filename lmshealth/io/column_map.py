@@ -19,8 +19,7 @@ from lmshealth._private.files import read_table
 from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.covariates import metadata_keys
-from lmshealth.io.metadata import as_text
+from lmshealth.io.log import as_text, metadata_keys
 from lmshealth.io.refusal import Unusable, listed, repeated
 
 Role = Literal[

@@ -10,9 +10,8 @@ from typing import NamedTuple
 from lmshealth._private.files import escapes
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
-from lmshealth.io.covariates import metadata_keys
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Refusal, metadata_keys
 from lmshealth.io.refusal import Unusable, shown
 from lmshealth.io.tables import read_sheet
 

@@ -16,8 +16,7 @@ import numpy as np
 from lmshealth._private.files import read_table
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.log import low_high, possible
-from lmshealth.io.metadata import parse_moment
+from lmshealth.io.log import low_high, parse_moment, possible
 from lmshealth.io.refusal import Unusable, listed, repeated
 
 if TYPE_CHECKING:

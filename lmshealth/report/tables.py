@@ -13,8 +13,7 @@ import numpy as np
 
 from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
-from lmshealth.io.covariates import covariates
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Refusal, covariates
 from lmshealth.machine.notices import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
@@ -30,7 +29,7 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.signal.following_error import FollowingError
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
-    from lmshealth.stage.planning import Plan
+    from lmshealth.stage.identifiability import Plan
     from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from datetime import date
 
 from lmshealth.life.verdict import OUTSIDE_MAP
-from lmshealth.machine.next_step import NextStep
-from lmshealth.machine.summary import Summary
+from lmshealth.machine.summary import NextStep, Summary
 from lmshealth.report.language import mark, tr
 from lmshealth.report.text import (
     GAP,

@@ -22,12 +22,10 @@ from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool, blocks, in_unit
 from lmshealth.io.column_map import SI_TIMES, ColumnMap, Layout, parse_column, role_of, unit_key
-from lmshealth.io.formats.channels import SINCE_EPOCH
-from lmshealth.io.formats.content import Content, frequency_column, over_frequency
+from lmshealth.io.formats.content import SINCE_EPOCH, Content, frequency_column, over_frequency
 from lmshealth.io.formats.dialect import LOCAL_TIME
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Log
-from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.log import Log, parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
 from lmshealth.io.time_axis import time_axis

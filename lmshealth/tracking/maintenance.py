@@ -9,9 +9,8 @@ from typing import Self
 from lmshealth._private.arrays import freeze
 from lmshealth._private.names import fact
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Notice, Refusal, expect_moment
+from lmshealth.io.log import Notice, Refusal, expect_moment, parse_moment, parse_name
 from lmshealth.io.manifest import find_sheets, name_of
-from lmshealth.io.metadata import parse_moment, parse_name
 from lmshealth.io.refusal import Unusable, shown
 from lmshealth.io.tables import Row, read_sheet
 

@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth.batch import constants
-from lmshealth.batch.cache import Resources
 from lmshealth.batch.ingest import _identified, _Outcome, _Task, identify_log
-from lmshealth.batch.store import Store
+from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal
 from lmshealth.modal.log_estimates import LogEstimates

@@ -55,7 +55,7 @@ from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal import identification
 from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.machine_page import make_page
+from lmshealth.report.pages import make_page
 from lmshealth.report.tables import log_tables, machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal

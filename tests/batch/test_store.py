@@ -26,8 +26,8 @@ from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
 from lmshealth.batch import store as store_module
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.dashboard import points, put_points, put_status
 from lmshealth.batch.database import StoreError
+from lmshealth.batch.outputs import points, put_points, put_status
 from lmshealth.batch.store import (
     Announced,
     Identified,

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lmshealth.machine import constants
-from lmshealth.machine.next_step import CASES, NextStep, Step, next_step, step_of
+from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of
 from lmshealth.report import wording
 from tests.assessments import Maker, make
 

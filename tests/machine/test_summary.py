@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.machine.next_step import first_limit
-from lmshealth.machine.summary import Summary, summarise, summarise_life
+from lmshealth.machine.summary import Summary, first_limit, summarise, summarise_life
 from lmshealth.report.text import time_left, travel_left
 from lmshealth.report.wording import headline as headline_of
 from lmshealth.report.wording import next_step

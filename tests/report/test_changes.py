@@ -12,11 +12,11 @@ import pytest
 
 from lmshealth._private.serialize import pack, unpack
 from lmshealth.life.verdict import degraded_words
-from lmshealth.machine.next_step import NextStep
 from lmshealth.machine.service import Service
 from lmshealth.machine.summary import (
     Life,
     LimitLife,
+    NextStep,
     ParameterHealth,
     Summary,
     summarise,

@@ -28,9 +28,8 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures, text
-from lmshealth.report.fleet_page import _WORDS, write_index
 from lmshealth.report.language import LANGUAGES, in_language, is_known, label, sentence, tr
-from lmshealth.report.machine_page import date_page, make_page
+from lmshealth.report.pages import _WORDS, date_page, make_page, write_index
 from lmshealth.report.rendering import read
 from tests.assessments import Maker, blind, leaves, make, nothing, worn
 from tests.report.fleet_rows import make_refused, make_rows

@@ -1,4 +1,8 @@
-"""Checks of channels: missing samples, constant value, clipping, linear dependence."""
+"""Faults of channels that their samples show.
+
+Missing samples, constant value, clipping, linear dependence; wrapped counters, single bad samples,
+lost signs, coarse levels.
+"""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -7,7 +11,17 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, IntArray, pivots
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
+from lmshealth.io.buffers import (
+    BLOCK,
+    NO_RANGES,
+    Samples,
+    Spool,
+    blocks,
+    places,
+    runs,
+    smallest_step,
+)
+from lmshealth.io.checks.prediction import Prediction, fit_prediction, within
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import too_many
 
@@ -163,3 +177,304 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     floor = high - (constants.LEVELS_BELOW + 0.5) * step
     n_below = sum(int(np.count_nonzero(sign * b > floor)) for _, b in blocks(values)) - n_at
     return n_at if n_at > constants.CLIPPING_RATIO * n_below else 0
+
+
+_ORDER = constants.PREDICTION_ORDER
+# Samples over which what follows a blow is one with it.
+_BLOW = 10 * _ORDER
+# Differences of levels below this share of the range are rounding of floats; a level is a whole
+# number of steps within the second.
+_ROUNDING, _WHOLE = 1e-9, 0.05
+# Samples among which the next overflow is searched at once.
+_STRIDE = 256
+# A step may be the smallest difference of levels over a number up to this: of many not all occur.
+_MOST_SKIPPED = 4
+
+
+def level_step(values: Samples) -> float | None:
+    """Return the step between the levels of a quantised channel; None where it has none."""
+    some = values[:BLOCK]
+    levels = np.unique(some[np.isfinite(some)])
+    apart = np.diff(levels)
+    apart = apart[apart > _ROUNDING * np.ptp(levels)] if levels.size > 1 else apart
+    if not apart.size:
+        return None
+    off = levels - levels[0]
+    for part in range(1, _MOST_SKIPPED + 1):
+        step = float(apart.min()) / part
+        reach = 16 * step
+        while reach < 2 * off[-1]:  # refined over ever more steps
+            near = off[off <= reach]
+            n = np.rint(near / step)
+            step = float(n @ near / (n @ n)) if n.any() else step
+            reach *= 2
+        if (np.abs(off / step - np.rint(off / step)) < _WHOLE).all():
+            return step
+    return None
+
+
+def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Samples, str]:
+    """Undo the overflows of a counter: return samples and a note, which is empty without any.
+
+    After an overflow samples are off their linear prediction by 2^bits steps of the levels of the
+    channel, which span less. `Unusable` (``wrapped``) where that number is not whole, or the
+    overflows are too many to be undone. ``missing`` are half-open ranges, ``(n_ranges, 2)``.
+    """
+    span = rough.high - rough.low
+    largest = float(np.sqrt(2 * np.log(values.size))) + constants.WRAP_BEND
+    if rough.step <= span / 2 or rough.bend <= largest * rough.usual:
+        return values, ""
+    jumps = _beyond(values, 1, span / 2)
+    bad = np.concatenate([missing, np.stack([jumps, jumps + 1], axis=1)])
+    model = fit_prediction(values, bad)
+    step = level_step(values)
+    bits = 0 if step is None else int(np.ceil(np.log2(span / step)))
+    whole = 0.0 if step is None or bits not in constants.WRAP_BITS else step * 2.0**bits
+    if model is None or 0 < whole < 2 * constants.WRAP_SIGMAS * model.variance**0.5:
+        _refuse_full(values, rough, whole - span, bits)
+        return values, ""
+    if whole > span:
+        undone, n = _without_turns(values, model, whole)
+        if n:
+            found = f"{n} samples are off by the {2**bits} steps of {bits} bits of a counter"
+            return undone, f"{found} that overflows: undone"
+    _refuse_unknown(values, jumps, model, span)
+    return values, ""
+
+
+def _refuse_unknown(values: Samples, jumps: IntArray, model: Prediction, span: float) -> None:
+    """Refuse (``wrapped``) a channel that jumps by its range, which is no whole number of steps."""
+    std = model.variance**0.5
+    first = jumps[np.diff(jumps, prepend=-_ORDER) >= _ORDER]
+    some = first[first >= _ORDER][:: max(1, first.size // 1000)].tolist()
+    sizes = [abs(float(model.errors(values[i - _ORDER : i + 1])[0])) for i in some]
+    odd = np.array([size for size in sizes if size > constants.ORDINARY * std])
+    if odd.size < max(constants.FEWEST_WRAPS, len(some) / 2):
+        return
+    alike = np.abs(odd - np.median(odd)) < constants.ORDINARY * std
+    # A square wave has noise beyond both its levels.
+    if np.median(odd) > span - 3 * std and alike.mean() > constants.WRAPS_UNDONE:
+        found = f"{jumps.size} jumps of its range: a counter overflows by no whole number of steps"
+        needed = "export its values without rounding, or record it with more bits"
+        raise Unusable("wrapped", f"{found}; {needed}")
+
+
+def _beyond(values: Samples, order: int, limit: float) -> IntArray:
+    """Return the samples whose first or second difference exceeds a limit.
+
+    The first is that from the sample before, the second that from both beside it.
+    """
+    found = [
+        np.flatnonzero(np.abs(np.diff(block, order)) > limit) + at + 1
+        for at, block in blocks(values, overlap=order)
+    ]
+    return np.unique(np.concatenate(found))
+
+
+def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Samples, int]:
+    """Bring each sample within half a turn of its prediction; return how many were off.
+
+    None is changed, and 0 returned, unless all are then as the prediction expects.
+    """
+    spool, a, squares, n = Spool(values.size), model.filter, 0.0, 0
+    before = np.full(_ORDER, model.mean)
+    for _, block in blocks(values):
+        x = np.concatenate([before, block])
+        gone = ~np.isfinite(x)
+        x[gone] = model.mean
+        errors = model.errors(x)
+        i = 0
+        while i < errors.size:
+            lacks = gone[i + _ORDER : i + _ORDER + _STRIDE]
+            off = (np.abs(errors[i : i + _STRIDE]) > whole / 2) | lacks
+            if not off.any():
+                i += _STRIDE
+                continue
+            i += int(off.argmax())
+            lacking = bool(gone[i + _ORDER])
+            if not abs(errors[i]) < constants.MOST_TURNS * whole:
+                return values, 0  # the model follows its own corrections
+            turn = float(errors[i]) if lacking else whole * round(float(errors[i]) / whole)
+            reached = errors[i : i + _ORDER + 1]
+            reached -= turn * a[: reached.size]
+            x[i + _ORDER] -= turn
+            if not lacking:
+                squares, n = squares + float(errors[i]) ** 2, n + 1
+            i += 1
+        before = x[-_ORDER:].copy()
+        x[gone] = np.nan
+        spool.append(x[_ORDER:])
+    if n and squares < constants.WRAPS_SPREAD**2 * n * model.variance:
+        return spool.samples(), n
+    return values, 0
+
+
+def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> None:
+    """Refuse (``wrapped``) a channel that holds all levels of a counter but for a few.
+
+    Unlike vibration it has as many samples at both ends of its range as elsewhere.
+    """
+    near = (rough.high - rough.low) / 100
+    x = _sample(values, constants.SHAPE_SAMPLES)
+    if x.size < constants.FEWEST_FOR_SHAPE:
+        return
+    ends = min(np.mean(x < rough.low + near), np.mean(x > rough.high - near))
+    if 0 < left < near and ends > constants.WRAP_ENDS:
+        found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
+        needed = "the counter overflows; record it with more bits, or faster"
+        raise Unusable("wrapped", f"{found}: {needed}")
+
+
+def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
+    """Find single samples, or two in a row, that are no part of the signal.
+
+    The signal itself is as its linear prediction expects it after and before them; a blow instead
+    goes on in it. ``missing`` are ascending half-open ranges, and so is the result, ``(n, 2)``.
+    """
+    if rough.bend <= constants.SUSPECT * rough.usual:
+        return NO_RANGES
+    suspects = _beyond(values, 2, constants.SUSPECT * rough.usual)
+    if not suspects.size or suspects.size > 3 * constants.MOST_SPIKES * values.size:
+        return NO_RANGES
+    bad = np.concatenate([missing, np.stack([suspects - 1, suspects + 2], axis=1)])
+    model = fit_prediction(values, bad)
+    if model is None:
+        return NO_RANGES
+    least = constants.SPIKE_LEVELS * smallest_step(values[:BLOCK])
+    found: list[_Spike] = []
+    doubtful: list[_Spike] = []
+    others, last = 0, -_BLOW
+    for place in np.split(suspects, np.flatnonzero(np.diff(suspects) > 3) + 1):
+        one = _spike(values, missing, model, place, least)
+        if one is not None:
+            (found if one.clear else doubtful).append(one)
+        elif place[0] - last > _BLOW:
+            others, last = others + 1, int(place[0])
+    # In white noise nothing goes on after a blow: there only outliers that stand alone are spikes.
+    if not others and all(one.size > constants.SPIKE_ALONE for one in doubtful):
+        found += doubtful
+    energy = sum(one.energy for one in found)
+    few = len(found) < constants.SPIKE_SHARE * others
+    if few or energy < constants.SPIKE_ENERGY * values.size:
+        return NO_RANGES
+    ranges = np.array([one.samples for one in found], dtype=np.int64)
+    return ranges[np.argsort(ranges[:, 0])]
+
+
+class _Spike(NamedTuple):
+    """Half-open range, size in standard deviations of its expectation, energy over the variance.
+
+    ``clear`` if what a blow would leave is not there.
+    """
+
+    samples: tuple[int, int]
+    size: float
+    energy: float
+    clear: bool
+
+
+def _spike(
+    values: Samples, missing: IntArray, model: Prediction, suspects: IntArray, least: float
+) -> _Spike | None:
+    """Judge one place: a spike of more than the least size, or None."""
+    first, last = int(suspects[0]) - 2 * _ORDER, int(suspects[-1]) + 2 * _ORDER + 1
+    if suspects[-1] - suspects[0] > 3 or first < 0 or last > values.size:
+        return None
+    x = values[first:last].copy()
+    gone = np.flatnonzero(within(missing, first, x.size))
+    if gone.size and (gone[0] < _ORDER or gone[-1] >= x.size - _ORDER):
+        return None
+    x[gone] = model.expected(x, gone)
+    errors = model.errors(x) ** 2 / model.variance
+    for n in (1, 2):
+        tried = []
+        for k in range(int(suspects[0]) + 1 - n, int(suspects[-1]) + 1):
+            own = np.arange(k, k + n) - first
+            y = x.copy()
+            unknown = np.union1d(own, gone)
+            y[unknown] = model.expected(y, unknown)
+            tried.append((float((model.errors(y) ** 2).sum()) / model.variance, own, y))
+        after, own, y = min(tried, key=lambda one: one[0])
+        rest = model.errors(y) ** 2 / model.variance
+        gain = float(errors.sum()) - after
+        if rest.max() < constants.ORDINARY**2 and gain > constants.SPIKE**2:
+            if np.abs(x[own] - y[own]).min() <= least:
+                return None
+            # What as many innovations, such as those of a blow, would leave.
+            blow = float(np.sort(errors)[:-n].sum())
+            span = int(own[0]) + first, int(own[-1]) + first + 1
+            return _Spike(span, gain**0.5, gain, after < constants.CLEARLY * blow)
+    return None
+
+
+def check_sign(values: Samples, rough: Roughness) -> None:
+    """Refuse a channel of magnitudes (``rectified``): vibration has both signs.
+
+    The density of |x| is largest at a sharp edge; that of (x² + y² + z²)^½ begins at zero.
+    """
+    x = _sample(values, constants.LEVEL_SAMPLES)
+    middle, reach = float(np.median(x)), constants.EDGE_REACH * float(x.std())
+    if min(middle - rough.low, rough.high - middle) > reach:
+        return
+    x = _sample(values, constants.SHAPE_SAMPLES)
+    if x.size < constants.FEWEST_FOR_SHAPE or np.unique(x).size < constants.FEWEST_LEVELS:
+        return
+    for own, low, high in ((x, rough.low, rough.high), (-x, -rough.high, -rough.low)):
+        q = np.quantile(own, [0.001, 0.01, 0.05, 0.5, 0.95, 0.99, 0.999])
+        below, above = q - low, high - q
+        # Quantiles above an edge are proportional to their probability, those of a tail are not.
+        edge = below[0] > 0 and below[1] > constants.EDGE * below[0]
+        # Most samples are at the edge; the other end, unlike that of a sine, has none.
+        edge &= below[2] < constants.AT_EDGE * below[3]
+        edge &= above[5] <= constants.EDGE / 2 * above[6]
+        # A sine that decays, with one sample beyond an end, is as wide above its median as below;
+        # so may be the magnitude of a sine with noise, whose edge is at zero.
+        at_zero = 0 <= low < constants.NEAR_ZERO * q[3]
+        sides = sorted((float(q[4] - q[3]), float(q[3] - q[2])))
+        edge &= at_zero or sides[1] > constants.LOPSIDED * sides[0]
+        scale = float(own.std())
+        skew = float(np.mean((own - own.mean()) ** 3)) / scale**3
+        from_zero = at_zero and skew > constants.MAGNITUDE_SKEW
+        if (edge or from_zero) and _reaches(values, own is x, low, float(q[3])):
+            end = f"below {rough.low:.4g}" if own is x else f"above {rough.high:.4g}"
+            detail = f"no sample is {end} (SI), as of a magnitude, which shows modes at sums and "
+            raise Unusable("rectified", f"{detail}doubles of their frequencies; record its sign")
+
+
+def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:
+    """Return whether a channel comes near its edge throughout; a drift is there for a while."""
+    n = constants.LEVEL_SAMPLES // 8
+    for at in places(values.size, n):
+        x = values[at : at + n] if is_lower else -values[at : at + n]
+        if np.isfinite(x).any() and np.nanmin(x) - low > (middle - low) / 2:
+            return False
+    return True
+
+
+def coarse_levels(values: Samples) -> str:
+    """Return what is wrong with the levels of a channel; empty if nothing."""
+    x = _sample(values, constants.LEVEL_SAMPLES)
+    levels = np.unique(x)
+    if levels.size < 3:
+        return ""
+    gaps, std = np.diff(levels), float(x.std())
+    step = float(np.median(gaps))
+    if std < constants.LEAST_STEPS * step and levels.size < constants.FEWEST_LEVELS:
+        found = f"its standard deviation is {std / step:.2f} steps of {step:.3g} (SI)"
+        return f"{found}: levels and standard deviations of its modes may be wrong; widen its gain"
+    # A bit that is stuck leaves bands of levels apart that are as wide as the bands.
+    wide = np.flatnonzero((gaps > max(constants.WIDE_GAP * std, 3 * step)) & (gaps < std))
+    bands = levels[wide[1:]] - levels[wide[:-1] + 1]
+    stuck = np.abs(bands / gaps[wide[:-1]] - 1) < constants.STUCK_BAND
+    if stuck.sum() > 0.5 * bands.size:
+        below, above = levels[wide[0] : wide[0] + 2].tolist()
+        found = f"no sample lies between {below:.6g} and {above:.6g} (SI), nor in gaps like it"
+        return f"{found}: a bit of the converter is stuck; check it"
+    return ""
+
+
+def _sample(values: Samples, most: int) -> FloatArray:
+    """Return so many samples of eight places at most, without the missing ones."""
+    n = most // 8
+    x = np.concatenate([values[at : at + n] for at in places(values.size, n)])
+    return np.asarray(x[np.isfinite(x)])

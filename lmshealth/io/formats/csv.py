@@ -21,8 +21,17 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
 from lmshealth.io.column_map import ColumnMap, Segments, role_of
-from lmshealth.io.formats.channels import SinceFirst, choose, parse_moments
-from lmshealth.io.formats.content import GZIP, Content, Format, check_size, describe, not_numeric
+from lmshealth.io.formats.content import (
+    GZIP,
+    Content,
+    Format,
+    SinceFirst,
+    check_size,
+    choose,
+    describe,
+    not_numeric,
+    parse_moments,
+)
 from lmshealth.io.formats.dialect import (
     Dialect,
     fields_of,

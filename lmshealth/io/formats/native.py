@@ -27,18 +27,20 @@ import numpy as np
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
 from lmshealth.io.column_map import ColumnMap, role_of
-from lmshealth.io.covariates import metadata_keys
-from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
 from lmshealth.io.formats.content import (
     Content,
+    Described,
     Format,
+    SinceFirst,
     check_memory,
     check_size,
+    choose,
     library,
     not_numeric,
+    rate_of,
     wanted,
 )
-from lmshealth.io.metadata import as_text
+from lmshealth.io.log import as_text, metadata_keys
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"

@@ -13,7 +13,7 @@ import pytest
 from lmshealth._private.toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.channels import SinceFirst
+from lmshealth.io.formats.content import SinceFirst
 from lmshealth.io.reading import read_log
 from lmshealth.stage.proposal import propose
 
