@@ -1,4 +1,7 @@
-"""Databases of a store: tables, connections (SQLite, PostgreSQL), and what to do about faults."""
+"""Databases of a store: tables, connections (SQLite, PostgreSQL), and what to do about faults.
+
+No message quotes the secrets of an address.
+"""
 
 import os
 import re
@@ -8,7 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from threading import Event, Timer
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import parse_qsl, quote, unquote
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql, sqlite
@@ -17,7 +20,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.schema import CreateTable
 
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
@@ -275,3 +277,50 @@ def reason(error: Exception, address: str) -> str:
     text = str(getattr(error, "orig", None) or error).strip()
     first = text.splitlines()[0] if text else type(error).__name__
     return without_secrets(first, address)
+
+
+# A password that contains characters with a meaning in URLs could be read as a host or a port: such
+# an address does not match.
+_URL = re.compile(
+    r"(?P<kind>[\w+.-]+)://"
+    r"(?:[^:@/?#]*(?::(?P<password>[^:@/?#]*))?@)?"
+    # Only the path of a file, after no host, may contain an @: elsewhere it ends a password.
+    r"(?P<place>(?:\[[\da-fA-F:]*\]|[\w.-]*)(?::\d+)?(?:(?<=://)/[^?]*|/[^?@]*)?)"
+    r"(?:\?(?P<options>.*))?",
+    re.DOTALL,
+)
+# Without any character of an address or option there is no password.
+_NO_URL = re.compile(r"[\w .-]*")
+
+
+def shown_address(address: str) -> str:
+    """Return an address without user, password and options."""
+    found = _URL.fullmatch(address)
+    if found is None:
+        return address if _NO_URL.fullmatch(address) else "that was given"
+    return f"{found['kind']}://{found['place']}"
+
+
+def without_secrets(text: str, address: str) -> str:
+    """Mask the password and the values of options of an address in an error message about it.
+
+    Where the password cannot be separated from the rest of the address, only what to do is
+    returned.
+    """
+    found = _URL.fullmatch(address)
+    if found is None:
+        if _NO_URL.fullmatch(address):
+            return text
+        return (
+            "needed is an address such as postgresql://user:password@host/database, with special "
+            "characters of a password percent-encoded, @ as %40; the reason may contain the "
+            "password and is not shown"
+        )
+    options = found["options"] or ""
+    values = [value for _, value in parse_qsl(options)]
+    values += [part.partition("=")[2] for part in options.split("&")]
+    secrets = [value for value in values if len(value) >= constants.SHORTEST_SECRET]
+    secrets += [found["password"] or "", unquote(found["password"] or "")]
+    for secret in sorted(set(secrets) - {""}, key=len, reverse=True):
+        text = text.replace(secret, "***")
+    return text

@@ -24,7 +24,6 @@ from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from lmshealth._private.serialize import fingerprint, pack, unpack
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address
 from lmshealth.batch.database import (
     INSERT,
     VALUES,
@@ -33,6 +32,7 @@ from lmshealth.batch.database import (
     is_older,
     next_step,
     reason,
+    shown_address,
 )
 from lmshealth.batch.workers import OnCrash, Pool, Progress, Task
 from lmshealth.io.log import Refusal

@@ -29,7 +29,6 @@ from threadpoolctl import threadpool_limits
 from lmshealth._private.interrupts import INTERRUPTS, ignore_interrupts
 from lmshealth._private.serialize import VERSION
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")
@@ -299,6 +298,8 @@ def cluster(address: str) -> Iterator[Pool]:
     this version of lmshealth, and the workers need the logs under the same paths. `SchedulerError`
     if the scheduler does not answer, has no worker, or has a worker of another version.
     """
+    from lmshealth.batch.database import shown_address, without_secrets  # late, as all of this
+
     shown = shown_address(address)
     try:
         from distributed.comm.core import CommClosedError

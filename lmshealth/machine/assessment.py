@@ -12,9 +12,8 @@ from datetime import date
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lmshealth._private.names import fact
-from lmshealth._private.seeds import seed_of
-from lmshealth._private.serialize import fingerprint
+from lmshealth._private.serialize import fingerprint, seed_of
+from lmshealth._private.tables import fact
 from lmshealth.errors import LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life import constants

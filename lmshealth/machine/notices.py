@@ -7,7 +7,7 @@ import numpy as np
 from scipy.special import gammaincinv
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.names import fact, spell
+from lmshealth._private.tables import fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, SURPRISE
 from lmshealth.life.verdict import lone_sentence

@@ -10,8 +10,7 @@ from typing import Literal
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
-from lmshealth._private.names import spell
-from lmshealth._private.tables import TABLES, Row
+from lmshealth._private.tables import TABLES, Row, spell
 from lmshealth.life.fleet_prior import Calibration
 from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words
@@ -55,7 +54,7 @@ CASES: tuple[tuple[Step, str, str, str, str], ...] = (
 
 @dataclass(frozen=True, slots=True)
 class NextStep:
-    """What to do next with a machine; `report.wording.next_step` puts it into a sentence."""
+    """What to do next with a machine; `report.text.next_step` puts it into a sentence."""
 
     kind: Step
     # parameter, word: the parameter whose limit is most probably reached first, and its word in

@@ -30,13 +30,24 @@ from lmshealth.machine.notices import chi_square_band, notices
 from lmshealth.machine.service import Service, day_after, probability_before
 from lmshealth.machine.status import Status, coming_states
 from lmshealth.machine.summary import Summary, first_limit, limit_of
-from lmshealth.report import constants, figures, wording
+from lmshealth.report import constants, figures
 from lmshealth.report.language import mark, tr, tr_month
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.rendering import read, render
 from lmshealth.report.tables import track_rows
-from lmshealth.report.text import GAP, coarse, ends, km, number, spell
-from lmshealth.report.wording import headline, service_on_day, verdict_text
+from lmshealth.report.text import (
+    GAP,
+    changes,
+    coarse,
+    ends,
+    headline,
+    km,
+    next_step,
+    number,
+    service_on_day,
+    spell,
+    verdict_text,
+)
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import covariate_effects
 from lmshealth.tracking.covariate_effects import CovariateEffect
@@ -76,7 +87,7 @@ def make_page(
         "before": before,
         "mark": _MARK,
         "outside": list(_outside_map(assessment)),
-        "news": before and [*wording.changes(before, summary)],
+        "news": before and [*changes(before, summary)],
         **_track_content(assessment),
         **_health_content(assessment),
     }
@@ -108,10 +119,10 @@ def date_page(page: str, summary: Summary, status: Status) -> str:
         summary=summary,
         status=status,
         states=coming_states(status, summary.today),
-        headline=wording.headline(summary),
-        verdict=wording.verdict_text(summary),
-        to_do=wording.next_step(summary.step),
-        due=wording.service_on_day(summary),
+        headline=headline(summary),
+        verdict=verdict_text(summary),
+        to_do=next_step(summary.step),
+        due=service_on_day(summary),
     ).split(_MARK)
     pieces = page.split(_MARK)[1:]  # the page begins with a mark
     return "".join(part + piece for part, piece in zip(parts, pieces, strict=True))

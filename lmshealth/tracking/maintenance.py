@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Self
 
 from lmshealth._private.arrays import freeze
-from lmshealth._private.names import fact
+from lmshealth._private.tables import fact
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal, expect_moment, parse_moment, parse_name
 from lmshealth.io.manifest import find_sheets, name_of

@@ -21,7 +21,7 @@ from lmshealth.machine.summary import (
     Summary,
     summarise,
 )
-from lmshealth.report.wording import changes
+from lmshealth.report.text import changes
 from lmshealth.stage.description import ParameterSpec, load_stage
 from lmshealth.stage.priors import Lognormal
 from tests.assessments import nothing, worn
