@@ -29,13 +29,8 @@ from lmshealth.machine.assessment import (
 )
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.contradictions import sort_by_time
 from lmshealth.tracking.maintenance import Maintenance
-
-# Keys of the parts of an assessment with the rows of its logs, and a fingerprint of these logs.
-_ROWS, _ROWS_OF = fingerprint(VERSION, "rows"), fingerprint(VERSION, "rows of")
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -138,52 +133,10 @@ def _assess_packed(job: _Job) -> PackedAssessment | str:
         before = unpack_or_none(known.get(key), LifeState)
         how = {"epochs": machine.epochs, "seed": machine.seed}
         found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
-        parts = _pack_rows(readings, machine, known.get(_ROWS))
-        if after is not None:
-            parts[key] = pack(after)
+        parts = {} if after is None else {key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
     return reason_if_failed(work, machine.name, (CancelledError,))
-
-
-@dataclass(frozen=True, slots=True)
-class LogRows:
-    """Tables of one log as CSV by name; they depend on its name and its key."""
-
-    log: str
-    key: str
-    tables: dict[str, str]
-
-
-def packed_rows(machine: Machine, store: Store) -> bytes:
-    """Fetch the rows of the logs of a machine, a packed list of `LogRows` in the order of time.
-
-    They are made from its logs where the store has those of other ones, or none.
-    """
-    found = store.part(machine.name, _ROWS)
-    if found is None or store.part(machine.name, _ROWS_OF) != _digest(machine):
-        parts = _pack_rows(unpack_logs(packed_logs(machine, store)), machine, found)
-        for key, content in parts.items():
-            store.put_part(machine.name, key, content)
-        found = parts[_ROWS]
-    return found
-
-
-def _digest(machine: Machine) -> bytes:
-    return fingerprint(machine.logs).encode()
-
-
-def _pack_rows(
-    readings: Sequence[LogEstimates], machine: Machine, before: bytes | None
-) -> dict[str, bytes]:
-    """Make the parts that have the rows of all logs; those known before are not made again."""
-    found: list[LogRows] = unpack_or_none(before, list[LogRows]) or []
-    known = {(own.log, own.key): own for own in found}
-    keys, rows = dict(machine.logs), []
-    for reading in sort_by_time(readings):
-        own = reading.log, keys[reading.log]
-        rows.append(known.get(own) or LogRows(*own, log_tables(reading)))
-    return {_ROWS: pack(rows), _ROWS_OF: _digest(machine)}
 
 
 def apply_fleet_priors(

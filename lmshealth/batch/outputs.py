@@ -19,7 +19,7 @@ from lmshealth._private.files import replacing, write_text
 from lmshealth._private.serialize import fingerprint, pack, unpack
 from lmshealth._private.tables import RUN_TABLES, Row
 from lmshealth.batch import constants
-from lmshealth.batch.assess import LogRows, reason_if_failed
+from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
 from lmshealth.batch.database import CHANGES, POINTS, STATUS
 from lmshealth.batch.store import Store, machine_key, unpack_or_none
 from lmshealth.machine.assessment import Assessment
@@ -27,9 +27,9 @@ from lmshealth.machine.status import Change, Status, judge_at, make_status, on_d
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import date_page, make_page
-from lmshealth.report.tables import csv_text, join_csv, machine_tables
+from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables
 from lmshealth.stage.constants import INFORMED
-from lmshealth.tracking.contradictions import LEFT_OUT
+from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
 
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
@@ -39,14 +39,13 @@ _DRAWING = threading.Lock()
 class MachineRecord:
     """Packed results of a machine, from which its page (a file) and its rows are made.
 
-    ``rows`` are those of its logs, None where no tables are needed; ``before`` is its previous
-    report.
+    ``logs`` is None where no tables are needed; ``before`` is its previous report.
     """
 
     machine: str
     file: str
     assessment: bytes | None
-    rows: bytes | None
+    logs: PackedLogs | None
     before: Summary | None
     language: Language = "en"  # of its page
 
@@ -66,8 +65,8 @@ class MachineOutput:
 def machine_output(record: MachineRecord) -> MachineOutput | None:
     """Make the page and the rows of a machine; None where this version cannot decode them."""
     found: Assessment | None = unpack_or_none(record.assessment, Assessment)
-    logs = [] if record.rows is None else unpack_or_none(record.rows, list[LogRows])
-    if found is None or logs is None:
+    logs = unpack_logs(record.logs or ())
+    if found is None or (record.logs is not None and not logs):
         return None
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
@@ -75,8 +74,9 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page = make_page(found, summary, before=record.before)
     rows = machine_tables(found) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
-    for name in logs[0].tables if logs else ():
-        tables[name] = "".join(join_csv([log.tables[name] for log in logs]))
+    of_logs = [log_tables(one) for one in sort_by_time(logs)]
+    for name in of_logs[0] if of_logs else ():
+        tables[name] = "".join(join_csv([one[name] for one in of_logs]))
     return MachineOutput(
         page=page,
         summary=summary,

@@ -17,7 +17,13 @@ from lmshealth._private.files import remove_abandoned
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
-from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
+from lmshealth.batch.assess import (
+    Machine,
+    PackedLogs,
+    apply_fleet_priors,
+    assess_all,
+    packed_logs,
+)
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
 from lmshealth.batch.outputs import (
     Judging,
@@ -327,7 +333,7 @@ def _outputs(
     store, missing = resources.store, dict[str, tuple[Machine, str]]()
     for machine in machines:
         name = machine.name
-        # The rows of its logs, which are large, follow from their names and keys.
+        # Its logs, which are large, follow from their names and keys.
         record = _record(name, keys[name], files[name], store, language)
         key = fingerprint(VERSION, record, machine.logs)
         if output := _kept_output(name, key, store):
@@ -340,8 +346,8 @@ def _outputs(
 
     def job(names: Sequence[str]) -> MachineRecord:
         [name] = names
-        rows = packed_rows(missing[name][0], store)
-        return _record(name, keys[name], files[name], store, language, rows)
+        logs = packed_logs(missing[name][0], store)
+        return _record(name, keys[name], files[name], store, language, logs)
 
     drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
         output_or_reason,
@@ -376,11 +382,11 @@ def _record(
     file: str,
     store: Store,
     language: Language,
-    rows: bytes | None = None,
+    logs: PackedLogs | None = None,
 ) -> MachineRecord:
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, rows, before, language)
+    return MachineRecord(machine, file, assessment, logs, before, language)
 
 
 _Files = dict[Path, tuple[int, int]]

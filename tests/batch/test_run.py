@@ -56,7 +56,7 @@ from lmshealth.modal import identification
 from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.pages import make_page
-from lmshealth.report.tables import log_tables, machine_tables
+from lmshealth.report.tables import machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.track import accepted_estimates, track
@@ -338,41 +338,6 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     (logs / "log-01.h5").unlink()
     run(logs, [modes_only], out)
     assert drawn == ["test-A.html"] * 2
-
-
-@pytest.mark.slow
-def test_rows_of_known_logs_are_not_made_again(
-    tmp_path: Path, modes_only: Stage, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A new log adds its own rows; the tables are those of a run from nothing."""
-    logs, out = write_archive(tmp_path / "logs", 3), tmp_path / "out"
-    later = (logs / "log-02.h5").rename(tmp_path / "log-02.h5")
-    run(logs, [modes_only], out)
-    made: list[str] = []
-
-    def counted(reading: LogEstimates) -> dict[str, str]:
-        made.append(reading.log)
-        return log_tables(reading)
-
-    monkeypatch.setattr(assessing, "log_tables", counted)
-    later.rename(logs / "log-02.h5")
-    run(logs, [modes_only], out)
-    assert made == ["log-02.h5"]
-    run(logs, [modes_only], tmp_path / "anew")
-    assert made == ["log-02.h5", "log-00.h5", "log-01.h5", "log-02.h5"]
-    changed = {"changes.csv": b""}  # since the last run, of which the new store knows none
-    assert tables(out) | changed == tables(tmp_path / "anew") | changed
-    # The store has the rows of three logs beside an assessment of two.
-    three = Store(default_url(out))
-    machine = three.published()[0].machine
-    kept = three.parts(machine)
-    (logs / "log-02.h5").rename(tmp_path / "log-02.h5")
-    run(logs, [modes_only], out)
-    for key, content in kept.items():
-        three.put_part(machine, key, content)
-    three.close()
-    run(logs, [modes_only], out)
-    assert {row["log"] for row in rows(out / "modes.csv")} == {"log-00.h5", "log-01.h5"}
 
 
 @pytest.mark.slow
