@@ -74,33 +74,29 @@ def assess_all(
     No part of an earlier assessment is used then. Return the machines that could not be assessed,
     and why: one must not end the batch.
     """
-    store, failed, known = resources.store, dict[str, str](), set[str]()
+    store, failed = resources.store, dict[str, str]()
 
-    def fetch(part: Sequence[Machine]) -> list[Machine]:
-        found = [m for m in part if not force and store.has_assessment(m.name, m.key)]
-        known.update(machine.name for machine in found)
-        return found
+    def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, None]]:
+        return ((m, None) for m in part if not force and store.has_assessment(m.name, m.key))
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
         return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
 
-    fetch(machines)
-    left = [machine for machine in machines if machine.name not in known]
-    resources.progress("assessing", len(known), len(machines))
-    assessing: Cached[Machine, _Job, PackedAssessment | str] = Cached(
-        _assess_packed,
-        lambda _, why: why,
+    assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
+        function=_assess_packed,
+        on_crash=lambda _, why: [why],
         key=lambda one: fingerprint(one.name, one.key),
         fetch=fetch,
         job=job,
     )
-    for k, ((machine, *_), made) in enumerate(assessing.values(left, resources), start=1):
+    resources.progress("assessing", 0, len(machines))
+    for k, ([(machine, made)], _) in enumerate(assessing.values(machines, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
-        else:
+        elif made is not None:
             failed[machine.name] = made
-        resources.progress("assessing", len(known) + k, len(machines))
+        resources.progress("assessing", k, len(machines))
     return failed
 
 
@@ -124,8 +120,8 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
     return PackedAssessment(pack(assessment), evidence, summary)
 
 
-def _assess_packed(job: _Job) -> PackedAssessment | str:
-    """Assess a machine; return why it fails, but raise what workers fail of."""
+def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
+    """Assess a machine, or return why it fails; raise what workers fail of."""
     machine, logs, known = job
 
     def work() -> PackedAssessment:
@@ -136,7 +132,7 @@ def _assess_packed(job: _Job) -> PackedAssessment | str:
         parts = {} if after is None else {key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
-    return reason_if_failed(work, machine.name, (CancelledError,))
+    return [reason_if_failed(work, machine.name, (CancelledError,))]
 
 
 def apply_fleet_priors(
@@ -155,11 +151,9 @@ def apply_fleet_priors(
         for machine, prior, ended in _machines_to_update(machines, store)
     ]
 
-    def fetch(part: Sequence[_Update]) -> list[_Update]:
-        of_part = [one for one in part if one[0].name not in force]
-        found = [one for one in of_part if store.has_assessment(one[0].name, one[1])]
-        keys.update((machine.name, key) for machine, key, *_ in found)
-        return found
+    def fetch(part: Sequence[_Update]) -> Iterator[tuple[_Update, None]]:
+        of_part = (one for one in part if one[0].name not in force)
+        return ((one, None) for one in of_part if store.has_assessment(one[0].name, one[1]))
 
     def job(part: Sequence[_Update]) -> _UpdateJob:
         [(machine, key, prior, ended)] = part
@@ -173,20 +167,23 @@ def apply_fleet_priors(
             ended=ended,
         )
 
-    known = {key for _, key, *_ in fetch(updates)}
-    left = [one for one in updates if one[1] not in known]
-    if left:
-        resources.progress("fleet priors", 0, len(left))
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
-        _update, lambda _, why: why, key=lambda one: one[1], fetch=fetch, job=job
+        function=_update,
+        on_crash=lambda _, why: [why],
+        key=lambda one: one[1],
+        fetch=fetch,
+        job=job,
     )
-    for k, (one, made) in enumerate(updating.values(left, resources), start=1):
+    for k, ([(one, made)], is_new) in enumerate(updating.values(updates, resources), start=1):
+        machine, key, *_ = one
         if isinstance(made, PackedAssessment):
-            store.put_assessment(one.machine, one.key, made)
-            keys[one.machine] = one.key
-        elif made is not None:
-            failed[one.machine] = made
-        resources.progress("fleet priors", k, len(left))
+            store.put_assessment(machine.name, key, made)
+        if isinstance(made, str):
+            failed[machine.name] = made
+        elif made is not None or not is_new:
+            keys[machine.name] = key
+        if is_new:
+            resources.progress("fleet priors", k, len(updates))
     return keys, failed
 
 
@@ -226,7 +223,7 @@ class _UpdateJob(NamedTuple):
     ended: tuple[EndedLife, ...]
 
 
-def _update(job: _UpdateJob) -> PackedAssessment | str | None:
+def _update(job: _UpdateJob) -> list[PackedAssessment | str | None]:
     """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
 
     def work() -> PackedAssessment | None:
@@ -240,7 +237,7 @@ def _update(job: _UpdateJob) -> PackedAssessment | str | None:
         made = with_fleet_prior(found, job.prior, epochs=job.epochs, before=before)
         return pack_assessment(made)
 
-    return reason_if_failed(work, job.machine)
+    return [reason_if_failed(work, job.machine)]
 
 
 def reason_if_failed(

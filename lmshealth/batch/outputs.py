@@ -107,9 +107,9 @@ class Judging:
         return summary
 
 
-def output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
+def output_or_reason(record: MachineRecord) -> list[MachineOutput | str | None]:
     """Return the output of a machine, why it fails, or None where `machine_output` does."""
-    return reason_if_failed(lambda: machine_output(record), record.machine)
+    return [reason_if_failed(lambda: machine_output(record), record.machine)]
 
 
 def write_tables(

@@ -189,7 +189,9 @@ def report(
     with few.pool() as pool:
         own = ((one.machine, one.key, files[one.machine]) for one in present)
         records = (_record(*one, store, settings.language) for one in own)
-        for record, output in pool.map_unordered(output_or_reason, records, lambda _, why: why):
+        made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
+        made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
+        for record, [output] in made:
             if isinstance(output, str):
                 failed[record.machine] = output
             elif output is not None:
@@ -330,50 +332,39 @@ def _outputs(
 
     A machine whose assessment is missing, or cannot be decoded, is left out.
     """
-    store, missing = resources.store, dict[str, tuple[Machine, str]]()
-    for machine in machines:
+    store = resources.store
+
+    def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
         name = machine.name
-        # Its logs, which are large, follow from their names and keys.
-        record = _record(name, keys[name], files[name], store, language)
-        key = fingerprint(VERSION, record, machine.logs)
-        if output := _kept_output(name, key, store):
-            yield name, output
-        else:
-            missing[name] = machine, key
-
-    def fetch(names: Sequence[str]) -> list[str]:
-        return [name for name in names if store.part(name, missing[name][1]) is not None]
-
-    def job(names: Sequence[str]) -> MachineRecord:
-        [name] = names
-        logs = packed_logs(missing[name][0], store)
         return _record(name, keys[name], files[name], store, language, logs)
 
-    drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
-        output_or_reason,
-        lambda _, why: why,
-        key=lambda name: missing[name][1],
+    # Its logs, which are large, follow from their names and keys.
+    own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
+
+    def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, MachineOutput]]:
+        for machine in part:
+            content = store.part(machine.name, own[machine.name])
+            if (found := unpack_or_none(content, MachineOutput)) is not None:
+                yield machine, found
+
+    def job(part: Sequence[Machine]) -> MachineRecord:
+        [machine] = part
+        return record(machine, packed_logs(machine, store))
+
+    drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
+        function=output_or_reason,
+        on_crash=lambda _, why: [why],
+        key=lambda machine: own[machine.name],
         fetch=fetch,
         job=job,
     )
-    left = set(missing)
-    for record, drawn in drawing.values(list(missing), resources):
-        name = record.machine
-        left.remove(name)
-        if isinstance(drawn, MachineOutput):
+    for [(machine, drawn)], is_new in drawing.values(machines, resources):
+        name = machine.name
+        if is_new and isinstance(drawn, MachineOutput):
             put_points(store, name, drawn.points)
-            store.put_part(name, missing[name][1], pack(drawn))
+            store.put_part(name, own[name], pack(drawn))
         if drawn is not None:
             yield name, drawn
-    for name in left:  # drawn by other runs
-        if output := _kept_output(name, missing[name][1], store):
-            yield name, output
-
-
-def _kept_output(name: str, key: str, store: Store) -> MachineOutput | None:
-    """Fetch the output of a machine from the store; None if it is not there."""
-    found: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
-    return found
 
 
 def _record(

@@ -13,7 +13,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Generic, Self, TypeVar
 
@@ -573,58 +573,71 @@ class Resources:
     progress: Progress = lambda step, done, total: None
 
 
-@dataclass(frozen=True, slots=True)
+Pairs = list[tuple[Piece, Value]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Cached(Generic[Piece, Job, Value]):
     """A pure function of pieces of work, whose values a store keeps.
 
-    A run claims pieces, ``size`` at a time, and makes a ``job`` of those that it gets, of which a
-    worker computes the function; ``on_crash`` makes the value of a job that ends its worker.
-    ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` takes
-    values of pieces from the store, and yields those pieces whose value was there.
+    ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` yields
+    those pieces whose value is in the store, with it. Of the others a run claims some, at most
+    ``most`` at a time, and makes a ``job`` of those that it gets, of which a worker computes the
+    function: a list of their values. ``on_crash`` makes that of a job that ends its worker.
     """
 
-    function: Task[Job, Value]
-    on_crash: OnCrash[Job, Value]
-    key: Callable[[Piece], str] = field(kw_only=True)
-    fetch: Callable[[Sequence[Piece]], Iterable[Piece]] = field(kw_only=True)
-    job: Callable[[Sequence[Piece]], Job] = field(kw_only=True)
-    size: int = field(default=1, kw_only=True)
+    function: Task[Job, Sequence[Value]]
+    on_crash: OnCrash[Job, Sequence[Value]]
+    key: Callable[[Piece], str]
+    fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]]
+    job: Callable[[Sequence[Piece]], Job]
+    most: int = 1
 
-    def values(self, pieces: Sequence[Piece], resources: Resources) -> Iterator[tuple[Job, Value]]:
-        """Compute the values of all pieces that no other run does; yield each job with its value.
+    def values(
+        self, pieces: Sequence[Piece], resources: Resources
+    ) -> Iterator[tuple[Pairs[Piece, Value], bool]]:
+        """Yield all pieces with their values, some at a time, and whether these are new.
 
         What other runs have claimed is looked at again in the end: they store its value, or end
-        without. The caller stores a value before it asks for the next.
+        without. The caller stores new values before it asks for the next.
         """
-        left = pieces
+        left, is_waiting = pieces, False
         while left:
-            others = yield from self._unclaimed(left, resources)
-            if len(others) == len(left):
+            known = set[str]()
+            for piece, value in self.fetch(left):
+                known.add(self.key(piece))
+                yield [(piece, value)], False
+            if is_waiting and not known:
                 time.sleep(constants.OTHERS_POLL_S)
-            left = others
+            left = [piece for piece in left if self.key(piece) not in known]
+            others = yield from self._unclaimed(left, resources)
+            left, is_waiting = others, len(others) == len(left)
 
     def _unclaimed(
         self, pieces: Sequence[Piece], resources: Resources
-    ) -> Generator[tuple[Job, Value], None, list[Piece]]:
-        """Compute the values of unclaimed pieces; return the pieces that others have claimed."""
-        store, others, claimed = resources.store, list[Piece](), dict[int, list[str]]()
+    ) -> Generator[tuple[Pairs[Piece, Value], bool], None, list[Piece]]:
+        """Compute the values of unclaimed pieces; return the other pieces."""
+        store, others, claimed = resources.store, list[Piece](), dict[int, list[Piece]]()
+        # A few are spread over the workers.
+        size = min(self.most, max(1, len(pieces) // (4 * resources.pool.size)))
 
         def jobs() -> Iterator[Job]:
-            for first in range(0, len(pieces), self.size):
-                part = [(self.key(piece), piece) for piece in pieces[first : first + self.size]]
+            for first in range(0, len(pieces), size):
+                part = [(self.key(piece), piece) for piece in pieces[first : first + size]]
                 own = store.claim([key for key, _ in part])
-                others.extend(piece for key, piece in part if key not in own)
-                mine = [piece for key, piece in part if key in own]
                 if store.is_divided:  # another run may have done it since this one began
-                    done = {self.key(piece) for piece in self.fetch(mine)}
-                    store.release(list(done))
-                    mine = [piece for piece in mine if self.key(piece) not in done]
-                if mine:
+                    mine = [piece for key, piece in part if key in own]
+                    done = {self.key(piece) for piece, _ in self.fetch(mine)}
+                    store.release([*done])
+                    own -= done
+                others.extend(piece for key, piece in part if key not in own)
+                if mine := [piece for key, piece in part if key in own]:
                     job = self.job(mine)
-                    claimed[id(job)] = [self.key(piece) for piece in mine]
+                    claimed[id(job)] = mine
                     yield job
 
-        for job, value in resources.pool.map_unordered(self.function, jobs(), self.on_crash):
-            yield job, value
-            store.release(claimed.pop(id(job)))
+        for job, values in resources.pool.map_unordered(self.function, jobs(), self.on_crash):
+            mine = claimed.pop(id(job))
+            yield list(zip(mine, values, strict=True)), True
+            store.release([self.key(piece) for piece in mine])
         return others
