@@ -332,6 +332,10 @@ class ColumnMap(_MapFile, frozen=True, forbid_unknown_fields=True, dict=True):
             return None
         return source
 
+    def is_time(self, source: str) -> bool:
+        """Return whether a column of the file holds times."""
+        return role_of(self.target(source) or "") == "time"
+
     def signal(self, target: str) -> Signal:
         """Read quantity, name and unit of a contract name, as `parse_column` does."""
         return parse_column(target, self.units.get(target))

@@ -361,9 +361,7 @@ def _moments(
 ) -> list[tuple[str, int]]:
     """Return the channel of moments as a column of times, where nothing else states the rate."""
     found = [(channel.name, k) for k, channel in enumerate(channels) if channel.moments]
-    timed = columns.sample_rate_hz or any(
-        role_of(columns.target(c) or "") == "time" for c, _ in named
-    )
+    timed = columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
     return [("time_s", found[0][1])] if len(found) == 1 and rate is None and not timed else []
 
 
@@ -456,11 +454,11 @@ _DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
 class SinceFirst:
     """Conversion of the moments of a column to times since the first, block by block.
 
-    ``unit`` is that of the column in s, ``first`` the earliest moment of the first block.
+    They are in the unit of the column; ``first`` is the earliest moment of the first block.
     """
 
-    def __init__(self, unit: float) -> None:
-        self._unit = unit
+    def __init__(self, name: str, columns: ColumnMap) -> None:
+        self._unit = columns.signal(columns.target(name) or "").factor
         self.first: np.datetime64 | None = None
 
     def __call__(self, moments: np.ndarray) -> FloatArray:
@@ -491,10 +489,9 @@ def without_epoch(content: Content, columns: ColumnMap) -> Content:
     Other times stay as they are.
     """
     for name, samples in content.columns.items():
-        target = columns.target(name) or ""
-        if role_of(target) == "time" and samples.size:
+        if columns.is_time(name) and samples.size:
             with suppress(Unusable):  # a unit that is not stated is refused with the others
-                unit = columns.signal(target).factor
+                unit = columns.signal(columns.target(name) or "").factor
                 content.columns[name], guessed, moment = _since_first(samples, unit)
                 metadata, guessed = moment | content.metadata, (*content.guessed, *guessed)
                 content = replace(content, metadata=metadata, guessed=guessed)

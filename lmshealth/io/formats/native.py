@@ -26,7 +26,7 @@ import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
-from lmshealth.io.column_map import ColumnMap, role_of
+from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
     Described,
@@ -180,9 +180,8 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         times: dict[str, SinceFirst] = {}
         for name in chosen:
             kind: Any = schema.field(name).type
-            target = columns.target(name) or ""
-            if pa.types.is_timestamp(kind) and role_of(target) == "time":
-                times[name] = SinceFirst(columns.signal(target).factor)
+            if pa.types.is_timestamp(kind) and columns.is_time(name):
+                times[name] = SinceFirst(name, columns)
             elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 raise not_numeric(name, f"values of type {kind}")
         check_size(8 * n_rows * len(chosen), path.stat().st_size)
