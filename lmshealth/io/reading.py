@@ -25,7 +25,7 @@ from lmshealth.io.checks.channel_checks import (
     spikes,
     unwrapped,
 )
-from lmshealth.io.checks.consistency import Findings, Motion, compare
+from lmshealth.io.checks.consistency import Findings, compare
 from lmshealth.io.checks.prediction import filled
 from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
@@ -230,7 +230,7 @@ def _compared(
     # A set point over a rate that varies is no witness of one rate.
     velocity, position = (None if axis.clocks else own.get(role) for role in _REFERENCES)
     values = [channel.values for channel in channels]
-    return compare(Motion(position, velocity, nominal), values, axis.sample_rate, axis.breaks)
+    return compare(position, velocity, nominal, values, axis.sample_rate, axis.breaks)
 
 
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:
