@@ -423,7 +423,7 @@ def identify_log(
     from lmshealth.modal.identification import read_modes
     from lmshealth.modal.mode_shapes import mode_shapes
     from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
-    from lmshealth.signal.following_error import loop_error
+    from lmshealth.signal.readings import loop_error
 
     by, stage, asked = "", None, None
     try:

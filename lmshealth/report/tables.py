@@ -25,8 +25,7 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.modal.log_estimates import LogEstimates
     from lmshealth.modal.mode_shapes import ModeShapes
     from lmshealth.modal.modes import Modes
-    from lmshealth.signal.acceleration_levels import Growth, Magnitude
-    from lmshealth.signal.following_error import FollowingError
+    from lmshealth.signal.readings import FollowingError, Growth, Magnitude
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
     from lmshealth.stage.identifiability import Plan

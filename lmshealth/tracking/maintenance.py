@@ -10,9 +10,8 @@ from lmshealth._private.arrays import freeze
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadTable
 from lmshealth.io.log import Notice, Refusal, expect_moment, parse_moment, parse_name
-from lmshealth.io.manifest import find_sheets, name_of
+from lmshealth.io.manifest import Row, find_sheets, name_of, read_sheet
 from lmshealth.io.refusal import Unusable, shown
-from lmshealth.io.tables import Row, read_sheet
 
 _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
