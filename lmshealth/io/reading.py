@@ -14,10 +14,11 @@ from lmshealth._private.arrays import IntArray
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.checks.channel_checks import (
+from lmshealth.io.channel_checks import (
     check_sign,
     check_signal,
     coarse_levels,
+    filled,
     independent,
     magnitudes,
     missing_ranges,
@@ -25,9 +26,8 @@ from lmshealth.io.checks.channel_checks import (
     spikes,
     unwrapped,
 )
-from lmshealth.io.checks.consistency import Findings, compare
-from lmshealth.io.checks.prediction import filled
 from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
+from lmshealth.io.consistency import Findings, compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, parse_metadata

@@ -26,9 +26,8 @@ from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
-from lmshealth.machine.notices import chi_square_band, notices
 from lmshealth.machine.service import Service, day_after, probability_before
-from lmshealth.machine.status import Status, coming_states
+from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
 from lmshealth.machine.summary import Summary, first_limit, limit_of
 from lmshealth.report import constants, figures
 from lmshealth.report.language import mark, tr, tr_month

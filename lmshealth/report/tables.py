@@ -14,7 +14,7 @@ import numpy as np
 from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal, covariates
-from lmshealth.machine.notices import notices
+from lmshealth.machine.status import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.tracking.track import Track, mode_columns

@@ -1,4 +1,4 @@
-"""Consistency: what a log states more than once is compared (README.md, "Consistency").
+"""Consistency: what a log states more than once is compared (CHECKS.md, "Consistency").
 
 The sample rate with the set position and the set velocity; the set position with itself, which
 jumps where samples were dropped; the samples with themselves, where a buffer was recorded twice.

@@ -10,7 +10,7 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.io import buffers, constants
 from lmshealth.io.buffers import as_samples
-from lmshealth.io.checks.consistency import Findings, compare
+from lmshealth.io.consistency import Findings, compare
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
 from models.recordings.motion_profile import Profile

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lmshealth.io.checks.channel_checks import (
+from lmshealth.io.channel_checks import (
     check_sign,
     coarse_levels,
     level_step,
