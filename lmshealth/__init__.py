@@ -47,8 +47,8 @@ if TYPE_CHECKING:
     from lmshealth.modal.setups import merge_setups as merge_setups
     from lmshealth.stage.description import Stage as Stage
     from lmshealth.stage.description import load_stage as load_stage
-    from lmshealth.stage.planning import Plan as Plan
-    from lmshealth.stage.planning import plan as plan
+    from lmshealth.stage.identifiability import Plan as Plan
+    from lmshealth.stage.identifiability import plan as plan
     from lmshealth.tracking.history import History as History
     from lmshealth.tracking.history import build_history as build_history
     from lmshealth.tracking.track import Track as Track
@@ -76,7 +76,7 @@ _HOMES = {
     "judge": "life.verdict",
     "load": "machine.saving",
     "load_stage": "stage.description",
-    "plan": "stage.planning",
+    "plan": "stage.identifiability",
     "prognose": "life.prognosis",
     "read_frf": "modal.deterministic.frequency_response",
     "read_log": "io.reading",
@@ -95,7 +95,7 @@ _RESULTS = {
     "LifePosterior": "life.posterior.fit",
     "Log": "io.log",
     "Modes": "modal.modes",
-    "Plan": "stage.planning",
+    "Plan": "stage.identifiability",
     "Prognosis": "life.prognosis",
     "Refusal": "io.log",
     "RunResult": "batch.run",

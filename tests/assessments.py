@@ -26,8 +26,7 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.report.fleet_page import by_urgency, file_names, write_index
-from lmshealth.report.machine_page import date_page, make_page
+from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage

@@ -6,7 +6,7 @@ import numpy as np
 from scipy import fft
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.signal.harmonics import Harmonics, Indices
+from lmshealth.signal.readings import Harmonics, Indices
 
 
 def rebuild(harmonics: Harmonics, kept: Indices) -> FloatArray:

@@ -14,7 +14,7 @@ from lmshealth.batch.run import run
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
-from lmshealth.report.fleet_page import file_names
+from lmshealth.report.pages import file_names
 from lmshealth.stage.description import load_stage
 from tests.security.guards import acting, bad_names
 from tests.security.hostile import BAD_STAGES, MACHINES, SECRET

@@ -148,7 +148,7 @@ def test_gathered_names(written: Any) -> None:
     names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}
     assert {"lmshealth/io/reading.py", "lmshealth/errors.py"} <= names
     assert any(name.startswith("lmshealth/io/formats/") and "native" in name for name in names)
-    assert not {"lmshealth/report/machine_page.py", "lmshealth/__init__.py"} & names
+    assert not {"lmshealth/report/pages.py", "lmshealth/__init__.py"} & names
 
 
 def test_options_and_names_part_trials(written: Any, tmp_path: Path) -> None:

@@ -1,11 +1,12 @@
 """Serialise results to bytes by the types of their fields, and their fingerprints.
 
 The bytes name no type and are never executed. Floats keep all their bits, NaN and infinity too;
-dates keep their offset from UTC.
+dates keep their offset from UTC. Seeds depend on the input and the step, not on the order of work.
 """
 
 import hashlib
 import zlib
+from collections.abc import Sequence
 from importlib.metadata import version
 from typing import Any
 
@@ -69,3 +70,14 @@ def _revive(kind: type, value: Any) -> Any:
         raise ValueError(f"an array of {array.dtype}")
     array.setflags(write=False)
     return array
+
+
+def stream(seed: int | Sequence[int], *steps: int) -> np.random.SeedSequence:
+    """Return the random stream of a step of the computation."""
+    return np.random.SeedSequence([*np.atleast_1d(seed).tolist(), *steps])
+
+
+def seed_of(seed: int, *inputs: str) -> tuple[int, int]:
+    """Derive the seed of a computation from the user's seed and a hash of its inputs."""
+    digest = hashlib.sha256("\n".join(inputs).encode()).hexdigest()
+    return seed, int(digest[:12], 16)

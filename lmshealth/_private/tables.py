@@ -1,7 +1,7 @@
 """Specification of all tables that are written: names, units and meanings of their columns.
 
 It is read from ``tables.toml``. CSV, JSON and terminal tables, tables of pages, frames of results
-and ``report/TABLES.md`` are made of it.
+and ``report/TABLES.md`` are made of it. Names and sentences are as people read them.
 """
 
 from collections.abc import Iterable, Mapping
@@ -94,3 +94,16 @@ MOMENTS = sorted(
     {name for one in TABLES.values() for name, unit in one.units.items() if unit == "moment"}
 )
 """Names of the columns of moments."""
+
+
+def spell(name: str) -> str:
+    """Return a name with blanks instead of underscores."""
+    return name.replace("_", " ")
+
+
+def fact(template: str, /, **values: object) -> str:
+    """Return a sentence of a result: English, from a template in which values have names.
+
+    Pages translate it by its template (`report.language.sentence`).
+    """
+    return template.format(**values)

@@ -29,7 +29,7 @@ FILE = "status.json"
 """Status of all machines in the folder of the output."""
 
 # Not the folder of the process: it may hold a module of any name.
-_NOTIFY = ("-P", "-c", "from lmshealth.batch.addresses import notify; notify()")
+_NOTIFY = ("-P", "-c", "from lmshealth.batch.alerts import notify; notify()")
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,3 +212,20 @@ def _keep_end(stream: IO[bytes], last: bytearray) -> None:
     with stream:
         while block := os.read(stream.fileno(), 1 << 16):
             last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
+
+
+def notify() -> None:
+    """Send the changes on standard input by apprise, in a process that `run_command` bounds.
+
+    The addresses hold passwords: no message quotes them.
+    """
+    import apprise  # an extra
+
+    changes = msgspec.json.decode(sys.stdin.buffer.read())["changes"]
+    messenger, addresses = apprise.Apprise(), os.environ.get(constants.NOTIFY, "").split()
+    # All are tried, so that each is named.
+    if not all([messenger.add(address) for address in addresses]):  # noqa: C419
+        sys.exit(f"apprise does not know an address in {constants.NOTIFY}")
+    body = "\n".join(f"{change['text']} ({change['severity']})" for change in changes)
+    if not messenger.notify(title=f"lmshealth: {len(changes)} changes", body=body):
+        sys.exit(f"apprise could not deliver to every address in {constants.NOTIFY}")

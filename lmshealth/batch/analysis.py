@@ -13,7 +13,7 @@ from lmshealth.io.reading import read_log
 from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.signal.following_error import loop_error
+from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
 

@@ -9,9 +9,15 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple, TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
-from lmshealth.batch.cache import Cached, Resources
 from lmshealth.batch.ingest import LogKey, unexpected
-from lmshealth.batch.store import Identified, PackedAssessment, Store, unpack_or_none
+from lmshealth.batch.store import (
+    Cached,
+    Identified,
+    PackedAssessment,
+    Resources,
+    Store,
+    unpack_or_none,
+)
 from lmshealth.errors import LmshealthError
 from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
 from lmshealth.machine.assessment import (
@@ -23,13 +29,8 @@ from lmshealth.machine.assessment import (
 )
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.tables import log_tables
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.contradictions import sort_by_time
 from lmshealth.tracking.maintenance import Maintenance
-
-# Keys of the parts of an assessment with the rows of its logs, and a fingerprint of these logs.
-_ROWS, _ROWS_OF = fingerprint(VERSION, "rows"), fingerprint(VERSION, "rows of")
 
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
@@ -73,33 +74,29 @@ def assess_all(
     No part of an earlier assessment is used then. Return the machines that could not be assessed,
     and why: one must not end the batch.
     """
-    store, failed, known = resources.store, dict[str, str](), set[str]()
+    store, failed = resources.store, dict[str, str]()
 
-    def fetch(part: Sequence[Machine]) -> list[Machine]:
-        found = [m for m in part if not force and store.has_assessment(m.name, m.key)]
-        known.update(machine.name for machine in found)
-        return found
+    def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, None]]:
+        return ((m, None) for m in part if not force and store.has_assessment(m.name, m.key))
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
         return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
 
-    fetch(machines)
-    left = [machine for machine in machines if machine.name not in known]
-    resources.progress("assessing", len(known), len(machines))
-    assessing: Cached[Machine, _Job, PackedAssessment | str] = Cached(
-        _assess_packed,
-        lambda _, why: why,
+    assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
+        function=_assess_packed,
+        on_crash=lambda _, why: [why],
         key=lambda one: fingerprint(one.name, one.key),
         fetch=fetch,
         job=job,
     )
-    for k, ((machine, *_), made) in enumerate(assessing.values(left, resources), start=1):
+    resources.progress("assessing", 0, len(machines))
+    for k, ([(machine, made)], _) in enumerate(assessing.values(machines, resources), start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
-        else:
+        elif made is not None:
             failed[machine.name] = made
-        resources.progress("assessing", len(known) + k, len(machines))
+        resources.progress("assessing", k, len(machines))
     return failed
 
 
@@ -123,8 +120,8 @@ def pack_assessment(assessment: Assessment) -> PackedAssessment:
     return PackedAssessment(pack(assessment), evidence, summary)
 
 
-def _assess_packed(job: _Job) -> PackedAssessment | str:
-    """Assess a machine; return why it fails, but raise what workers fail of."""
+def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
+    """Assess a machine, or return why it fails; raise what workers fail of."""
     machine, logs, known = job
 
     def work() -> PackedAssessment:
@@ -132,52 +129,10 @@ def _assess_packed(job: _Job) -> PackedAssessment | str:
         before = unpack_or_none(known.get(key), LifeState)
         how = {"epochs": machine.epochs, "seed": machine.seed}
         found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
-        parts = _pack_rows(readings, machine, known.get(_ROWS))
-        if after is not None:
-            parts[key] = pack(after)
+        parts = {} if after is None else {key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
-    return reason_if_failed(work, machine.name, (CancelledError,))
-
-
-@dataclass(frozen=True, slots=True)
-class LogRows:
-    """Tables of one log as CSV by name; they depend on its name and its key."""
-
-    log: str
-    key: str
-    tables: dict[str, str]
-
-
-def packed_rows(machine: Machine, store: Store) -> bytes:
-    """Fetch the rows of the logs of a machine, a packed list of `LogRows` in the order of time.
-
-    They are made from its logs where the store has those of other ones, or none.
-    """
-    found = store.part(machine.name, _ROWS)
-    if found is None or store.part(machine.name, _ROWS_OF) != _digest(machine):
-        parts = _pack_rows(unpack_logs(packed_logs(machine, store)), machine, found)
-        for key, content in parts.items():
-            store.put_part(machine.name, key, content)
-        found = parts[_ROWS]
-    return found
-
-
-def _digest(machine: Machine) -> bytes:
-    return fingerprint(machine.logs).encode()
-
-
-def _pack_rows(
-    readings: Sequence[LogEstimates], machine: Machine, before: bytes | None
-) -> dict[str, bytes]:
-    """Make the parts that have the rows of all logs; those known before are not made again."""
-    found: list[LogRows] = unpack_or_none(before, list[LogRows]) or []
-    known = {(own.log, own.key): own for own in found}
-    keys, rows = dict(machine.logs), []
-    for reading in sort_by_time(readings):
-        own = reading.log, keys[reading.log]
-        rows.append(known.get(own) or LogRows(*own, log_tables(reading)))
-    return {_ROWS: pack(rows), _ROWS_OF: _digest(machine)}
+    return [reason_if_failed(work, machine.name, (CancelledError,))]
 
 
 def apply_fleet_priors(
@@ -196,11 +151,9 @@ def apply_fleet_priors(
         for machine, prior, ended in _machines_to_update(machines, store)
     ]
 
-    def fetch(part: Sequence[_Update]) -> list[_Update]:
-        of_part = [one for one in part if one[0].name not in force]
-        found = [one for one in of_part if store.has_assessment(one[0].name, one[1])]
-        keys.update((machine.name, key) for machine, key, *_ in found)
-        return found
+    def fetch(part: Sequence[_Update]) -> Iterator[tuple[_Update, None]]:
+        of_part = (one for one in part if one[0].name not in force)
+        return ((one, None) for one in of_part if store.has_assessment(one[0].name, one[1]))
 
     def job(part: Sequence[_Update]) -> _UpdateJob:
         [(machine, key, prior, ended)] = part
@@ -214,20 +167,23 @@ def apply_fleet_priors(
             ended=ended,
         )
 
-    known = {key for _, key, *_ in fetch(updates)}
-    left = [one for one in updates if one[1] not in known]
-    if left:
-        resources.progress("fleet priors", 0, len(left))
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
-        _update, lambda _, why: why, key=lambda one: one[1], fetch=fetch, job=job
+        function=_update,
+        on_crash=lambda _, why: [why],
+        key=lambda one: one[1],
+        fetch=fetch,
+        job=job,
     )
-    for k, (one, made) in enumerate(updating.values(left, resources), start=1):
+    for k, ([(one, made)], is_new) in enumerate(updating.values(updates, resources), start=1):
+        machine, key, *_ = one
         if isinstance(made, PackedAssessment):
-            store.put_assessment(one.machine, one.key, made)
-            keys[one.machine] = one.key
-        elif made is not None:
-            failed[one.machine] = made
-        resources.progress("fleet priors", k, len(left))
+            store.put_assessment(machine.name, key, made)
+        if isinstance(made, str):
+            failed[machine.name] = made
+        elif made is not None or not is_new:
+            keys[machine.name] = key
+        if is_new:
+            resources.progress("fleet priors", k, len(updates))
     return keys, failed
 
 
@@ -267,7 +223,7 @@ class _UpdateJob(NamedTuple):
     ended: tuple[EndedLife, ...]
 
 
-def _update(job: _UpdateJob) -> PackedAssessment | str | None:
+def _update(job: _UpdateJob) -> list[PackedAssessment | str | None]:
     """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
 
     def work() -> PackedAssessment | None:
@@ -281,7 +237,7 @@ def _update(job: _UpdateJob) -> PackedAssessment | str | None:
         made = with_fleet_prior(found, job.prior, epochs=job.epochs, before=before)
         return pack_assessment(made)
 
-    return reason_if_failed(work, job.machine)
+    return [reason_if_failed(work, job.machine)]
 
 
 def reason_if_failed(

@@ -1,14 +1,15 @@
-"""Databases of a store: tables, connections (SQLite, PostgreSQL), and what to do about faults."""
+"""Databases of a store: tables, connections (SQLite, PostgreSQL), and what to do about faults.
+
+No message quotes the secrets of an address.
+"""
 
 import os
 import re
-import socket
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
-from threading import Event, Timer
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import parse_qsl, quote, unquote
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql, sqlite
@@ -17,7 +18,6 @@ from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.schema import CreateTable
 
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
@@ -128,12 +128,8 @@ def _engine(url: URL, *, create: bool) -> Engine:
     if kind != "sqlite":
         if url.drivername == kind:
             url = url.set(drivername="postgresql+psycopg")  # the driver that the extra installs
-        timeout = constants.SERVER_TIMEOUT_S
-        wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
-        engine = sql.create_engine(url, pool_pre_ping=True, connect_args=wait)
-        if url.drivername == "postgresql+psycopg":
-            sql.event.listen(engine, "do_connect", _connect_bounded)
-        return engine
+        limits = {k: v for k, v in constants.SERVER_LIMITS.items() if k not in url.query}
+        return sql.create_engine(url, pool_pre_ping=True, connect_args=limits)
     name = url.database or ":memory:"
     is_uri = name.startswith("file:")
     if create and not is_uri and not Path(name).parent.is_dir():
@@ -170,39 +166,6 @@ def _unwritable(path: Path) -> dict[str, str]:
         return {}
     is_used = path.with_name(path.name + "-wal").exists()
     return {"mode": "ro"} | ({} if is_used else {"immutable": "1"})
-
-
-def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, Any]) -> Any:
-    """Connect to PostgreSQL; a server that is frozen then ends a statement, a ping or a commit."""
-    from psycopg import Connection, OperationalError
-
-    class Bounded(Connection[Any]):
-        def wait(self, *given: Any, **more: Any) -> Any:
-            # libpq waits without end for a server whose system still confirms packets.
-            late = Event()
-            timer = Timer(constants.ANSWER_TIMEOUT_S, _hang_up, [self.fileno(), late])
-            timer.daemon = True
-            timer.start()
-            try:
-                return super().wait(*given, **more)
-            except OperationalError as error:
-                if late.is_set():
-                    why = f"the server has not answered for {constants.ANSWER_TIMEOUT_S} s"
-                    raise OperationalError(why) from error
-                raise
-            finally:
-                timer.cancel()
-
-    return Bounded.connect(*arguments, **options)
-
-
-def _hang_up(number: int, late: Event) -> None:
-    """Close both directions of a socket, which whoever waits for it notices."""
-    late.set()
-    connection = socket.socket(fileno=number)
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
-    connection.detach()
 
 
 def _create_tables(engine: Engine) -> bool:
@@ -275,3 +238,50 @@ def reason(error: Exception, address: str) -> str:
     text = str(getattr(error, "orig", None) or error).strip()
     first = text.splitlines()[0] if text else type(error).__name__
     return without_secrets(first, address)
+
+
+# A password that contains characters with a meaning in URLs could be read as a host or a port: such
+# an address does not match.
+_URL = re.compile(
+    r"(?P<kind>[\w+.-]+)://"
+    r"(?:[^:@/?#]*(?::(?P<password>[^:@/?#]*))?@)?"
+    # Only the path of a file, after no host, may contain an @: elsewhere it ends a password.
+    r"(?P<place>(?:\[[\da-fA-F:]*\]|[\w.-]*)(?::\d+)?(?:(?<=://)/[^?]*|/[^?@]*)?)"
+    r"(?:\?(?P<options>.*))?",
+    re.DOTALL,
+)
+# Without any character of an address or option there is no password.
+_NO_URL = re.compile(r"[\w .-]*")
+
+
+def shown_address(address: str) -> str:
+    """Return an address without user, password and options."""
+    found = _URL.fullmatch(address)
+    if found is None:
+        return address if _NO_URL.fullmatch(address) else "that was given"
+    return f"{found['kind']}://{found['place']}"
+
+
+def without_secrets(text: str, address: str) -> str:
+    """Mask the password and the values of options of an address in an error message about it.
+
+    Where the password cannot be separated from the rest of the address, only what to do is
+    returned.
+    """
+    found = _URL.fullmatch(address)
+    if found is None:
+        if _NO_URL.fullmatch(address):
+            return text
+        return (
+            "needed is an address such as postgresql://user:password@host/database, with special "
+            "characters of a password percent-encoded, @ as %40; the reason may contain the "
+            "password and is not shown"
+        )
+    options = found["options"] or ""
+    values = [value for _, value in parse_qsl(options)]
+    values += [part.partition("=")[2] for part in options.split("&")]
+    secrets = [value for value in values if len(value) >= constants.SHORTEST_SECRET]
+    secrets += [found["password"] or "", unquote(found["password"] or "")]
+    for secret in sorted(set(secrets) - {""}, key=len, reverse=True):
+        text = text.replace(secret, "***")
+    return text

@@ -15,17 +15,14 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.cache import Cached, Resources
-from lmshealth.batch.store import Identified, Store
-from lmshealth.batch.workers import Pool, cluster, processes
+from lmshealth.batch.store import Cached, Identified, Resources, Store
+from lmshealth.batch.workers import Pool, Threads, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
-from lmshealth.io.covariates import SHIPPED, covariates
 from lmshealth.io.formats.registry import format_name
-from lmshealth.io.log import Metadata, Refusal
+from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
 from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
-from lmshealth.io.metadata import is_future
 from lmshealth.io.reading import content_digest, read_log, require_identity
 from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates
@@ -188,27 +185,23 @@ def ingest(
             own = groups.setdefault(str(found.machine), {}).setdefault(found.description, [])
             own.append(found.key)
 
-    cached = set()
-
-    def fetch(part: Sequence[_Task]) -> Iterator[_Task]:
-        for task, outcome in _cached(part, stages, store, settings.latest):
-            add(_Outcome.of(task, outcome, is_new=False))
-            cached.add(task.name)
-            yield task
-
-    known = {task.name for task in fetch(tasks)}
-    progress("identifying", len(cached), len(tasks))
-    left = [task for task in tasks if task.name not in known]
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
     options: dict[str, Any] = {"stages": tuple(stages), "how": how}
     identify = partial(_identify_logs, limit=settings.seconds_per_log, **options)
-    done = 0
-    for part in _identified(left, identify, resources, fetch):
+
+    def fetch(part: Sequence[_Task]) -> Iterator[tuple[_Task, _Outcome]]:
+        for task, outcome in _cached(part, stages, store, settings.latest):
+            yield task, _Outcome.of(task, outcome, is_new=False)
+
+    n_cached = done = 0
+    progress("identifying", 0, len(tasks))
+    for part, is_new in _identified(tasks, identify, resources, fetch):
         store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
         for one in part:
             add(one)
+        n_cached += 0 if is_new else len(part)
         done += len(part)
-        progress("identifying", len(cached) + done, len(tasks))
+        progress("identifying", done, len(tasks))
     names = {name_of(path, folder) for path in found}
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
@@ -217,7 +210,7 @@ def ingest(
         machines=machines,
         refused=(*archive.refused, *refused, *lost),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
-        n_cached=len(cached),
+        n_cached=n_cached,
     )
 
 
@@ -299,48 +292,39 @@ def _all_digests(
     """Hash the files that have changed since they were hashed last, by this run or another one."""
     store, digests = resources.store, dict[Path, str | BadLog]()
 
-    def fetch(paths: Sequence[Path]) -> Iterator[Path]:
+    def fetch(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
         known = store.digests(files[path][0] for path in paths)
-        for path in paths:
-            if (digest := known.get(files[path][0])) is not None:
-                digests[path] = digest
-                yield path
+        return ((path, known[key]) for path in paths if (key := files[path][0]) in known)
 
-    known = set(fetch([*files]))
-    resources.progress("reading", len(digests), len(files))
-    hashing: Cached[Path, tuple[Path, ...], dict[Path, str | BadLog]] = Cached(
-        _digests,
-        _no_digests,
+    hashing: Cached[Path, tuple[Path, ...], str | BadLog] = Cached(
+        function=_digests,
+        on_crash=lambda paths, why: [],  # a thread has none
         key=lambda path: files[path][0],
         fetch=fetch,
         job=tuple,
-        size=constants.FILES_PER_HASH_TASK,
+        most=constants.FILES_PER_HASH_TASK,
     )
-    left = [path for path in files if path not in known]
-    if len(left) <= constants.FILES_PER_HASH_TASK:  # a process takes longer to start
-        resources = replace(resources, pool=Pool())
-    for _, part in hashing.values(left, resources):
+    resources.progress("reading", 0, len(files))
+    # Threads hash at the same time, and start at once.
+    in_threads = replace(resources, pool=Threads(resources.pool.size))
+    for part, is_new in hashing.values([*files], in_threads):
         digests |= part
-        new = {files[path]: digest for path, digest in part.items() if isinstance(digest, str)}
-        store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
+        if is_new:
+            new = {files[path]: digest for path, digest in part if isinstance(digest, str)}
+            store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
         resources.progress("reading", len(digests), len(files))
     return digests
 
 
-def _digests(paths: Iterable[Path]) -> dict[Path, str | BadLog]:
+def _digests(paths: Iterable[Path]) -> list[str | BadLog]:
     """Hash files; return the error of one that cannot be read."""
-    found: dict[Path, str | BadLog] = {}
+    found: list[str | BadLog] = []
     for path in paths:
         try:
-            found[path] = content_digest(path)
+            found.append(content_digest(path))
         except BadLog as error:
-            found[path] = error
+            found.append(error)
     return found
-
-
-def _no_digests(paths: Iterable[Path], why: str) -> dict[Path, str | BadLog]:
-    detail = f"{why}: it cannot be read"
-    return {path: BadLog(path.name, "missing-file", detail) for path in paths}
 
 
 def _cached(
@@ -374,26 +358,29 @@ def _none_of(stages: Sequence[Stage]) -> str:
 
 
 def _identified(
-    left: Sequence[_Task],
+    tasks: Sequence[_Task],
     identify: Callable[[Sequence[_Task]], list[_Outcome]],
     resources: Resources,
-    fetch: Callable[[Sequence[_Task]], Iterable[_Task]],
-) -> Iterator[list[_Outcome]]:
-    """Identify logs, several in one task; those of a task that ended its worker one by one."""
-    pool, lost = resources.pool, list[tuple[_Task, ...]]()
-    identifying: Cached[_Task, tuple[_Task, ...], list[_Outcome]] = Cached(
-        identify,
-        lambda part, why: [],
+    fetch: Callable[[Sequence[_Task]], Iterable[tuple[_Task, _Outcome]]],
+) -> Iterator[tuple[list[_Outcome], bool]]:
+    """Identify logs, several in one task; those of a task that ended its worker one by one.
+
+    Yield some outcomes at a time, and whether they are new.
+    """
+    lost: list[tuple[_Task, ...]] = []
+    identifying: Cached[_Task, tuple[_Task, ...], _Outcome | None] = Cached(
+        function=identify,
+        on_crash=lambda part, why: [None] * len(part),
         key=lambda task: task.key(""),
         fetch=fetch,
         job=tuple,
-        size=min(constants.LOGS_PER_TASK, max(1, len(left) // (4 * pool.size))),
+        most=constants.LOGS_PER_TASK,
     )
-    for part, outcomes in identifying.values(left, resources):
-        lost += [] if outcomes else [(task,) for task in part]
-        yield outcomes
-    for _, outcomes in pool.map_unordered(identify, lost, _crashed):
-        yield outcomes
+    for part, is_new in identifying.values(tasks, resources):
+        lost += [(task,) for task, outcome in part if outcome is None]
+        yield [outcome for _, outcome in part if outcome is not None], is_new
+    for _, outcomes in resources.pool.map_unordered(identify, lost, _crashed):
+        yield outcomes, True
 
 
 def _crashed(tasks: Sequence[_Task], why: str) -> list[_Outcome]:
@@ -436,7 +423,7 @@ def identify_log(
     from lmshealth.modal.identification import read_modes
     from lmshealth.modal.mode_shapes import mode_shapes
     from lmshealth.modal.spectra_summary import WATERFALL_BINS, shown_band, summarise
-    from lmshealth.signal.following_error import loop_error
+    from lmshealth.signal.readings import loop_error
 
     by, stage, asked = "", None, None
     try:

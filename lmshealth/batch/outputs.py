@@ -1,29 +1,35 @@
-"""Output of a run: a page and rows of tables for each machine, one machine at a time.
+"""Output of a run: a page and rows of tables for each machine, and tables for dashboards.
 
 Memory holds the packed tables of all machines, and besides them only the machines in progress.
 """
 
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
+import sqlalchemy as sql
 
 from lmshealth._private.files import replacing, write_text
-from lmshealth._private.serialize import pack, unpack
+from lmshealth._private.serialize import fingerprint, pack, unpack
 from lmshealth._private.tables import RUN_TABLES, Row
-from lmshealth.batch.assess import LogRows, reason_if_failed
-from lmshealth.batch.dashboard import points
-from lmshealth.batch.store import unpack_or_none
+from lmshealth.batch import constants
+from lmshealth.batch.assess import PackedLogs, reason_if_failed, unpack_logs
+from lmshealth.batch.database import CHANGES, POINTS, STATUS
+from lmshealth.batch.store import Store, machine_key, unpack_or_none
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.status import Status, judge_at, make_status, on_day
+from lmshealth.machine.status import Change, Status, judge_at, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.language import Language, in_language
-from lmshealth.report.machine_page import date_page, make_page
-from lmshealth.report.tables import csv_text, join_csv, machine_tables
-from lmshealth.tracking.contradictions import LEFT_OUT
+from lmshealth.report.pages import date_page, make_page
+from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables
+from lmshealth.stage.constants import INFORMED
+from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
 
 # matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
@@ -33,14 +39,13 @@ _DRAWING = threading.Lock()
 class MachineRecord:
     """Packed results of a machine, from which its page (a file) and its rows are made.
 
-    ``rows`` are those of its logs, None where no tables are needed; ``before`` is its previous
-    report.
+    ``logs`` is None where no tables are needed; ``before`` is its previous report.
     """
 
     machine: str
     file: str
     assessment: bytes | None
-    rows: bytes | None
+    logs: PackedLogs | None
     before: Summary | None
     language: Language = "en"  # of its page
 
@@ -60,8 +65,8 @@ class MachineOutput:
 def machine_output(record: MachineRecord) -> MachineOutput | None:
     """Make the page and the rows of a machine; None where this version cannot decode them."""
     found: Assessment | None = unpack_or_none(record.assessment, Assessment)
-    logs = [] if record.rows is None else unpack_or_none(record.rows, list[LogRows])
-    if found is None or logs is None:
+    logs = unpack_logs(record.logs or ())
+    if found is None or (record.logs is not None and not logs):
         return None
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
@@ -69,8 +74,9 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         page = make_page(found, summary, before=record.before)
     rows = machine_tables(found) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
-    for name in logs[0].tables if logs else ():
-        tables[name] = "".join(join_csv([log.tables[name] for log in logs]))
+    of_logs = [log_tables(one) for one in sort_by_time(logs)]
+    for name in of_logs[0] if of_logs else ():
+        tables[name] = "".join(join_csv([one[name] for one in of_logs]))
     return MachineOutput(
         page=page,
         summary=summary,
@@ -101,9 +107,9 @@ class Judging:
         return summary
 
 
-def output_or_reason(record: MachineRecord) -> MachineOutput | str | None:
+def output_or_reason(record: MachineRecord) -> list[MachineOutput | str | None]:
     """Return the output of a machine, why it fails, or None where `machine_output` does."""
-    return reason_if_failed(lambda: machine_output(record), record.machine)
+    return [reason_if_failed(lambda: machine_output(record), record.machine)]
 
 
 def write_tables(
@@ -119,3 +125,72 @@ def write_tables(
             target = stack.enter_context(replacing(folder / f"{name}.csv"))
             own = [pack(csv_text(name, [])), *(part[name] for part in parts if name in part)]
             target.writelines(join_csv(own, partial(unpack, kind=str)))
+
+
+_SHOWN = ("recorded_at", "verdict", "probability", "service", "service_by", "inspect_by")
+
+
+def points(rows: Mapping[str, Sequence[Row]]) -> list[Row]:
+    """Return values of a machine with 90 % intervals for dashboards, from the rows of its tables.
+
+    Health (in units of the parameter) and frequency at its newest logs, remaining life at the last.
+    """
+    tables = {name: rows.get(name, ()) for name in ("health", "track", "prognosis", "verdict")}
+    found = [
+        ("health", row["parameter"], row["recorded_at"], row["q05"], row["median"], row["q95"])
+        for row in tables["health"]
+        if row["identifiable"] and row["informed"] >= INFORMED
+    ]
+    for row in tables["track"][-constants.TRACK_POINTS :]:
+        hertz, spread = row["frequency_hz"], 1.645 * row["frequency_std_hz"]
+        own = hertz - spread, hertz, hertz + spread
+        if np.isfinite(own).all():
+            found.append(("frequency_hz", row["mode"], row["recorded_at"], *map(float, own)))
+    for row in tables["prognosis"]:
+        own = tuple(row[f"rul_km_{name}"] for name in ("q05", "q50", "q95"))
+        found.append(("remaining_km", row["parameter"], tables["verdict"][0]["recorded_at"], *own))
+    names = "quantity", "subject", "recorded_at", "low", "median", "high"
+    return [dict(zip(names, own, strict=True)) for own in found]
+
+
+def put_points(store: Store, machine: str, rows: Iterable[Row]) -> None:
+    """Replace what dashboards show of a machine; remaining lives at earlier logs stay."""
+    new = [
+        own
+        | {"name": machine, "recorded_at": datetime.fromisoformat(own["recorded_at"])}
+        | {"key": fingerprint(own["quantity"], own["subject"], own["recorded_at"])}
+        for own in rows
+    ]
+    earlier = POINTS.c.machine == machine_key(machine), POINTS.c.quantity != "remaining_km"
+    with store.transaction() as connection:
+        connection.execute(sql.delete(POINTS).where(*earlier))
+        store.upsert(POINTS, _named(new))
+
+
+def put_status(
+    store: Store, statuses: Iterable[Status], changes: Iterable[Change], noticed_at: datetime
+) -> None:
+    """Write the status of machines, and what has changed."""
+    present = [
+        {name: getattr(one, name) for name in _SHOWN}
+        | {"name": one.stage, "state": one.device_health, "alarms": " ".join(one.alarms)}
+        | {"silent": "yes" if one.silent else "no"}
+        for one in statuses
+    ]
+    changed = [
+        {name: getattr(one, name) for name in ("recorded_at", "what", "before", "now")}
+        | {"name": one.stage, "key": fingerprint(one), "noticed_at": noticed_at}
+        for one in changes
+    ]
+    with store.transaction():
+        store.upsert(STATUS, _named(present))
+        store.upsert(CHANGES, _named(changed))
+
+
+def _named(rows: Iterable[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Add the keys of machines to rows with their names; moments in UTC: SQLite has no zones."""
+    return [
+        {k: v.astimezone(UTC) if isinstance(v, datetime) else v for k, v in row.items()}
+        | {"machine": machine_key(row["name"])}
+        for row in rows
+    ]

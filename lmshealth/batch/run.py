@@ -1,10 +1,13 @@
-"""Run over an archive: from a folder of logs to tables and a report."""
+"""Run over an archive, once or whenever logs arrive: from logs to tables and a report."""
 
+import os
+import time
 from collections import Counter
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime, time
+from datetime import UTC, datetime
+from datetime import time as day_time
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 
@@ -14,18 +17,24 @@ from lmshealth._private.files import remove_abandoned
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
-from lmshealth.batch.assess import Machine, apply_fleet_priors, assess_all, packed_rows
-from lmshealth.batch.cache import Cached, Resources
-from lmshealth.batch.dashboard import put_points, put_status
+from lmshealth.batch.assess import (
+    Machine,
+    PackedLogs,
+    apply_fleet_priors,
+    assess_all,
+    packed_logs,
+)
 from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
 from lmshealth.batch.outputs import (
     Judging,
     MachineOutput,
     MachineRecord,
     output_or_reason,
+    put_points,
+    put_status,
     write_tables,
 )
-from lmshealth.batch.store import Store, default_url, unpack_or_none
+from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -33,8 +42,8 @@ from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.io.refusal import visible
 from lmshealth.machine.status import Change, Status
 from lmshealth.machine.summary import Summary
-from lmshealth.report.fleet_page import by_urgency, file_names, write_index
 from lmshealth.report.language import Language, in_language
+from lmshealth.report.pages import by_urgency, file_names, write_index
 from lmshealth.report.tables import csv_text, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import read_maintenance
@@ -180,7 +189,9 @@ def report(
     with few.pool() as pool:
         own = ((one.machine, one.key, files[one.machine]) for one in present)
         records = (_record(*one, store, settings.language) for one in own)
-        for record, output in pool.map_unordered(output_or_reason, records, lambda _, why: why):
+        made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
+        made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
+        for record, [output] in made:
             if isinstance(output, str):
                 failed[record.machine] = output
             elif output is not None:
@@ -204,7 +215,7 @@ def report(
 def _judging(store: Store, settings: Settings = Settings()) -> Judging:
     """Return when pages and statuses are judged: at the end of a day, by default now (UTC)."""
     today = settings.today
-    moment = datetime.now(UTC) if today is None else datetime.combine(today, time.max, UTC)
+    moment = datetime.now(UTC) if today is None else datetime.combine(today, day_time.max, UTC)
     before = {stage: one.status for stage, one in store.announced().items()}
     return Judging(moment, settings.alerts.silent_days, before, settings.language)
 
@@ -321,50 +332,39 @@ def _outputs(
 
     A machine whose assessment is missing, or cannot be decoded, is left out.
     """
-    store, missing = resources.store, dict[str, tuple[Machine, str]]()
-    for machine in machines:
+    store = resources.store
+
+    def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
         name = machine.name
-        # The rows of its logs, which are large, follow from their names and keys.
-        record = _record(name, keys[name], files[name], store, language)
-        key = fingerprint(VERSION, record, machine.logs)
-        if output := _kept_output(name, key, store):
-            yield name, output
-        else:
-            missing[name] = machine, key
+        return _record(name, keys[name], files[name], store, language, logs)
 
-    def fetch(names: Sequence[str]) -> list[str]:
-        return [name for name in names if store.part(name, missing[name][1]) is not None]
+    # Its logs, which are large, follow from their names and keys.
+    own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
 
-    def job(names: Sequence[str]) -> MachineRecord:
-        [name] = names
-        rows = packed_rows(missing[name][0], store)
-        return _record(name, keys[name], files[name], store, language, rows)
+    def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, MachineOutput]]:
+        for machine in part:
+            content = store.part(machine.name, own[machine.name])
+            if (found := unpack_or_none(content, MachineOutput)) is not None:
+                yield machine, found
 
-    drawing: Cached[str, MachineRecord, MachineOutput | str | None] = Cached(
-        output_or_reason,
-        lambda _, why: why,
-        key=lambda name: missing[name][1],
+    def job(part: Sequence[Machine]) -> MachineRecord:
+        [machine] = part
+        return record(machine, packed_logs(machine, store))
+
+    drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
+        function=output_or_reason,
+        on_crash=lambda _, why: [why],
+        key=lambda machine: own[machine.name],
         fetch=fetch,
         job=job,
     )
-    left = set(missing)
-    for record, drawn in drawing.values(list(missing), resources):
-        name = record.machine
-        left.remove(name)
-        if isinstance(drawn, MachineOutput):
+    for [(machine, drawn)], is_new in drawing.values(machines, resources):
+        name = machine.name
+        if is_new and isinstance(drawn, MachineOutput):
             put_points(store, name, drawn.points)
-            store.put_part(name, missing[name][1], pack(drawn))
+            store.put_part(name, own[name], pack(drawn))
         if drawn is not None:
             yield name, drawn
-    for name in left:  # drawn by other runs
-        if output := _kept_output(name, missing[name][1], store):
-            yield name, output
-
-
-def _kept_output(name: str, key: str, store: Store) -> MachineOutput | None:
-    """Fetch the output of a machine from the store; None if it is not there."""
-    found: MachineOutput | None = unpack_or_none(store.part(name, key), MachineOutput)
-    return found
 
 
 def _record(
@@ -373,8 +373,55 @@ def _record(
     file: str,
     store: Store,
     language: Language,
-    rows: bytes | None = None,
+    logs: PackedLogs | None = None,
 ) -> MachineRecord:
     """Fetch the results of a machine from the store."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, rows, before, language)
+    return MachineRecord(machine, file, assessment, logs, before, language)
+
+
+_Files = dict[Path, tuple[int, int]]
+
+
+def watch(
+    folder: Path, stages: Sequence[Stage], out: Path, settings: Settings, *, interval: float
+) -> Iterator[RunResult | LmshealthError]:
+    """Yield the result of `run`, or its error, whenever it has something to do; never end.
+
+    Files whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
+    a later run. The folder is polled, because network shares report no changes. There is a run on
+    every new day (UTC) too: services fall due, and machines fall silent, without a new log.
+    """
+    before, done, day = _files(folder, out), _Files(), None
+    while True:
+        time.sleep(interval)
+        now, today = _files(folder, out), datetime.now(UTC).date()
+        settled = {path: seen for path, seen in now.items() if before.get(path) == seen}
+        before = now
+        new = settled.items() - done.items() or done.keys() - now.keys()
+        # A folder without files may be a share that is not mounted now: tables stay as they are.
+        if settled and (new or today != day):
+            done, day = settled, today
+            growing = frozenset(now.keys() - settled.keys())
+            try:
+                yield run(folder, stages, out, replace(settings, growing=growing))
+            except LmshealthError as error:
+                yield error
+
+
+def _files(folder: Path, out: Path) -> _Files:
+    """Return size in bytes and time of change in ns of all files outside of the output."""
+    found: _Files = {}
+    inside = out.resolve()
+    for parent, folders, files in os.walk(folder.absolute()):
+        here = Path(parent)
+        folders[:] = [
+            name for name in folders if name[0] != "." and (here / name).resolve() != inside
+        ]
+        for path in (here / name for name in files if name[0] != "."):
+            try:
+                seen = path.stat()
+            except OSError:  # removed meanwhile
+                continue
+            found[path] = seen.st_size, seen.st_mtime_ns
+    return found

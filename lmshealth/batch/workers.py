@@ -14,7 +14,14 @@ import socket
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import BrokenExecutor, CancelledError, Executor, Future, wait
+from concurrent.futures import (
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ThreadPoolExecutor,
+    wait,
+)
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
@@ -29,7 +36,6 @@ from threadpoolctl import threadpool_limits
 from lmshealth._private.interrupts import INTERRUPTS, ignore_interrupts
 from lmshealth._private.serialize import VERSION
 from lmshealth.batch import constants
-from lmshealth.batch.addresses import shown_address, without_secrets
 from lmshealth.errors import LmshealthError
 
 Item = TypeVar("Item")
@@ -72,6 +78,21 @@ class Pool:
         """
         for item in items:
             yield item, function(item)
+
+
+class Threads(Pool):
+    """Threads of this process, for work that waits for disks, or computes without its lock."""
+
+    def __init__(self, size: int) -> None:
+        self.size = min(size, os.cpu_count() or 1)
+
+    def map_unordered(
+        self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
+    ) -> Iterator[tuple[Item, Result]]:
+        """Apply a function to items, at most ``size`` at a time."""
+        with ThreadPoolExecutor(self.size) as executor:
+            for item, future in _completed(executor, function, iter(items), self.size):
+                yield item, future.result()
 
 
 class _ProcessPool(Pool):
@@ -299,6 +320,8 @@ def cluster(address: str) -> Iterator[Pool]:
     this version of lmshealth, and the workers need the logs under the same paths. `SchedulerError`
     if the scheduler does not answer, has no worker, or has a worker of another version.
     """
+    from lmshealth.batch.database import shown_address, without_secrets  # late, as all of this
+
     shown = shown_address(address)
     try:
         from distributed.comm.core import CommClosedError

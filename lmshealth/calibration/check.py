@@ -12,8 +12,8 @@ import numpy as np
 from numpy.linalg import LinAlgError
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.names import spell
 from lmshealth._private.result import Result
+from lmshealth._private.tables import spell
 from lmshealth.batch.workers import Progress, processes
 from lmshealth.calibration import constants
 from lmshealth.calibration.lives import KINDS, Kind, Life, Schedule, draw

@@ -142,7 +142,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
 
     Prints one line for each run, change and failure; with --format json one document a line.
     """
-    from lmshealth.batch.watch import watch as watch_folder
+    from lmshealth.batch.run import watch as watch_folder
 
     pdf, style = given.pop("pdf"), given.pop("style")
     for result in watch_folder(logs, stages, out, _settings(given), interval=interval):

@@ -31,8 +31,7 @@ from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
 from lmshealth.modal.setups import merge_setups
 from lmshealth.report import log_figures, tables
-from lmshealth.signal.acceleration_levels import find_growth
-from lmshealth.signal.following_error import loop_error, read_error
+from lmshealth.signal.readings import find_growth, loop_error, read_error
 from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
 

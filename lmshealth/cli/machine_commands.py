@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from numpy.linalg import LinAlgError
 
 from lmshealth._private.files import write_draws, write_text
-from lmshealth._private.seeds import seed_of
+from lmshealth._private.serialize import seed_of
 from lmshealth._private.tables import Row
 from lmshealth.cli import options, views
 from lmshealth.cli.terminal import PATIENCE, print_errors, print_notes, progress_bars

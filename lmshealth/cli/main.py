@@ -17,8 +17,7 @@ from typing import Any, NoReturn
 import click
 
 from lmshealth._private.interrupts import INTERRUPTS
-from lmshealth.cli.streams import standard_streams
-from lmshealth.cli.terminal import print_errors
+from lmshealth.cli.terminal import print_errors, standard_streams
 from lmshealth.errors import LmshealthError
 
 # What is imported and drawn stays: looking for cycles more often takes an eighth of its time.

@@ -15,7 +15,7 @@ from lmshealth.report.tables import plan_rows, stage_rows
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.constants import DURATIONS, KM_PER_DAY
 from lmshealth.stage.description import Stage
-from lmshealth.stage.planning import plan as make_plan
+from lmshealth.stage.identifiability import plan as make_plan
 
 
 @options.command("stage lms-y", "stage my-stage.toml --format json")

@@ -8,8 +8,7 @@ from datetime import date
 from itertools import combinations, permutations, zip_longest
 from typing import TYPE_CHECKING
 
-from lmshealth._private.names import spell
-from lmshealth._private.tables import TABLES, Row
+from lmshealth._private.tables import TABLES, Row, spell
 from lmshealth.cli.terminal import (
     print_line,
     print_refused,
@@ -29,19 +28,21 @@ from lmshealth.report.text import (
     count,
     day,
     fixed,
+    headline,
     in_brackets,
     interval,
     km,
+    next_step,
     number,
     percent,
     probability,
     probability_range,
+    service_on_day,
     service_text,
     time_left,
     travel_left,
     whole_km,
 )
-from lmshealth.report.wording import headline, next_step, service_on_day
 from lmshealth.tracking.track import Track
 
 if TYPE_CHECKING:

@@ -19,8 +19,7 @@ from lmshealth._private.files import read_table
 from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadTable
 from lmshealth.io import constants
-from lmshealth.io.covariates import metadata_keys
-from lmshealth.io.metadata import as_text
+from lmshealth.io.log import as_text, metadata_keys
 from lmshealth.io.refusal import Unusable, listed, repeated
 
 Role = Literal[
@@ -332,6 +331,10 @@ class ColumnMap(_MapFile, frozen=True, forbid_unknown_fields=True, dict=True):
         except Unusable:
             return None
         return source
+
+    def is_time(self, source: str) -> bool:
+        """Return whether a column of the file holds times."""
+        return role_of(self.target(source) or "") == "time"
 
     def signal(self, target: str) -> Signal:
         """Read quantity, name and unit of a contract name, as `parse_column` does."""

@@ -14,21 +14,23 @@ from lmshealth._private.arrays import IntArray
 from lmshealth.errors import BadLog
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.checks.channel_checks import (
+from lmshealth.io.channel_checks import (
+    check_sign,
     check_signal,
+    coarse_levels,
+    filled,
     independent,
     magnitudes,
     missing_ranges,
     roughness,
+    spikes,
+    unwrapped,
 )
-from lmshealth.io.checks.consistency import Findings, Motion, compare
-from lmshealth.io.checks.prediction import filled
-from lmshealth.io.checks.sample_faults import check_sign, coarse_levels, spikes, unwrapped
 from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
+from lmshealth.io.consistency import Findings, compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal
-from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
 from lmshealth.io.time_axis import (
     Ranges,
@@ -228,7 +230,7 @@ def _compared(
     # A set point over a rate that varies is no witness of one rate.
     velocity, position = (None if axis.clocks else own.get(role) for role in _REFERENCES)
     values = [channel.values for channel in channels]
-    return compare(Motion(position, velocity, nominal), values, axis.sample_rate, axis.breaks)
+    return compare(position, velocity, nominal, values, axis.sample_rate, axis.breaks)
 
 
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:

@@ -1,6 +1,6 @@
 """The time axis: sample rate, interruptions, resampling, and the set velocity of a set position.
 
-Samples are never sorted; `checks.prediction` fills short gaps only (README.md, "Time").
+Samples are never sorted; `channel_checks` fills short gaps only (README.md, "Time").
 """
 
 from collections.abc import Callable, Iterator, Sequence

@@ -12,7 +12,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
 from lmshealth._private.result import Result
-from lmshealth._private.seeds import stream
+from lmshealth._private.serialize import stream
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, freeze
-from lmshealth._private.names import fact
 from lmshealth._private.result import Result
-from lmshealth._private.seeds import stream
+from lmshealth._private.serialize import stream
+from lmshealth._private.tables import fact
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import KM, SECONDS_PER_DAY, with_clock

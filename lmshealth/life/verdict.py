@@ -11,7 +11,7 @@ import numpy as np
 from scipy.special import expit, logit
 
 from lmshealth._private.arrays import BoolArray
-from lmshealth._private.names import fact, spell
+from lmshealth._private.tables import fact, spell
 from lmshealth.life import constants
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.fit import LoneMode

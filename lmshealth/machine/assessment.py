@@ -12,9 +12,8 @@ from datetime import date
 import numpy as np
 from numpy.linalg import LinAlgError
 
-from lmshealth._private.names import fact
-from lmshealth._private.seeds import seed_of
-from lmshealth._private.serialize import fingerprint
+from lmshealth._private.serialize import fingerprint, seed_of
+from lmshealth._private.tables import fact
 from lmshealth.errors import LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life import constants
@@ -153,8 +152,10 @@ class Assessment:
         identity, verdict = self.judgement.stage, self.judgement.verdict
         if verdict in NO_HEALTH:
             return (0 if self.alarmed or self.drifted else 1), 0.0, 0.0, identity
-        if verdict in ("step", OUTSIDE_MAP):  # until the cause is known, no day of a service counts
+        if verdict == "step":  # until its cause is known, no day of a service counts
             return 0, 0.0, 0.0, identity
+        if verdict == OUTSIDE_MAP:  # after services that were overdue then
+            return 0, float(self.judgement.recorded_at.toordinal()), 0.0, identity
         if self.prognosis is None:
             return (1 if verdict == "healthy" else 0), 0.0, 0.0, identity
         day = np.inf if service.by is None else float(service.by.toordinal())

@@ -25,7 +25,7 @@ from lmshealth.modal.deterministic.frequency_response import FrfReading
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
-from lmshealth.stage.planning import Plan
+from lmshealth.stage.identifiability import Plan
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Refusal
 from lmshealth.modal.targets import check_band
-from lmshealth.signal.acceleration_levels import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.constants import LEVEL_BAND_RANGE
+from lmshealth.signal.readings import Magnitude, choose_bands, read_magnitudes
 from lmshealth.signal.segments import Part
 from lmshealth.signal.spectral_lines import Line, find_lines_by_velocity
 from lmshealth.stage.description import Stage

@@ -7,7 +7,7 @@ import numpy as np
 
 from lmshealth._private.arrays import ComplexArray
 from lmshealth.errors import BadLog, BadStage
-from lmshealth.io.checks.channel_checks import independent
+from lmshealth.io.channel_checks import independent
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
 from lmshealth.stage.constants import BAND_HALF_WIDTH

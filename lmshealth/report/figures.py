@@ -22,8 +22,8 @@ from lmshealth.errors import BadQuestion
 from lmshealth.io.log import SI_UNITS, Log
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
-from lmshealth.machine.notices import chi_square_band
 from lmshealth.machine.service import Service
+from lmshealth.machine.status import chi_square_band
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import constants

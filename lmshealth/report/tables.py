@@ -13,9 +13,8 @@ import numpy as np
 
 from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
-from lmshealth.io.covariates import covariates
-from lmshealth.io.log import Refusal
-from lmshealth.machine.notices import notices
+from lmshealth.io.log import Refusal, covariates
+from lmshealth.machine.status import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.tracking.track import Track, mode_columns
@@ -26,11 +25,10 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.modal.log_estimates import LogEstimates
     from lmshealth.modal.mode_shapes import ModeShapes
     from lmshealth.modal.modes import Modes
-    from lmshealth.signal.acceleration_levels import Growth, Magnitude
-    from lmshealth.signal.following_error import FollowingError
+    from lmshealth.signal.readings import FollowingError, Growth, Magnitude
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
-    from lmshealth.stage.planning import Plan
+    from lmshealth.stage.identifiability import Plan
     from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9

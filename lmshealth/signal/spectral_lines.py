@@ -1,15 +1,308 @@
-"""Spectral lines: detection, and naming by their sources (README.md, "Lines")."""
+"""Spectral lines: multitaper test, detection, and naming by their sources (README.md, "Lines")."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from itertools import pairwise
+from typing import Self
 
-from lmshealth._private.arrays import FloatArray
+import numpy as np
+from scipy import fft
+from scipy.linalg import toeplitz
+from scipy.special import fdtri, gammainccinv
+
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
-from lmshealth.signal.multitaper_test import detect_sinusoids
 from lmshealth.signal.segments import Segment, find_segments
 from lmshealth.signal.spectra import as_acceleration, lag_gain
 from lmshealth.stage.description import Stage
+
+# Sine tapers: the test uses half as many ordinates to either side.
+_TAPERS = 7
+# Frequencies tested per ordinate: between two of them a line loses little of its coherence.
+_PER_ORDINATE = 4
+_REACH = _TAPERS * _PER_ORDINATE // 2
+# Ordinates of the window around a line, distance up to which weaker lines are searched, and most
+# lines of a window.
+_WINDOW, _VICINITY, _MOST_LINES = 128, 32, 40
+# Octaves end at this frequency in Hz times powers of two: away from harmonics of the mains.
+_EDGE, _MOST_OCTAVES = 45.0, 40
+
+
+def detect_sinusoids(
+    lengths: Sequence[int],
+    read: Callable[[int], FloatArray],
+    sample_rate: float,
+    band: tuple[float, float],
+    false_alarm: float,
+) -> FloatArray:
+    """Detect the sinusoids that several segments have in common [Thomson1982], [Riedel1995].
+
+    Lengths are the samples of each segment; those less than half as long as the longest are
+    omitted. ``read`` returns the samples of a segment by its number, shape ``(n,)``. Sample rate
+    and band are in Hz; the first and last four ordinates cannot be tested. ``false_alarm`` is the
+    probability that segments without lines show any in the band, shared by all frequencies; it is
+    valid in white and coloured noise, and in resolved resonances of damping 0.2 % or more. The
+    result is frequency in Hz and amplitude of each, ascending, shape ``(n_lines, 2)``.
+    """
+    low, high = band
+    cuts = _octaves(max(low, high / 2**_MOST_OCTAVES), high)
+    octaves = [_plan(lengths, sample_rate, *cut) for cut in cuts]
+    tested = [octave for octave in octaves if octave.start < octave.stop]
+    n_tests = sum(octave.stop - octave.start for octave in tested)
+    rows = [row for octave in tested for row in _search(octave, read, false_alarm / n_tests)]
+    return np.array(sorted(rows)).reshape(-1, 2)
+
+
+def _octaves(low: float, high: float) -> list[tuple[float, float]]:
+    """Cut a band at fixed frequencies, so that results do not depend on its ends."""
+    first, last = np.floor(np.log2(np.array([low, high]) / _EDGE)).astype(int)
+    cuts = [low, *(_EDGE * 2.0 ** np.arange(first + 1, last + 1)).tolist(), high]
+    return [(a, b) for a, b in pairwise(cuts) if a < b]
+
+
+@dataclass(frozen=True, slots=True)
+class _Octave:
+    """Blocks and frequencies by which an octave is tested.
+
+    `n` are the samples of a block, 0 where the segments are too short; `blocks` the first
+    samples of those of each segment; `start` and `stop` a half-open range of indices of the padded
+    transform of a block.
+    """
+
+    sample_rate: float
+    n: int
+    blocks: list[range]
+    start: int
+    stop: int
+
+    @property
+    def ordinates(self) -> float:
+        """Ordinates per index of the padded transform."""
+        return self.n / (_PER_ORDINATE * (self.n + 1))
+
+    def each(self, read: Callable[[int], FloatArray]) -> Iterator[FloatArray]:
+        """Yield the blocks without their means."""
+        for number, starts in enumerate(self.blocks):
+            values = read(number) if starts else np.empty(0)
+            for a in starts:
+                part = values[a : a + self.n]
+                yield part - part.mean()
+
+
+def _plan(lengths: Sequence[int], sample_rate: float, low: float, high: float) -> _Octave:
+    """Cut segments into blocks of one length, in which a line keeps its phase."""
+    top = _EDGE * 2.0 ** np.ceil(np.log2(high / _EDGE))
+    coherent = (1 / constants.LINE_WIDTH) * sample_rate
+    apart = [length // max(1, round(length * top / coherent)) for length in lengths]
+    room = min(own for own, size in zip(apart, lengths, strict=True) if 2 * size >= max(lengths))
+    # A few samples are omitted for a fast transform.
+    n = fft.prev_fast_len(room + 1, real=True) - 1 if room > 4 * _TAPERS else 0
+    blocks = [
+        range(0, length - n + 1, own) if n and 2 * length >= max(lengths) else range(0)
+        for length, own in zip(lengths, apart, strict=True)
+    ]
+    size = _PER_ORDINATE * (n + 1)
+    start, stop = (int(np.ceil(edge * size / sample_rate)) for edge in (low, high))
+    start, stop = max(start, _REACH), min(stop, size // 2 + 1 - _REACH)
+    return _Octave(sample_rate, n, blocks, start, stop)
+
+
+def _search(
+    octave: _Octave, read: Callable[[int], FloatArray], p_value: float
+) -> list[tuple[float, float]]:
+    """Return frequency in Hz and amplitude of the lines of an octave."""
+    evidence, power = np.zeros((2, octave.stop - octave.start))
+    for part in octave.each(read):
+        transform = fft.rfft(part, _PER_ORDINATE * (octave.n + 1))
+        ratio, squared = _line_test(transform, octave.n, octave.start, octave.stop)
+        evidence += _noise_evidence(ratio)
+        power += squared
+    threshold = float(gammainccinv(sum(map(len, octave.blocks)), p_value))
+    passed = np.flatnonzero(evidence > threshold)
+    centres: list[int] = []
+    for index in passed[np.argsort(-power[passed])].tolist():
+        centre = round((octave.start + index) * octave.ordinates)
+        if all(abs(centre - other) > _VICINITY - _TAPERS for other in centres):
+            centres.append(centre)
+    low, high = octave.start * octave.ordinates, octave.stop * octave.ordinates
+    found: list[tuple[float, float]] = []
+    starts = [centre - _WINDOW // 2 for centre in centres]
+    for first, window in zip(starts, _windows(octave.each(read), starts), strict=True):
+        for ordinate, amplitude in _window_lines(window, first, threshold):
+            # Windows overlap.
+            new = all(abs(ordinate - other) > _TAPERS / 2 for other, _ in found)
+            if new and low <= ordinate < high:
+                found.append((ordinate, amplitude))
+    return [(ordinate * octave.sample_rate / octave.n, amplitude) for ordinate, amplitude in found]
+
+
+def _windows(blocks: Iterator[FloatArray], starts: list[int]) -> list[ComplexArray]:
+    """Return the series of windows, ``(n_blocks, _WINDOW)``, from their first ordinates on."""
+    cut: list[list[ComplexArray]] = [[] for _ in starts]
+    for part in blocks if starts else ():
+        transform = fft.fft(part, norm="forward")
+        for own, start in zip(cut, starts, strict=True):
+            # The transform is periodic.
+            index = np.arange(start, start + _WINDOW)
+            own.append(fft.ifft(transform.take(index, mode="wrap"), norm="forward"))
+    return [np.array(own) for own in cut]
+
+
+def _line_test(
+    transform: ComplexArray, n: int, first: int, stop: int
+) -> tuple[FloatArray, FloatArray]:
+    """Return the ratio of the power explained by a sine to the rest, and its squared amplitude.
+
+    A taper sin(πk(j+1)/(n+1)) is the difference of two transforms, k half ordinates apart on
+    either side: one padded transform, shape ``(..., size)``, holds all tapers.
+    """
+    norm = np.sqrt(0.5 / (n + 1))
+    mean: ComplexArray = np.zeros(1, dtype=complex)
+    total, weights = np.zeros(1), 0.0
+    for k in range(1, _TAPERS + 1):
+        shift, turn = k * (_PER_ORDINATE // 2), norm * np.exp(1j * np.pi * k / (n + 1))
+        tapered = transform[..., first - shift : stop - shift] * turn
+        tapered -= transform[..., first + shift : stop + shift] * turn.conjugate()
+        total = total + tapered.real**2 + tapered.imag**2
+        if k % 2 == 1:
+            # The sum of a taper over its samples; even tapers have none.
+            weight = 2 * norm / np.tan(np.pi * k / (2 * (n + 1)))
+            mean, weights = mean + weight * tapered, weights + weight**2
+    explained = (mean.real**2 + mean.imag**2) / weights
+    return explained / _rest(total, explained), 4 * explained / weights
+
+
+def _rest(total: FloatArray, explained: FloatArray) -> FloatArray:
+    """Return the power that a sine does not explain, not below the rounding error."""
+    return np.asarray((total - explained).clip(1e-12 * explained + 1e-300))
+
+
+def _noise_evidence(ratio: FloatArray) -> FloatArray:
+    """Return -ln p of the ratio F / (K - 1) in white noise."""
+    return (_TAPERS - 1) * np.log1p(ratio)
+
+
+def _resonance_evidence(ratio: FloatArray, width: float) -> FloatArray:
+    """Return -ln p of the ratio at the peak of a resonance, its width in ordinates (README.md).
+
+    Off the peak, in wider resonances and in more noise p is smaller.
+    """
+    correlation = toeplitz(np.exp(-np.pi * width * np.arange(_WINDOW) / _WINDOW))
+    root = np.linalg.cholesky(_tapers() @ correlation @ _tapers().T)
+    weight = _tapers().sum(axis=1)
+    line = np.outer(weight, weight) / (weight @ weight)
+    # Above 1e9 the eigenvalues are lost to rounding.
+    form = line - ratio[:, None, None].clip(max=1e9) * (np.eye(_TAPERS) - line)
+    values = np.linalg.eigvalsh(root.T @ form @ root)
+    return np.asarray(np.log1p(-values[:, :-1].clip(max=0) / values[:, -1:]).sum(axis=1))
+
+
+@lru_cache(maxsize=1)
+def _tapers() -> FloatArray:
+    """Return the tapers of a window, shape ``(_TAPERS, _WINDOW)``."""
+    k, j = np.arange(1, _TAPERS + 1), np.arange(1, _WINDOW + 1)
+    norm = np.sqrt(2 / (_WINDOW + 1))
+    return np.asarray(norm * np.sin(np.pi * np.outer(k, j) / (_WINDOW + 1)))
+
+
+def _window_lines(window: ComplexArray, first: int, threshold: float) -> list[tuple[float, float]]:
+    """Return ordinate and amplitude of the lines of a window, removed strongest first."""
+    size = _PER_ORDINATE * (_WINDOW + 1)
+    start, stop = size // 2 - _PER_ORDINATE * _VICINITY, size // 2 + _PER_ORDINATE * _VICINITY
+    # The centre has passed the scan; on this slightly different grid it might fail.
+    known = np.abs(np.arange(start, stop) - size // 2) <= _PER_ORDINATE // 2
+    free = np.ones(stop - start, dtype=bool)
+    found = []
+    for _ in range(_MOST_LINES):
+        ratio, squared = _line_test(fft.fft(window, size), _WINDOW, start, stop)
+        power = squared.sum(axis=0)
+        passed = np.flatnonzero(free & (known | (_noise_evidence(ratio).sum(axis=0) > threshold)))
+        if passed.size == 0:
+            break
+        # The foot of a strong line is coherent as well.
+        at = int(passed[np.argmax(power[passed])])
+        foot = max(0, at - _REACH)
+        top = foot + int(np.argmax(power[foot : at + _REACH + 1]))
+        for place in (at, top):
+            free[max(0, place - _REACH) : place + _REACH + 1] = False
+        ordinate = (start + _peak(power, top)) * _WINDOW / size
+        line = _LineFit.fit(window, ordinate)
+        if line.is_significant(abs(first + ordinate), threshold):
+            found.append((first + ordinate, line.amplitude))
+            window = line.removed()
+    return found
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _LineFit:
+    """Fit of a sine to a window.
+
+    The window demodulated by the sine, shape ``(n_blocks, _WINDOW)``; the conjugate of the sine
+    ``(_WINDOW,)``; its complex amplitude, and its power over the rest, ``(n_blocks,)``.
+    """
+
+    base: ComplexArray
+    carrier: ComplexArray
+    mean: ComplexArray
+    ratio: FloatArray
+
+    @classmethod
+    def fit(cls, window: ComplexArray, ordinate: float) -> Self:
+        """Fit the sine of a frequency in ordinates."""
+        carrier = np.exp(-2j * np.pi * ordinate * np.arange(_WINDOW) / _WINDOW)
+        weight = _tapers().sum(axis=1)
+        tapered = window * carrier @ _tapers().T
+        mean = tapered @ weight / (weight @ weight)
+        explained = np.abs(mean) ** 2 * (weight @ weight)
+        rest = _rest(np.sum(np.abs(tapered) ** 2, axis=1), explained)
+        return cls(window * carrier, carrier, mean, explained / rest)
+
+    @property
+    def amplitude(self) -> float:
+        """RMS amplitude over the blocks, corrected for noise."""
+        squared = np.abs(self.mean) ** 2 * (1 - 1 / (_TAPERS - 1) / self.ratio.clip(1e-300))
+        return float(2 * np.sqrt(np.mean(squared).clip(0)))
+
+    def is_significant(self, periods: float, threshold: float) -> bool:
+        """Return whether neither noise nor the narrowest resonance explains the sine."""
+        # Below one period a resonance cannot be distinguished from a line.
+        width = 2 * constants.LEAST_DAMPING * max(periods, 1.0)
+        evidence = _resonance_evidence(self.ratio, width).sum()
+        return bool(evidence > threshold) or not self._noise_rises(periods)
+
+    def _noise_rises(self, periods: float) -> bool:
+        """Return whether noise within eight ordinates exceeds that further away, on both sides."""
+        noise = self.base - self.mean[:, None]
+        time = np.arange(_WINDOW) / (_WINDOW + 1)
+
+        def level(ordinate: float) -> float:
+            tapers = _tapers() * np.exp(-2j * np.pi * ordinate * time)
+            return float(np.mean(np.abs(noise @ tapers.T) ** 2))
+
+        # The lower of two levels further away: another resonance may raise either. Below zero
+        # frequency the spectrum is its mirror image.
+        dof = 2 * _TAPERS * len(noise)
+        # The upper quantile of F is the inverse of the lower one.
+        limit = float(1 / fdtri(dof, dof, np.sqrt(constants.RISE_FALSE_ALARM) / 2))
+        sides = (-1, 1) if periods > 24 else (1,)
+        return all(level(4 * k) > limit * min(level(12 * k), level(20 * k)) for k in sides)
+
+    def removed(self) -> ComplexArray:
+        """Return the window without the sine, whose amplitude and phase may vary slowly."""
+        basis, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, _WINDOW), 3))
+        return np.asarray((self.base - self.base @ basis @ basis.T) * self.carrier.conj())
+
+
+def _peak(power: FloatArray, at: int) -> float:
+    """Return the vertex of the parabola through the logarithms around a maximum."""
+    if not 0 < at < power.size - 1:
+        return float(at)
+    a, b, c = np.log(power[at - 1 : at + 2].clip(1e-300)).tolist()
+    bend = a - 2 * b + c
+    off = 0.5 * (a - c) / bend if bend < 0 else 0.0
+    return at + min(max(off, -0.5), 0.5)
 
 
 @dataclass(frozen=True, slots=True)

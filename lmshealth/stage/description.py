@@ -19,8 +19,7 @@ from lmshealth._private.files import escapes, read_table
 from lmshealth._private.toml import decode, within
 from lmshealth.errors import BadStage
 from lmshealth.io.constants import FIRST_MOMENT, LAST_MOMENT, LONGEST_NAME
-from lmshealth.io.log import MOMENTS, Metadata
-from lmshealth.io.metadata import INVISIBLE
+from lmshealth.io.log import INVISIBLE, MOMENTS, Metadata
 from lmshealth.io.refusal import repeated
 from lmshealth.stage import constants
 from lmshealth.stage.degradation_laws import AnyLaw, Free, Unchanging

@@ -20,14 +20,12 @@ from lmshealth._private.files import write_text
 from lmshealth._private.toml import quoted
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, Spool, blocks, in_unit
+from lmshealth.io.buffers import MINUTE, Samples, Spool, blocks, in_unit
 from lmshealth.io.column_map import SI_TIMES, ColumnMap, Layout, parse_column, role_of, unit_key
-from lmshealth.io.formats.channels import SINCE_EPOCH
-from lmshealth.io.formats.content import Content, frequency_column, over_frequency
+from lmshealth.io.formats.content import SINCE_EPOCH, Content, frequency_column, over_frequency
 from lmshealth.io.formats.dialect import LOCAL_TIME
 from lmshealth.io.formats.registry import load
-from lmshealth.io.log import Log
-from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.log import Log, parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
 from lmshealth.io.time_axis import time_axis
@@ -91,33 +89,27 @@ class Guess(NamedTuple):
 
 
 class _Column:
-    """A column of the file: name, unit, all samples, and what they show.
+    """A column of the file: name, unit, samples, and what the first minute of them shows.
 
     ``moments`` is whether they are moments, read as times in s since the first.
     """
 
     def __init__(self, name: str, unit: str, samples: Samples, *, moments: bool = False) -> None:
         self.name, self.unit, self.samples, self.moments = name, unit, samples, moments
+        self.first = samples[:MINUTE]
+        self._finite = self.first[np.isfinite(self.first)]
 
     @cached_property
     def extremes(self) -> tuple[float, float, float]:
         """Least value, mean and largest value; NaN where no sample is a number."""
-        low, high, total, n = np.inf, -np.inf, 0.0, 0
-        for _, block in blocks(self.samples):
-            if (finite := block[np.isfinite(block)]).size:
-                low, high = min(low, float(finite.min())), max(high, float(finite.max()))
-                total, n = total + float(finite.sum()), n + finite.size
-        return (low, total / n, high) if n else (np.nan, np.nan, np.nan)
+        x = self._finite
+        return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
 
     @cached_property
     def steps(self) -> tuple[float, float, float]:
         """Least, mean and largest difference of consecutive samples."""
-        found = [np.diff(b) for _, b in blocks(self.samples, overlap=1) if b.size > 1]
-        if not found:
-            return np.nan, np.nan, np.nan
-        low, high = (f(np.array([f(one) for one in found])) for f in (np.min, np.max))
-        span = float(self.samples[self.samples.size - 1 :][0] - self.samples[:1][0])
-        return float(low), span / (self.samples.size - 1), float(high)
+        x = np.diff(self.first)
+        return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
 
     @property
     def is_even(self) -> bool:
@@ -128,13 +120,9 @@ class _Column:
     @property
     def n_crossings(self) -> int:
         """Crossings of the mean by values that are no switch or counter of few levels."""
-        levels: set[float] = set()
-        n = 0
-        for _, block in blocks(self.samples, overlap=1):
-            finite = block[np.isfinite(block)]
-            levels |= set(np.unique(finite)[: constants.FEWEST_LEVELS].tolist())
-            n += int(np.count_nonzero(np.diff(finite > self.extremes[1])))
-        return n if len(levels) >= constants.FEWEST_LEVELS else 0
+        n_levels = np.unique(self._finite).size
+        n = int(np.count_nonzero(np.diff(self._finite > self.extremes[1])))
+        return n if n_levels >= constants.FEWEST_LEVELS else 0
 
 
 def propose(
@@ -313,7 +301,7 @@ def _rate_of(load_by: _Load, one: _Column, unit: str) -> tuple[float, str]:
         return rate, unit or ("s" if is_epoch else "")
     since_first = Spool()
     for _, block in blocks(one.samples):
-        since_first.append(block - one.samples[:1][0])
+        since_first.append(block - one.first[0])
     return time_axis(since_first.samples(), None).sample_rate, ""
 
 
@@ -416,12 +404,12 @@ def _numbered(target: str, n: int) -> str:
 def _by_samples(one: _Column, guess: Guess) -> Guess:
     """Guess whether a column without a name or unit of a signal is an accelerometer."""
     low, mean, high = one.extremes
-    n, least = one.n_crossings, max(_CROSSINGS[0], _CROSSINGS[1] * one.samples.size)
+    n, least = one.n_crossings, max(_CROSSINGS[0], _CROSSINGS[1] * one.first.size)
     if low >= 0 and high - mean > _ONE_SIDED * (mean - low):
         return guess._replace(why=_ONE_SIGN)
     if one.moments or n < least or _OTHERS.search(one.name):
         return guess
-    why = f"looks like an accelerometer: crosses its mean {n} times in {one.samples.size} samples"
+    why = f"looks like an accelerometer: crosses its mean {n} times in {one.first.size} samples"
     return _signal("acc", one, why)
 
 

@@ -9,8 +9,8 @@ from typing import Any, Literal, Self
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
-from lmshealth._private.names import fact
 from lmshealth._private.result import Result
+from lmshealth._private.tables import fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates

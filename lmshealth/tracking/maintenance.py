@@ -7,13 +7,11 @@ from pathlib import Path
 from typing import Self
 
 from lmshealth._private.arrays import freeze
-from lmshealth._private.names import fact
+from lmshealth._private.tables import fact
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Notice, Refusal, expect_moment
-from lmshealth.io.manifest import find_sheets, name_of
-from lmshealth.io.metadata import parse_moment, parse_name
+from lmshealth.io.log import Notice, Refusal, expect_moment, parse_moment, parse_name
+from lmshealth.io.manifest import Row, find_sheets, name_of, read_sheet
 from lmshealth.io.refusal import Unusable, shown
-from lmshealth.io.tables import Row, read_sheet
 
 _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")

@@ -16,9 +16,9 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
-from lmshealth.io.covariates import covariates as known_covariates
 from lmshealth.io.log import Metadata, Refusal
-from lmshealth.io.tables import lines, name_machine, read_rows, to_moments, to_numbers
+from lmshealth.io.log import covariates as known_covariates
+from lmshealth.io.manifest import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage

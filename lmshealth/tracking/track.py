@@ -17,9 +17,8 @@ import numpy as np
 from scipy.special import chdtrc, ndtr
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
-from lmshealth._private.names import fact
 from lmshealth._private.result import Result
-from lmshealth._private.tables import TABLES
+from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage

@@ -25,8 +25,7 @@ import numpy as np
 from lmshealth.calibration.ranks import judge_coverage
 from lmshealth.errors import BadQuestion
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.stage.identifiability import identifiability_of
-from lmshealth.stage.planning import plan
+from lmshealth.stage.identifiability import identifiability_of, plan
 from models.dynamics.plant import GUIDE_MODES
 from models.lives.simulation import Plan
 from studies.harness.claims import Claim, covered, percents, span

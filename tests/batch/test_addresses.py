@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from lmshealth.batch.addresses import shown_address, without_secrets
+from lmshealth.batch.database import shown_address, without_secrets
 from tests.security.guards import ADDRESSES
 
 SECRET = "s3cr3t"

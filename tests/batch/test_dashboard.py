@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from lmshealth.batch.dashboard import points
+from lmshealth.batch.outputs import points
 from lmshealth.machine.summary import summarise
 from lmshealth.report.tables import machine_tables
 from tests.assessments import Maker, make, nothing

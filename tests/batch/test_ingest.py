@@ -8,9 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth.batch import constants
-from lmshealth.batch.cache import Resources
 from lmshealth.batch.ingest import _identified, _Outcome, _Task, identify_log
-from lmshealth.batch.store import Store
+from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal
 from lmshealth.modal.log_estimates import LogEstimates
@@ -50,7 +49,7 @@ def test_a_log_that_ends_its_worker_costs_no_other_log() -> None:
     pool = Fragile()
     with closing(Store("sqlite://")) as store:
         parts = list(_identified(tasks, work, Resources(store, pool), lambda part: ()))
-    refused = [one.refused[0] for part in parts for one in part]
+    refused = [one.refused[0] for part, _ in parts for one in part]
     assert sorted(one.log for one in refused) == [task.name for task in tasks]
     assert [one.log for one in refused if one.reason == "crashed"] == [BAD]
     assert max(pool.sizes) == constants.LOGS_PER_TASK
@@ -63,7 +62,7 @@ def test_few_logs_are_spread_over_the_workers() -> None:
     pool = Fragile()
     with closing(Store("sqlite://")) as store:
         parts = list(_identified(tasks, work, Resources(store, pool), lambda part: ()))
-    assert len([one for part in parts for one in part]) == len(tasks)
+    assert len([one for part, _ in parts for one in part]) == len(tasks)
     assert pool.sizes == [1] * len(tasks)
 
 

@@ -89,5 +89,6 @@ def test_a_page_needs_no_logs(tmp_path: Path) -> None:
     summary = output.summary
     assert (summary.file, summary.identity) == ("M7-Y.html", "M7-Y")
     assert output.tables == {}
-    for assessment, rows in ((b"nonsense", None), (None, None), (made.content, b"nonsense")):
-        assert machine_output(MachineRecord("M7-Y", "M7-Y.html", assessment, rows, None)) is None
+    lost = (("a.h5", b"nonsense"),)
+    for assessment, logs in ((b"nonsense", None), (None, None), (made.content, lost)):
+        assert machine_output(MachineRecord("M7-Y", "M7-Y.html", assessment, logs, None)) is None

@@ -13,10 +13,9 @@ from typing import Any
 
 import pytest
 
-from lmshealth.batch import watch as watching
+from lmshealth.batch import run as watching
 from lmshealth.batch.ingest import Settings
-from lmshealth.batch.run import RunResult
-from lmshealth.batch.watch import watch
+from lmshealth.batch.run import RunResult, watch
 from lmshealth.errors import NothingUsable
 from studies.harness.servers import wait_until
 from tests.signals import write_archive_stage, write_log

@@ -10,7 +10,7 @@ import numpy as np
 from emcee.autocorr import integrated_time
 from numpy.random import MT19937, RandomState
 
-from lmshealth._private.seeds import stream
+from lmshealth._private.serialize import stream
 from lmshealth.calibration.lives import START
 from lmshealth.life.posterior.ensemble_sampling import sample
 from lmshealth.life.posterior.importance_sampling import WeightedDraws, importance_sample_to_ess

@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from lmshealth import identify, read_log
-from lmshealth.signal.following_error import loop_error
+from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage
 from studies.cost.archive import Steps
 from studies.harness.cost import cpu_s

@@ -12,7 +12,7 @@ import pytest
 import xarray
 from click.testing import CliRunner, Result
 
-from lmshealth._private.seeds import seed_of
+from lmshealth._private.serialize import seed_of
 from lmshealth._private.tables import TABLES
 from lmshealth.cli.main import main
 from lmshealth.life import health as api

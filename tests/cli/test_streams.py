@@ -15,16 +15,16 @@ import pytest
 
 from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli import main as command_line
-from lmshealth.cli import streams, terminal
+from lmshealth.cli import terminal
 from tests.signals import write_archive_stage, write_log
 
 
-def text_stream(encoding: str) -> streams._Stream:
+def text_stream(encoding: str) -> terminal._Stream:
     """Open a stream of an encoding that writes into memory."""
-    return streams._Stream(io.TextIOWrapper(io.BytesIO(), encoding))
+    return terminal._Stream(io.TextIOWrapper(io.BytesIO(), encoding))
 
 
-def written(stream: streams._Stream) -> bytes:
+def written(stream: terminal._Stream) -> bytes:
     """Return the bytes that a stream of `text_stream` wrote."""
     buffer = stream.buffer
     assert isinstance(buffer, io.BytesIO)
@@ -47,7 +47,7 @@ def test_characters_that_a_stream_lacks_are_spelled(
     """By the stream itself, and before a table is laid out."""
     stream = text_stream(encoding)
     monkeypatch.setattr(sys, "stdout", stream)
-    assert streams.readable(text) == shown
+    assert terminal.readable(text) == shown
     print(text, end="", flush=True)
     assert written(stream).decode(encoding) == shown
 
@@ -65,7 +65,7 @@ def test_a_stream_that_fails_is_noted_and_goes_on(tmp_path: Path) -> None:
     if not Path("/dev/full").exists():
         pytest.skip("there is no /dev/full: only Linux has it")
     with open("/dev/full", "w", encoding="utf-8") as full:
-        stream = streams._Stream(full)
+        stream = terminal._Stream(full)
         print("lost", file=stream, flush=True)
         assert isinstance(stream.lost, OSError) and stream.lost.strerror
         print("nothing", file=stream, flush=True)

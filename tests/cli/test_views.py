@@ -28,7 +28,7 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import decide, probability_before
 from lmshealth.machine.summary import prognosis_rows, summarise, summarise_life
 from lmshealth.modal.naming import Difference
-from lmshealth.report.fleet_page import by_urgency
+from lmshealth.report.pages import by_urgency
 from lmshealth.report.tables import stage_rows
 from lmshealth.report.text import service_text
 from lmshealth.stage.check import check_stage, diagnose

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from lmshealth.io.covariates import OTHER_KEYS, _checked, covariates, metadata_keys
+from lmshealth.io.log import OTHER_KEYS, _checked, covariates, metadata_keys
 from tests.installed import install, run_script
 
 SHIPPED = [(key, *ends) for key, ends in covariates().items()]

@@ -7,9 +7,8 @@ import pandas as pd
 import pytest
 
 from lmshealth._private.serialize import fingerprint
-from lmshealth.io import constants, metadata
-from lmshealth.io.log import Metadata
-from lmshealth.io.metadata import moment_after, parse_metadata
+from lmshealth.io import constants, log
+from lmshealth.io.log import Metadata, moment_after, parse_metadata
 from lmshealth.io.refusal import Unusable
 
 MOMENT = datetime(2026, 3, 1, 8, 30, tzinfo=UTC)
@@ -102,11 +101,11 @@ def test_a_log_of_the_future_is_refused_by_its_date(monkeypatch):
     with pytest.raises(Unusable, match=late[:10]):
         parse_metadata({"recorded_at": late})
     for year, last in ((1999, constants.MADE), (2080, datetime(2080, 1, 1, tzinfo=UTC))):
-        monkeypatch.setattr(metadata, "datetime", type("Clock", (datetime,), {
+        monkeypatch.setattr(log, "datetime", type("Clock", (datetime,), {
             "now": classmethod(lambda cls, zone, year=year: datetime(year, 1, 1, tzinfo=zone)),
         }))  # fmt: skip
-        assert not metadata.is_future(last + constants.FUTURE)
-        assert metadata.is_future(last + constants.FUTURE + timedelta(seconds=1))
+        assert not log.is_future(last + constants.FUTURE)
+        assert log.is_future(last + constants.FUTURE + timedelta(seconds=1))
 
 
 def test_moments_out_of_the_calendar_are_written_for_their_refusal():

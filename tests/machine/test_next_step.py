@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from lmshealth.machine import constants
-from lmshealth.machine.next_step import CASES, NextStep, Step, next_step, step_of
-from lmshealth.report import wording
+from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of
+from lmshealth.report import text
 from tests.assessments import Maker, make
 
 __all__ = ["make"]
@@ -69,7 +69,7 @@ def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
         assert step_of(*case) in get_args(Step)
     assert {case[0] for case in CASES} == set(get_args(Step))
     for kind in get_args(Step):
-        sentence = wording.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
+        sentence = text.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
         assert (sentence == "") == (kind == "none")
 
 
@@ -85,10 +85,10 @@ def test_a_healthy_young_machine_orders_no_service(
     monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs - 1)
     # Not "plan", whose sentence orders work beside the headline "Healthy".
     assert next_step(healthy, service).kind == "schedule"
-    assert "Order" not in wording.next_step(next_step(healthy, service))
+    assert "Order" not in text.next_step(next_step(healthy, service))
     monkeypatch.setattr(constants, "YOUNG_LOGS", n_logs)
     found = next_step(healthy, service)
     assert found.kind == "confirm"
     assert (found.by, found.horizon) == (date(2027, 3, 1), assessment.prognosis.horizon)
     assert found.log_every == service.inspect_every / np.median(assessment.prognosis.usage)
-    assert "order nothing yet" in wording.next_step(found)
+    assert "order nothing yet" in text.next_step(found)

@@ -14,8 +14,7 @@ from lmshealth._private.tables import TABLES
 from lmshealth.io.log import Refusal
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine.assessment import assess
-from lmshealth.machine.notices import notices
-from lmshealth.machine.status import make_status
+from lmshealth.machine.status import make_status, notices
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables

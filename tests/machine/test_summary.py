@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import date
+from datetime import date, timedelta
 
 import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth.machine.next_step import first_limit
-from lmshealth.machine.summary import Summary, summarise, summarise_life
-from lmshealth.report.text import time_left, travel_left
-from lmshealth.report.wording import headline as headline_of
-from lmshealth.report.wording import next_step
+from lmshealth.machine.summary import Summary, first_limit, summarise, summarise_life
+from lmshealth.report.text import headline as headline_of
+from lmshealth.report.text import next_step, time_left, travel_left
 from lmshealth.tracking.filters.change_detection import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
 
@@ -88,15 +86,20 @@ def test_health_is_that_of_the_draws(make: Maker) -> None:
 
 
 def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
-    """What to do is to look for its cause; it stands before healthy machines, after worn ones."""
+    """What to do is to look for its cause, before any service that was not overdue then."""
     assessment = make()
     outside = replace(assessment.judgement, verdict="outside-map")
     found = summary(replace(assessment, judgement=outside))
     sentence = next_step(found.step)
     assert sentence.startswith("Find out what moved the mode: its sensor, cables, payload")
     assert summary(assessment).step.kind in ("plan", "service-now")
-    healthy = summary(make("sound", wear_km=400000, floor=0.98))
-    assert summary(assessment).urgency < found.urgency < healthy.urgency
+    healthy = make("sound", wear_km=400000, floor=0.98)
+    assert found.urgency < summary(healthy).urgency
+    day = assessment.judgement.recorded_at.date()
+    for kind in (assessment, healthy):
+        due = [replace(kind.service(), kind="by", by=day + timedelta(days=n)) for n in (-1, 1)]
+        overdue, planned = (kind.urgency(service) for service in due)
+        assert overdue < found.urgency < planned
 
 
 def test_a_sudden_change_comes_first(make: Maker) -> None:

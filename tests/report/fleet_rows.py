@@ -8,9 +8,8 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io.log import Refusal
-from lmshealth.machine.next_step import NextStep
 from lmshealth.machine.service import Service
-from lmshealth.machine.summary import Life, LimitLife, ParameterHealth, State, Summary
+from lmshealth.machine.summary import Life, LimitLife, NextStep, ParameterHealth, State, Summary
 
 TODAY = date(2026, 11, 20)
 HORIZON = 20e6

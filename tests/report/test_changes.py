@@ -12,16 +12,16 @@ import pytest
 
 from lmshealth._private.serialize import pack, unpack
 from lmshealth.life.verdict import degraded_words
-from lmshealth.machine.next_step import NextStep
 from lmshealth.machine.service import Service
 from lmshealth.machine.summary import (
     Life,
     LimitLife,
+    NextStep,
     ParameterHealth,
     Summary,
     summarise,
 )
-from lmshealth.report.wording import changes
+from lmshealth.report.text import changes
 from lmshealth.stage.description import ParameterSpec, load_stage
 from lmshealth.stage.priors import Lognormal
 from tests.assessments import nothing, worn

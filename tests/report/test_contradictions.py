@@ -17,8 +17,7 @@ from lmshealth.machine.service import Service, day_after
 from lmshealth.machine.status import judge_at, make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures as plots
-from lmshealth.report.fleet_page import write_index
-from lmshealth.report.machine_page import date_page, make_page
+from lmshealth.report.pages import date_page, make_page, write_index
 from tests.assessments import Maker, Page, make, words
 
 __all__ = ["make"]

@@ -16,7 +16,7 @@ import pytest
 from lmshealth._private.serialize import pack, unpack
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.summary import Summary, summarise
-from lmshealth.report.fleet_page import by_urgency, file_names, write_index
+from lmshealth.report.pages import by_urgency, file_names, write_index
 from lmshealth.report.text import GAP
 from tests.assessments import Page, blind, chromium, leaves, make, nothing, watch, words
 from tests.report.fleet_rows import TODAY, make_refused, make_rows

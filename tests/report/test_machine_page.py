@@ -28,8 +28,7 @@ from lmshealth.modal.identification import read_ambient
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import summarise
 from lmshealth.report import figures as plots
-from lmshealth.report.fleet_page import write_index
-from lmshealth.report.machine_page import date_page, make_page
+from lmshealth.report.pages import date_page, make_page, write_index
 from lmshealth.report.text import GAP, plain
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal

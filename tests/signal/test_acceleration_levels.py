@@ -13,7 +13,7 @@ from lmshealth.errors import BadLog
 from lmshealth.io.log import Log, Metadata
 from lmshealth.io.reading import read_log
 from lmshealth.modal.identification import identify
-from lmshealth.signal.acceleration_levels import (
+from lmshealth.signal.readings import (
     FrequencyBand,
     Magnitude,
     choose_bands,

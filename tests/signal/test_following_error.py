@@ -10,7 +10,7 @@ import pytest
 
 from lmshealth.errors import BadLog
 from lmshealth.io.reading import read_log
-from lmshealth.signal.following_error import loop_error, read_error
+from lmshealth.signal.readings import loop_error, read_error
 from models.dynamics.stages import STAGES
 from models.recordings.strokes import record_strokes
 from models.recordings.velocities import Experiment, drive_velocities

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from lmshealth.signal.harmonics import Harmonics, decompose
+from lmshealth.signal.readings import Harmonics, decompose
 from tests.harmonics import rebuild
 
 RATE = 2000.0

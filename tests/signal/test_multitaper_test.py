@@ -7,8 +7,8 @@ import pytest
 from scipy import fft
 
 from lmshealth.signal import constants
-from lmshealth.signal import multitaper_test as linetest
-from lmshealth.signal.multitaper_test import detect_sinusoids
+from lmshealth.signal import spectral_lines as linetest
+from lmshealth.signal.spectral_lines import detect_sinusoids
 from tests.signals import Mode, accelerations, sine, white
 
 RATE = 1000.0

@@ -12,9 +12,14 @@ import pytest
 
 from lmshealth.io.log import Channel, Log
 from lmshealth.io.reading import read_log
-from lmshealth.signal.multitaper_test import detect_sinusoids
 from lmshealth.signal.segments import Segment, find_segments
-from lmshealth.signal.spectral_lines import Line, find_lines, find_lines_by_velocity, name_lines
+from lmshealth.signal.spectral_lines import (
+    Line,
+    detect_sinusoids,
+    find_lines,
+    find_lines_by_velocity,
+    name_lines,
+)
 from tests.signals import (
     Mode,
     accelerations,

@@ -9,7 +9,7 @@ from lmshealth.modal import identification
 from lmshealth.modal.identification import identify
 from lmshealth.modal.modes import Modes
 from lmshealth.signal import spectra
-from lmshealth.signal.tone_removal import Sinusoid, remove_sinusoids
+from lmshealth.signal.spectra import Sinusoid, remove_sinusoids
 from tests.signals import (
     Mode,
     acceleration_log,

@@ -24,8 +24,8 @@ from lmshealth.report.tables import stage_rows
 from lmshealth.stage.check import check_stage, diagnose
 from lmshealth.stage.degradation_laws import Unchanging
 from lmshealth.stage.description import Stage, load_stage, shipped
+from lmshealth.stage.identifiability import plan
 from lmshealth.stage.modal_map import read_map
-from lmshealth.stage.planning import plan
 from tests.lives import FADING, FOOT, MOUNT, PRELOAD, make_stage, map_rows, stage_text, true_drift
 
 

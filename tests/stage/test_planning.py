@@ -14,8 +14,7 @@ from lmshealth.errors import BadQuestion, BadStage, OutsideMap
 from lmshealth.stage.check import check_stage
 from lmshealth.stage.constants import TYPICAL_DURATION
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.stage.identifiability import ambient_bound
-from lmshealth.stage.planning import Plan, plan
+from lmshealth.stage.identifiability import Plan, ambient_bound, plan
 from studies.harness.data.cramer_rao import long_record_law
 from tests.lives import DAMPING, FOOT, FREQUENCY, PRELOAD, SENSITIVITY, make_stage
 from tests.oracles import planned_std

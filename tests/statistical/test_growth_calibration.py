@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from lmshealth.signal.acceleration_levels import (
+from lmshealth.signal.readings import (
     FrequencyBand,
     Growth,
     Magnitude,

@@ -12,8 +12,7 @@ import numpy as np
 from scipy import stats
 
 from lmshealth.stage.description import Stage
-from lmshealth.stage.identifiability import ambient_bound, identifiability_of
-from lmshealth.stage.planning import plan
+from lmshealth.stage.identifiability import ambient_bound, identifiability_of, plan
 from studies.health.detectability import FALSE_ALARM, POWER, called, stage_with
 from tests.claims import Claims
 from tests.lives import DAMPING, FREQUENCY, MOUNT, PRELOAD, SENSITIVITY, make_stage

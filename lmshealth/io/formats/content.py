@@ -1,20 +1,28 @@
-"""Content of files: columns as they are in the file and metadata as text, or what holds no log."""
+"""Content of files: columns as they are in the file and metadata as text, or what holds no log.
+
+Which channels are read, by unit, rate and start; moments in columns of times.
+"""
 
 import gzip
 import re
 import zipfile
 import zlib
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
+import numpy as np
+
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples
-from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.log import Refusal
+from lmshealth.io.buffers import Samples, Spool, blocks
+from lmshealth.io.column_map import ColumnMap, parse_column, role_of, unit_key
+from lmshealth.io.log import Refusal, moment_after
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
 GZIP = b"\x1f\x8b"
@@ -263,3 +271,254 @@ def over_frequency(column: str) -> Unusable:
     needed = "needed samples over time, of which spectra are estimated"
     step = "`lmshealth frf` reads responses: frequency_hz with real and imag, or with magnitude"
     return Unusable("format", f"{what}; {needed}; {step} and phase_deg")
+
+
+# Names that exporters give to the column of times.
+_TIME = re.compile(r"(time|zeit|temps|tiempo|tempo|t|x_value|timestamp)\b", re.IGNORECASE)
+
+
+@dataclass(frozen=True, slots=True)
+class Described:
+    """Name and unit of a channel as in the file, empty where there is none.
+
+    ``rate`` is its sample rate in Hz, ``start`` the time in s of its first sample, None where the
+    file has none, and ``size`` its number of samples, 0 where it is not yet there; ``acceleration``
+    whether the file calls it one, whatever its unit, and ``moments`` whether it holds moments.
+    """
+
+    name: str
+    unit: str
+    rate: float | None = None
+    acceleration: bool = False
+    start: float | None = 0.0
+    size: int = 0
+    moments: bool = False
+
+
+def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str, int], Content]:
+    """Choose the channels of one sample rate that the contract or the column map names.
+
+    Return the index in the file of each by its name as a column of the log, and a content that has
+    their sample rate, the names of all channels, refusals, and by how many samples they start late,
+    but no samples. Channels of another rate are refused, and those whose start is a fraction of a
+    sample off, or so late that the others would be used in part only.
+
+    Without ``[columns]`` every channel whose unit is an acceleration is read as ``acc_<name>``;
+    with it, the named ones and those that keep the contract. Moments are times where there are no
+    others and no rate. Two channels that would be one column are refused as ``columns``, a name
+    that contradicts the unit of its channel as ``unit``.
+    """
+    named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
+    if len(named) > constants.MOST_COLUMNS:
+        found = f"{len(named)} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+    # Each group of channels may have times of its own: those of the chosen rate are read.
+    counts = Counter(
+        own
+        for column, k in named
+        if (own := channels[k].rate) is not None and role_of(column) != "time"
+    )
+    rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
+    named = [*named, *_moments(channels, named, rate, columns)]
+    alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
+    n_late = _aligned([channels[k] for k in alike], rate)
+    samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
+    kept: dict[str, int] = {}
+    refused: dict[str, Refusal] = {}
+    for column, k in named:
+        own = channels[k].rate
+        if k in samples:
+            if column in kept and (role_of(column) != "time" or own is None):
+                both = listed([channels[kept[column]].name, channels[k].name])
+                detail = f"{both} would both be read as {column}; rename them or map one of them"
+                raise Unusable("columns", detail)
+            kept.setdefault(column, k)
+        elif role_of(column) != "time":
+            detail = f"sampled at {own or rate:.6g} Hz, the log at {rate:.6g} Hz; "
+            if k in alike:
+                others = min(channels[one].start or 0.0 for one in samples)
+                late, common = (round(s or 0.0, 6) for s in (channels[k].start, others))
+                detail = f"starts at {late:.12g} s, the others at {common:.12g} s; "
+            detail += "keep channels of one rate and start in one log"
+            refused[column] = Refusal("", "time", detail, channel=column)
+    # 999.9999999999999 Hz is an artefact of the division.
+    metadata = {} if rate is None else {"sample_rate_hz": f"{rate:.10g}"}
+    present = tuple(f"{c.name} [{c.unit}]" if c.unit else c.name for c in channels)
+    first = min((samples[k] for k in kept.values()), default=0)
+    delays = {column: n for column, k in kept.items() if (n := samples[k] - first)}
+    for column, n in delays.items():
+        since = f"{n} samples ({n / (rate or 1.0):.6g} s)"
+        detail = f"starts {since} after others; all are used where they have samples"
+        refused[column] = Refusal("", "gaps", detail, channel=column)
+    return kept, Content({}, metadata, present, tuple(refused.values()), late=delays)
+
+
+def _moments(
+    channels: Sequence[Described],
+    named: Sequence[tuple[str, int]],
+    rate: float | None,
+    columns: ColumnMap,
+) -> list[tuple[str, int]]:
+    """Return the channel of moments as a column of times, where nothing else states the rate."""
+    found = [(channel.name, k) for k, channel in enumerate(channels) if channel.moments]
+    timed = columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
+    return [("time_s", found[0][1])] if len(found) == 1 and rate is None and not timed else []
+
+
+def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | None]:
+    """Return by how many samples each channel starts after that to which most others fit.
+
+    None for a channel that is a fraction of a sample off, or so far that less than
+    `constants.LEAST_COMMON` of its record would be left.
+    """
+    starts = [0.0 if channel.start is None else channel.start for channel in channels]
+    fits: list[list[int | None]] = []
+    for start in dict.fromkeys(starts):
+        offsets = [0.0 if c.start is None else (c.start - start) * (rate or 0.0) for c in channels]
+        found: list[int | None] = [None] * len(channels)
+        low = high = 0
+        for k in sorted(range(len(channels)), key=lambda k: abs(offsets[k])):
+            n, size = round(offsets[k]), channels[k].size
+            span = max(high, n) - min(low, n)
+            is_exact = abs(offsets[k] - n) <= constants.START_TOLERANCE
+            is_exact &= rate is not None or starts[k] == start
+            if is_exact and (size < 1 or span <= (1 - constants.LEAST_COMMON) * size):
+                found[k], low, high = n, min(low, n), max(high, n)
+        fits.append(found)
+    # Most channels start at its start; then, most are aligned to it.
+    return max(fits, key=lambda fit: (fit.count(0), -fit.count(None)), default=[])
+
+
+def _agree(one: float, other: float) -> bool:
+    return abs(one / other - 1) <= constants.AGREEMENT
+
+
+def rate_of(interval: object) -> float | None:
+    """Convert an interval in s to a sample rate in Hz; None for an impossible one."""
+    if not isinstance(interval, int | float) or not 1e-12 < interval < 1e9:
+        return None
+    return 1 / float(interval)
+
+
+def _column(channel: Described, columns: ColumnMap) -> str | None:
+    """Name a channel as a column of the log; None if it is not to be read."""
+    if channel.name in columns.columns.values():
+        return channel.name
+    if role_of(channel.name) is None and columns.target(channel.name) is not None:
+        return channel.name
+    if role_of(channel.name) is not None:
+        column = _with_unit(channel, columns)
+    else:
+        time = unit_key(channel.unit, "time")
+        if time and channel.rate is None and _TIME.match(channel.name):
+            return f"time_{time}" if columns.target(f"time_{time}") is not None else None
+        unit = unit_key(channel.unit, "acceleration")
+        if columns.columns or (unit is None and not channel.acceleration):
+            return None
+        column = "acc_" + re.sub(r"\W+", "_", channel.name).strip("_")
+        if unit is not None and column not in columns.units:
+            column = f"{column}_{unit}"
+    return column if columns.target(column) is not None else None
+
+
+def _with_unit(channel: Described, columns: ColumnMap) -> str:
+    """Complete a name of the contract by the unit of its channel; the two must agree."""
+    unit = unit_key(channel.unit)
+    if unit is None or channel.name in columns.units:
+        return channel.name
+    try:
+        own = parse_column(channel.name)
+    except Unusable:
+        return f"{channel.name}_{unit}"
+    if parse_column(own.name, unit).factor != own.factor:
+        detail = f"channel {channel.name!r} has the unit {channel.unit!r}; they must agree"
+        raise Unusable("unit", detail)
+    return channel.name
+
+
+# End of the note of what was taken for what.
+SINCE_EPOCH = "since an epoch"
+# Least magnitude of time stamps that count ticks since an epoch, ticks of a second, and that epoch
+# as Unix time in s; the last time in s, of the year 2286, that is read in the unit of its column;
+# and Unix times from 2001 to 2039 (those of LabVIEW, since 1904, are later).
+_TICKS = (
+    *((1e18, 1e9, "ns", 0), (1e16, 1e7, "100 ns", -11644473600)),
+    *((1e15, 1e6, "µs", 0), (1e12, 1e3, "ms", 0)),
+)
+_LATEST, _UNIX_TIMES = 1e10, (1e9, 2.2e9)
+# Days since 1900 from 1954 to 2173, which spreadsheets write, and their largest step: in s it would
+# be a sample rate of 1 MHz.
+_DAYS, _DAY_STEP = (2e4, 1e5), 1e-6
+
+
+class SinceFirst:
+    """Conversion of the moments of a column to times since the first, block by block.
+
+    They are in the unit of the column; ``first`` is the earliest moment of the first block.
+    """
+
+    def __init__(self, name: str, columns: ColumnMap) -> None:
+        self._unit = columns.signal(columns.target(name) or "").factor
+        self.first: np.datetime64 | None = None
+
+    def __call__(self, moments: np.ndarray) -> FloatArray:
+        """Return the times of moments, ``(n,)`` each, NaN where there is none."""
+        moments = moments.astype("datetime64[ns]")
+        there = moments[~np.isnat(moments)]
+        if self.first is None and there.size:
+            self.first = there.min()
+        if self.first is None:
+            return np.full(moments.shape, np.nan)
+        return (moments - self.first) / np.timedelta64(1, "ns") * (1e-9 / self._unit)
+
+
+def parse_moments(text: Any) -> np.ndarray:
+    """Read a series of text as moments, ``(n,)``; what is none is no time."""
+    import pandas as pd
+
+    day_first = bool(text.astype(str).str.match(r"\d{1,2}\.").any())
+    text = text.astype(str).str.replace(",", ".") if text.dtype == object else text
+    found = pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
+    moments: np.ndarray = found.dt.tz_localize(None).to_numpy("datetime64[ns]")
+    return moments
+
+
+def without_epoch(content: Content, columns: ColumnMap) -> Content:
+    """Convert ticks or days since an epoch in columns of times to times since the first.
+
+    Other times stay as they are.
+    """
+    for name, samples in content.columns.items():
+        if columns.is_time(name) and samples.size:
+            with suppress(Unusable):  # a unit that is not stated is refused with the others
+                unit = columns.signal(columns.target(name) or "").factor
+                content.columns[name], guessed, moment = _since_first(samples, unit)
+                metadata, guessed = moment | content.metadata, (*content.guessed, *guessed)
+                content = replace(content, metadata=metadata, guessed=guessed)
+    return content
+
+
+def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
+    """Convert ticks or days since an epoch to times since the first, in a unit in s.
+
+    Other times stay as they are. Return what was taken for what, and the moment of the first ticks.
+    """
+    first = next((block for _, block in blocks(time)), np.zeros(1))
+    start, step = float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
+    ticks = (one[1:] for one in _TICKS if abs(start) >= one[0] and abs(start) * unit > _LATEST)
+    if _DAYS[0] <= start < _DAYS[1] and step < _DAY_STEP:
+        scale, what, epoch = 1 / 86400, "days", None
+    elif _UNIX_TIMES[0] <= start * unit < _UNIX_TIMES[1]:
+        scale, what, epoch = 1 / unit, "", 0
+    else:
+        scale, what, epoch = next(ticks, (0.0, "", None))
+    if not scale:
+        return time, (), {}
+    spool = Spool()
+    for _, block in blocks(time):
+        spool.append((block - start) / (scale * unit))
+    guessed = (f"times in {what} {SINCE_EPOCH}",) if what else ()
+    if epoch is None:
+        return spool.samples(), guessed, {}
+    moment = moment_after(constants.FIRST_MOMENT, start / scale + epoch)
+    return spool.samples(), guessed, {"recorded_at": moment}

@@ -20,9 +20,18 @@ import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
-from lmshealth.io.column_map import ColumnMap, Segments, role_of
-from lmshealth.io.formats.channels import SinceFirst, choose, parse_moments
-from lmshealth.io.formats.content import GZIP, Content, Format, check_size, describe, not_numeric
+from lmshealth.io.column_map import ColumnMap, Segments
+from lmshealth.io.formats.content import (
+    GZIP,
+    Content,
+    Format,
+    SinceFirst,
+    check_size,
+    choose,
+    describe,
+    not_numeric,
+    parse_moments,
+)
 from lmshealth.io.formats.dialect import (
     Dialect,
     fields_of,
@@ -200,8 +209,7 @@ def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
     chosen, content = choose(dialect.channels, columns)
     metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
     if chosen:
-        times = {c: columns.signal(target).factor for c in chosen
-                 if role_of(target := columns.target(c) or "") == "time"}  # fmt: skip
+        times = {name: SinceFirst(name, columns) for name in chosen if columns.is_time(name)}
         samples = _numbers(text, chosen, dialect, times)
         guessed += [text.trailer] if text.trailer else []
     elif not (dialect.has_rows or columns.csv.delimiter) and len(lines) > dialect.start:
@@ -286,11 +294,11 @@ def _is_old_pandas() -> bool:
 
 
 def _numbers(
-    text: Text, places: dict[str, int], dialect: Dialect, times: Mapping[str, float]
+    text: Text, places: dict[str, int], dialect: Dialect, times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
 
-    Moments are read in the columns of times only, since the first of them, in their unit in s.
+    Moments are read in the columns of times only, since the first of them.
     Empty lines are left out where time stamps place the rows, and at the end.
     """
     import pandas as pd
@@ -337,11 +345,10 @@ def _numbers(
 
 
 def _spooled(
-    read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, float]
+    read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
     """Read the rows block by block."""
     n_rows = n_blank = 0
-    since = {name: SinceFirst(unit) for name, unit in times.items()}
     taken = {name: Spool() for name in places}
     with read() as tables:
         for table in tables:
@@ -359,7 +366,7 @@ def _spooled(
                 is_number = values.dtype.kind in "fiu"
                 if not is_number and name not in times:
                     raise not_numeric(name, _first_text(values.tolist(), n_rows))
-                numbers = values.to_numpy() if is_number else since[name](parse_moments(values))
+                numbers = values.to_numpy() if is_number else times[name](parse_moments(values))
                 if n_used:
                     taken[name].append(np.full(n_blank, np.nan))
                     taken[name].append(numbers[:n_used])

@@ -27,8 +27,8 @@ from lmshealth.io.column_map import (
     load_layouts,
     unit_key,
 )
-from lmshealth.io.formats.channels import Described, rate_of
-from lmshealth.io.metadata import moment_after
+from lmshealth.io.formats.content import Described, rate_of
+from lmshealth.io.log import moment_after
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Delimiters in the order in which equal candidates are preferred; a blank is any run of them.

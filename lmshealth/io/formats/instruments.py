@@ -13,8 +13,7 @@ import numpy as np
 
 from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.channels import Described, choose
-from lmshealth.io.formats.content import Content, Format, check_size
+from lmshealth.io.formats.content import Content, Described, Format, check_size, choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 _RTX, _RTX_DATA, _RTX_END = b"HEADER::", b"Data:\r\n", b"EOF::"

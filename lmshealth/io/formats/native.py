@@ -26,19 +26,21 @@ import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
-from lmshealth.io.column_map import ColumnMap, role_of
-from lmshealth.io.covariates import metadata_keys
-from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
+from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
+    Described,
     Format,
+    SinceFirst,
     check_memory,
     check_size,
+    choose,
     library,
     not_numeric,
+    rate_of,
     wanted,
 )
-from lmshealth.io.metadata import as_text
+from lmshealth.io.log import as_text, metadata_keys
 from lmshealth.io.refusal import Unusable, corrupt, listed, repeated
 
 _HDF5 = b"\x89HDF\r\n\x1a\n"
@@ -178,9 +180,8 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         times: dict[str, SinceFirst] = {}
         for name in chosen:
             kind: Any = schema.field(name).type
-            target = columns.target(name) or ""
-            if pa.types.is_timestamp(kind) and role_of(target) == "time":
-                times[name] = SinceFirst(columns.signal(target).factor)
+            if pa.types.is_timestamp(kind) and columns.is_time(name):
+                times[name] = SinceFirst(name, columns)
             elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 raise not_numeric(name, f"values of type {kind}")
         check_size(8 * n_rows * len(chosen), path.stat().st_size)

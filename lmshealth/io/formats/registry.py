@@ -16,8 +16,7 @@ from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth.io import constants
 from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.channels import without_epoch
-from lmshealth.io.formats.content import Content, Format, describe, gzipped, load_by
+from lmshealth.io.formats.content import Content, Format, describe, gzipped, load_by, without_epoch
 from lmshealth.io.formats.csv import CSV
 from lmshealth.io.formats.instruments import RTX, TRACE
 from lmshealth.io.formats.isolation import read_isolated

@@ -17,18 +17,20 @@ import numpy as np
 
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples, Spool
-from lmshealth.io.column_map import ColumnMap, role_of
-from lmshealth.io.covariates import metadata_keys
-from lmshealth.io.formats.channels import Described, SinceFirst, choose, rate_of
+from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
+    Described,
     Format,
+    SinceFirst,
     check_memory,
     check_size,
+    choose,
     library,
     not_numeric,
+    rate_of,
 )
-from lmshealth.io.metadata import as_text
+from lmshealth.io.log import as_text, metadata_keys
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _MAGIC = b"TDSm"
@@ -73,7 +75,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         wanted = {name: channels[k] for name, k in chosen.items()}
         times = _times(wanted, columns)
         read = _read(file, wanted, times, path.stat().st_size)
-        is_timed = any(role_of(columns.target(name) or "") == "time" for name in read)
+        is_timed = any(map(columns.is_time, read))
         stamps = None if is_timed else _stamps([parts[c.path] for c in wanted.values()])
         if stamps is not None and content.late:
             raise Unusable("time", _UNLIKE)
@@ -251,9 +253,8 @@ def _times(wanted: dict[str, Any], columns: ColumnMap) -> dict[str, SinceFirst]:
     """Return the conversion of the columns of moments; all others must be numbers."""
     found: dict[str, SinceFirst] = {}
     for name, channel in wanted.items():
-        target = columns.target(name) or ""
-        if channel.dtype.kind == "M" and role_of(target) == "time":
-            found[name] = SinceFirst(columns.signal(target).factor)
+        if channel.dtype.kind == "M" and columns.is_time(name):
+            found[name] = SinceFirst(name, columns)
         elif channel.dtype.kind not in "fiu":
             raise not_numeric(name, f"values of type {channel.dtype}")
     return found

@@ -17,8 +17,16 @@ import numpy as np
 from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.buffers import Samples, as_samples, blocks
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.channels import Described, choose, rate_of
-from lmshealth.io.formats.content import Content, Format, check_memory, library, not_numeric
+from lmshealth.io.formats.content import (
+    Content,
+    Described,
+    Format,
+    check_memory,
+    choose,
+    library,
+    not_numeric,
+    rate_of,
+)
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 _START = re.compile(rb"\s*-1[ \t]*\r?\n[ \t]*\d+")

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, ReadOnly
-from lmshealth._private.names import fact
+from lmshealth._private.tables import fact
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.scenarios import Scenario, list_scenarios

@@ -11,7 +11,7 @@ from scipy.special import chdtrc, softmax
 from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import FloatArray, freeze
-from lmshealth._private.seeds import stream
+from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData

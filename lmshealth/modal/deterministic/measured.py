@@ -21,8 +21,7 @@ from lmshealth.io.formats.csv import CSV
 from lmshealth.io.formats.instruments import TRACE
 from lmshealth.io.formats.registry import confirm, format_name, load
 from lmshealth.io.formats.uff import UFF, Function, load_functions
-from lmshealth.io.log import SI_UNITS, Metadata
-from lmshealth.io.metadata import parse_metadata
+from lmshealth.io.log import SI_UNITS, Metadata, parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, corrupt, listed, shown, visible
 from lmshealth.modal import constants

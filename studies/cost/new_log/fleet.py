@@ -25,7 +25,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from lmshealth import load_stage
-from lmshealth._private.seeds import seed_of
+from lmshealth._private.serialize import seed_of
 from lmshealth.batch.assess import Machine
 from lmshealth.batch.store import Store, unpack_or_none
 from lmshealth.life.prognosis import prognose

@@ -19,8 +19,7 @@ import numpy as np
 from lmshealth._private.serialize import fingerprint, pack
 from lmshealth.batch import run as running
 from lmshealth.batch.assess import Machine, assess_all
-from lmshealth.batch.cache import Resources
-from lmshealth.batch.store import Identified, Store, unpack_or_none
+from lmshealth.batch.store import Identified, Resources, Store, unpack_or_none
 from lmshealth.batch.workers import Progress, processes
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis

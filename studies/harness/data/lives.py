@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from lmshealth import identify, read_log
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
-from lmshealth.signal.following_error import loop_error
+from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import History, Series, Step
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes

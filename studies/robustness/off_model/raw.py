@@ -33,7 +33,7 @@ from lmshealth.calibration.ranks import share_row
 from lmshealth.io.constants import LAST_MOMENT
 from lmshealth.io.manifest import find_logs, read_manifest
 from lmshealth.life.verdict import degraded_below, verdict_of
-from lmshealth.signal.following_error import loop_error
+from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage
 from models.dynamics.plant import GUIDE_MODES, closed_loop_modes
 from models.lives.simulation import Plan, simulate_life

@@ -13,7 +13,7 @@ import pytest
 from lmshealth._private.toml import decode
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.channels import SinceFirst
+from lmshealth.io.formats.content import SinceFirst
 from lmshealth.io.reading import read_log
 from lmshealth.stage.proposal import propose
 
@@ -55,7 +55,7 @@ def test_ticks_of_hdf5(tmp_path: Path, name: str, ticks: str) -> None:
 
 def test_moments_that_are_missing() -> None:
     """What is no moment has no time; blocks without any wait for the first."""
-    since = SinceFirst(1e-3)
+    since = SinceFirst("time_ms", ColumnMap())
     assert np.isnan(since(np.array(["NaT", "NaT"], "M8[us]"))).all()
     read = since(np.array([STAMPS[1], "NaT", STAMPS[0]], "M8[us]"))
     np.testing.assert_allclose(read, [2.5, np.nan, 0.0])

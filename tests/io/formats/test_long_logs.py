@@ -9,8 +9,7 @@ from lmshealth.io import buffers as spool
 from lmshealth.io.buffers import Stored
 from lmshealth.io.reading import read_log
 from lmshealth.signal import segments
-from lmshealth.signal.acceleration_levels import choose_bands, read_magnitudes
-from lmshealth.signal.following_error import read_error
+from lmshealth.signal.readings import choose_bands, read_error, read_magnitudes
 from lmshealth.signal.segments import find_phases
 
 RATE = 1000.0

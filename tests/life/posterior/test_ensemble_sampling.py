@@ -10,7 +10,7 @@ from emcee.autocorr import integrated_time
 from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.seeds import stream
+from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior import ensemble_sampling as sampling

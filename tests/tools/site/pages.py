@@ -48,7 +48,7 @@ NAV = {
         "Changelog": "CHANGELOG",
     },
     "Explanation": {
-        "Checks of samples": "lmshealth/io/checks/README",
+        "Checks of samples": "lmshealth/io/CHECKS",
         "Signals": "lmshealth/signal/README",
         "Modes": "lmshealth/modal/README",
         "Ambient modes": "lmshealth/modal/ambient/README",

@@ -1,4 +1,7 @@
-"""Acceleration levels of bands, and their growth with velocity (README.md, "Levels")."""
+"""Direct readings of a record: its harmonics, the following error, levels of accelerations.
+
+README.md, "Harmonics", "Following error" and "Levels".
+"""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,19 +9,191 @@ from itertools import pairwise
 from typing import Literal
 
 import numpy as np
+from scipy import fft
 
+from lmshealth._private.arrays import FloatArray, ReadOnly, freeze
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
-from lmshealth.signal.harmonics import decompose
 from lmshealth.signal.segments import (
     Part,
     Segment,
+    find_segments,
     nominal_velocity,
     select_channels,
     select_segments,
 )
 from lmshealth.stage.description import Stage
+
+Indices = np.ndarray[tuple[int], np.dtype[np.intp]]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Harmonics:
+    """A record as its mean and a sum of cosines, A cos(2πft + φ) with t from its first sample.
+
+    Frequencies in Hz, ascending from 1 / duration (s), amplitudes in the record's unit and phases
+    in rad have the shape ``(n_harmonics,)``; `size` is the number of samples.
+    """
+
+    mean: float
+    frequency: FloatArray
+    amplitude: FloatArray
+    phase: FloatArray
+    duration: float
+    size: int
+
+    def __post_init__(self) -> None:
+        freeze(self, ("amplitude phase", *self.frequency.shape))
+
+    @property
+    def power(self) -> FloatArray:
+        """Mean square of each harmonic; their sum is the variance (Parseval)."""
+        power = self.amplitude**2 / 2
+        if self.size % 2 == 0:
+            # At half the sample rate a cosine of phase 0 or π is ± A at every sample.
+            power[-1] *= 2
+        return power
+
+    def strongest(self, count: int) -> Indices:
+        """Return the indices of the strongest harmonics, at most ``count``, strongest first."""
+        return np.argsort(-self.amplitude, kind="stable")[:count]
+
+    def between(self, low: float, high: float) -> slice:
+        """Return the harmonics strictly between two frequencies in Hz."""
+        first = np.searchsorted(self.frequency, low, side="right")
+        return slice(int(first), int(np.searchsorted(self.frequency, high)))
+
+    def span(self, kept: Indices) -> tuple[float, float]:
+        """Return lowest and highest frequency in Hz of some harmonics, NaN without any."""
+        own = self.frequency[kept]
+        return (float(own.min()), float(own.max())) if own.size else (float("nan"), float("nan"))
+
+    def share(self, kept: Indices) -> float:
+        """Return the share of the variance in some harmonics."""
+        power = self.power
+        return float(power[kept].sum() / power.sum())
+
+
+def decompose(values: FloatArray, sample_rate: float) -> Harmonics:
+    """Decompose a gap-free record, at least two samples ``(n_samples,)``, into its harmonics."""
+    n = values.size
+    mean = float(values.mean())
+    transform = fft.rfft(values - mean)[1:]
+    amplitude: FloatArray = np.abs(transform) * (2 / n)
+    if n % 2 == 0:
+        amplitude[-1] /= 2
+    return Harmonics(
+        mean=mean,
+        frequency=np.arange(1, n // 2 + 1, dtype=np.float64) * (sample_rate / n),
+        amplitude=amplitude,
+        phase=np.angle(transform),
+        duration=n / sample_rate,
+        size=n,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FollowingError(ReadOnly):
+    """Statistics and harmonics of one following-error channel of a log."""
+
+    channel: str
+    velocity: float  # set velocity in m/s; NaN where unknown or where the log has several
+    # duration, lowest, highest, std, mean: total duration in s, and statistics of all samples
+    # in m.
+    duration: float
+    lowest: float
+    highest: float
+    std: float
+    mean: float
+    harmonics: Harmonics  # of the longest gap-free segment, at most of a minute at 20 kHz
+    kept: Indices  # indices of the strongest harmonics, strongest first, shape ``(n_kept,)``
+    floor: float  # amplitude in m above which a harmonic is no noise
+
+    @property
+    def above(self) -> Indices:
+        """Indices of the kept harmonics above the floor, strongest first."""
+        return self.kept[self.harmonics.amplitude[self.kept] > self.floor]
+
+    @property
+    def max_magnitude(self) -> float:
+        """Amplitude of the strongest harmonic in m."""
+        return float(self.harmonics.amplitude[self.kept[0]])
+
+
+def read_error(
+    log: Log,
+    *,
+    count: int = constants.N_HARMONICS,
+    floor: float = constants.ENCODER_FLOOR,
+    part: Part = "record",
+) -> tuple[FollowingError, ...]:
+    """Analyse the following error of a log, one reading per displacement channel [Piscalov2021].
+
+    The `count` strongest harmonics are kept; those up to the floor in m are noise. `part` is a
+    motion phase, see `select_segments`. `BadLog`: ``too-short`` where the longest segment has fewer
+    than ``count`` harmonics, or as `select_channels` and `select_segments` do.
+    """
+    channels = select_channels(log, "displacement")
+    segments = select_segments(log, part)
+    longest = max(segments, key=lambda segment: segment.stop - segment.start)
+    n, needed = longest.stop - longest.start, 2 * count + 1
+    if n < needed:
+        found = f"the longest segment has {n / log.sample_rate:.3g} s"
+        needs = f"{count} harmonics need {needed / log.sample_rate:.3g} s"
+        raise BadLog(log.name, "too-short", f"{found}; {needs}: record longer or lower --count")
+    velocity = nominal_velocity(log)
+    duration = sum(s.stop - s.start for s in segments) / log.sample_rate
+    readings = []
+    for channel in channels:
+        harmonics = decompose(channel.values[longest.start : longest.stop], log.sample_rate)
+        kept, statistics = harmonics.strongest(count), _statistics(channel, segments)
+        readings.append(
+            FollowingError(channel.name, velocity, duration, *statistics, harmonics, kept, floor)
+        )
+    return tuple(readings)
+
+
+def loop_error(log: Log) -> float | None:
+    """Measure the RMS following error in m from 1 to 40 Hz, which depends on the servo tuning.
+
+    Segments of constant velocity of two seconds or more are detrended and weighted by duration,
+    channels equally. Disturbances depend on velocity: only logs of one velocity are comparable.
+    None without a displacement channel, such a segment, or a sample rate above 80 Hz.
+    """
+    low, high = constants.LOOP_BAND
+    channels = [channel for channel in log.channels if channel.kind == "displacement"]
+    segments = find_segments(log, constants.LOOP_PERIODS / low)
+    if not channels or not segments or log.sample_rate <= 2 * high:
+        return None
+    squares = [
+        [_mean_square(c.values[s.start : s.stop], log.sample_rate) for s in segments]
+        for c in channels
+    ]
+    mean = [np.average(own, weights=[s.stop - s.start for s in segments]) for own in squares]
+    return float(np.sqrt(np.mean(mean)))
+
+
+def _mean_square(values: FloatArray, sample_rate: float) -> float:
+    """Return the mean square of a segment in the band of the loop."""
+    from scipy.signal import detrend, periodogram  # late: it imports scipy.stats, half a second
+
+    # The window prevents leakage of drift below the band and of lines above it.
+    frequency, density = periodogram(values, sample_rate, "hann", detrend=detrend)
+    low, high = constants.LOOP_BAND
+    inside = (frequency >= low) & (frequency <= high)
+    return float(np.sum(density[inside]) * sample_rate / values.size)
+
+
+def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:
+    """Return minimum, maximum, standard deviation and mean of all samples."""
+    parts = (channel.values[s.start : s.stop] for s in segments)
+    moments = [(x.size, x.min(), x.max(), x.mean(), x.var()) for x in parts]
+    size, low, high, mean, var = np.array(moments).T
+    total = float(np.average(mean, weights=size))
+    scatter = float(np.average(var + (mean - total) ** 2, weights=size))
+    return float(low.min()), float(high.max()), float(np.sqrt(scatter)), total
+
 
 BandKind = Literal["mode", "grid", "health", "watch"]
 

@@ -1,4 +1,4 @@
-"""Consistency: what a log states more than once is compared (README.md, "Consistency").
+"""Consistency: what a log states more than once is compared (CHECKS.md, "Consistency").
 
 The sample rate with the set position and the set velocity; the set position with itself, which
 jumps where samples were dropped; the samples with themselves, where a buffer was recorded twice.
@@ -29,14 +29,6 @@ _NEEDED = "record again, or map no set position if it is sampled by another cloc
 _NONE = np.empty(0, dtype=np.int64)
 
 
-class Motion(NamedTuple):
-    """What a log states about its motion: columns in SI units, each ``(n_samples,)``."""
-
-    position: Samples | None  # set position in m
-    velocity: Samples | None  # set velocity in m/s
-    nominal: float | None  # speed of the metadata in m/s
-
-
 class Findings(NamedTuple):
     """Samples before which some were dropped, and half-open ranges that repeat others, ``(n, 2)``.
 
@@ -61,14 +53,21 @@ class _Blocks(NamedTuple):
 
 
 def compare(
-    motion: Motion, measured: Sequence[Samples], sample_rate: float, breaks: IntArray
+    position: Samples | None,
+    velocity: Samples | None,
+    nominal: float | None,
+    measured: Sequence[Samples],
+    sample_rate: float,
+    breaks: IntArray,
 ) -> Findings:
     """Compare what a log states more than once.
 
     Parameters
     ----------
-    motion : Motion
-        Set point and nominal speed.
+    position, velocity : Samples, optional
+        Set position in m and set velocity in m/s, ``(n_samples,)`` each.
+    nominal : float, optional
+        Speed of the metadata in m/s.
     measured : sequence of Samples
         Usable channels, ``(n_samples,)`` each.
     sample_rate : float
@@ -92,42 +91,41 @@ def compare(
             raise Unusable("repeated", f"{found}; export the record again, each buffer once")
         notes.append(("repeated", "time_s", f"{found}: left out"))
     dropped = _NONE
-    if motion.position is not None:
-        own = _displacements(motion.position, motion.velocity, sample_rate)
+    if position is not None:
+        own = _displacements(position, velocity, sample_rate)
         if own.step > 0:
+            dropped, notes_of_rate = _moved(position, velocity, nominal, own, sample_rate)
             known = np.concatenate([breaks, copies.ravel()])
-            dropped, more = _moved(motion, own, sample_rate, known)
-            notes += more
+            dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
+            notes += [*notes_of_rate, *_dropped_notes(dropped, own)]
     return Findings(dropped, copies, tuple(notes))
 
 
 def _moved(
-    motion: Motion, own: _Blocks, rate: float, known: IntArray
+    position: Samples,
+    velocity: Samples | None,
+    nominal: float | None,
+    own: _Blocks,
+    rate: float,
 ) -> tuple[IntArray, list[tuple[str, str, str]]]:
-    """Compare a set position with itself, and the sample rate with it; return jumps and notes.
-
-    Interruptions that are ``known``, before or after a sample, are no jumps.
-    """
-    position, velocity, nominal = motion
-    assert position is not None
+    """Compare a set position with itself, and the sample rate with it; return jumps and notes."""
     fine = own.usual >= constants.FINE_STEPS * own.step
     dropped = _isolated(position, own) if fine else _NONE
-    notes: list[tuple[str, str, str]] = []
     if velocity is not None:
         dropped, fit = _without_beat(own, dropped)
-        notes += [] if fit is None else _rate_notes(own, velocity, rate, fit)
-        dropped = dropped if fine else _jumps(position, own)
-    elif nominal:
-        notes += _speed_notes(own, abs(nominal), rate)
-    if known.size:
-        dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
+        notes = [] if fit is None else _rate_notes(own, velocity, rate, fit)
+        return dropped if fine else _jumps(position, own), [*notes]
+    return dropped, [*_speed_notes(own, abs(nominal), rate)] if nominal else []
+
+
+def _dropped_notes(dropped: IntArray, own: _Blocks) -> Iterator[tuple[str, str, str]]:
+    """Count the jumps of a set position; too many are refused."""
     if dropped.size:
         found = f"the set position jumps {dropped.size} times: samples were dropped there"
         # At rest they are not seen.
         if too_many(dropped.size, _LENGTH * int(np.count_nonzero(own.way))):
             raise Unusable("dropped", f"{found}; {_NEEDED}")
-        notes.append(("dropped", "reference_position", f"{found}, the record is cut"))
-    return dropped, notes
+        yield "dropped", "reference_position", f"{found}, the record is cut"
 
 
 def _displacements(position: Samples, velocity: Samples | None, rate: float) -> _Blocks:

@@ -10,7 +10,7 @@ import pytest
 from lmshealth.errors import BadLog
 from lmshealth.io import buffers, constants
 from lmshealth.io.buffers import as_samples
-from lmshealth.io.checks.consistency import Findings, Motion, compare
+from lmshealth.io.consistency import Findings, compare
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import Unusable
 from models.recordings.motion_profile import Profile
@@ -49,7 +49,7 @@ def found(
     """Compare a set point with a sample rate, beside one channel of noise."""
     size = 2000 if position is None else position.size
     at = np.array([*breaks], dtype=np.int64)
-    return compare(Motion(position, velocity, nominal), [noise(size)], rate, at)
+    return compare(position, velocity, nominal, [noise(size)], rate, at)
 
 
 def rounded(values: np.ndarray, step: float) -> np.ndarray:
@@ -214,12 +214,12 @@ def test_a_repeated_buffer_is_left_out(kind, instead):
         signals = signals.astype("f4").astype(float)
     elif kind == "counts":
         signals = rounded(signals, 0.02)
-    assert compare(Motion(None, None, None), list(signals), RATE, NO_BREAKS).repeated.size == 0
+    assert compare(None, None, None, list(signals), RATE, NO_BREAKS).repeated.size == 0
     first, length = 7000, 512
     again = signals[:, first : first + length]
     rest = signals[:, first + (2 if instead else 1) * length :]
     signals = np.concatenate([signals[:, : first + length], again, rest], axis=1)
-    seen = compare(Motion(None, None, None), list(signals), RATE, NO_BREAKS)
+    seen = compare(None, None, None, list(signals), RATE, NO_BREAKS)
     [(start, stop)] = seen.repeated.tolist()
     # Coarse samples may be equal beyond the ends.
     assert abs(start - first - length) < 4 and abs(stop - first - 2 * length) < 4
@@ -230,7 +230,7 @@ def test_one_channel_that_repeats_is_no_repeated_buffer():
     """All channels must repeat."""
     one, other = noise(20_000, 1), noise(20_000, 2)
     one[8000:8512] = one[7488:8000]
-    assert compare(Motion(None, None, None), [one, other], RATE, NO_BREAKS).repeated.size == 0
+    assert compare(None, None, None, [one, other], RATE, NO_BREAKS).repeated.size == 0
 
 
 @pytest.mark.parametrize(
@@ -246,14 +246,14 @@ def test_one_channel_that_repeats_is_no_repeated_buffer():
 )
 def test_computed_and_coarse_signals_are_no_repeated_buffers(values):
     """Periodic signals, held samples, few levels and slow signals repeat by themselves."""
-    assert compare(Motion(None, None, None), [values], RATE, NO_BREAKS).notes == ()
+    assert compare(None, None, None, [values], RATE, NO_BREAKS).notes == ()
 
 
 def test_a_record_of_buffers_that_repeat_is_refused():
     """A record half of which is a copy is no record."""
     twice = np.repeat(noise(20_000).reshape(-1, 500), 2, axis=0).ravel()
     with pytest.raises(Unusable, match="20000 samples repeat earlier ones"):
-        compare(Motion(None, None, None), [twice], RATE, NO_BREAKS)
+        compare(None, None, None, [twice], RATE, NO_BREAKS)
 
 
 def test_stored_samples_are_compared_alike(monkeypatch):
@@ -265,10 +265,10 @@ def test_stored_samples_are_compared_alike(monkeypatch):
     start = buffers.BLOCK - 100
     signal[start : start + 300] = signal[start - 300 : start]
     columns = [without(position, gone), without(velocity, gone), signal]
-    whole = compare(Motion(columns[0], columns[1], None), [signal], RATE, NO_BREAKS)
+    whole = compare(columns[0], columns[1], None, [signal], RATE, NO_BREAKS)
     monkeypatch.setattr(buffers, "MINUTE", 1000)
     stored = [as_samples(one) for one in columns]
-    parts = compare(Motion(stored[0], stored[1], None), stored[2:], RATE, NO_BREAKS)
+    parts = compare(stored[0], stored[1], None, stored[2:], RATE, NO_BREAKS)
     for one in (whole, parts):
         assert one.dropped.tolist() == [1000, buffers.BLOCK, 2 * buffers.BLOCK + 298]
         assert one.repeated.tolist() == [[start, start + 300]]

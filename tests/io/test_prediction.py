@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lmshealth.io.checks.prediction import filled, fit_prediction
+from lmshealth.io.channel_checks import filled, fit_prediction
 
 NONE = np.empty((0, 2), dtype=np.int64)
 NO_BREAK = np.empty(0, dtype=np.int64)

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lmshealth.io.checks.channel_checks import magnitudes, roughness
-from lmshealth.io.checks.sample_faults import (
+from lmshealth.io.channel_checks import (
     check_sign,
     coarse_levels,
     level_step,
+    magnitudes,
+    roughness,
     spikes,
     unwrapped,
 )

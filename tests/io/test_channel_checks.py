@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lmshealth.io.buffers import BLOCK
-from lmshealth.io.checks.channel_checks import check_signal, independent, missing_ranges
+from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
 from lmshealth.io.refusal import Unusable
 
 N = 40_000
