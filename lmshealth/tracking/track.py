@@ -5,7 +5,7 @@ Declared steps are in the model from the start; a detected step is added, and th
 are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import reduce
@@ -115,6 +115,8 @@ class Track(Result):
     widening: FloatArray
     # Of the published filter, at every epoch; None of a track that was not filtered here.
     nuisances: Nuisances | None = None
+    # Step that the last logs may show, by less evidence than an event needs; None without.
+    suspected: Step | None = None
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
@@ -268,6 +270,7 @@ def _published(state: TrackState) -> Track:
     undetected = _undetected(history)
     mean[undetected], std[undetected] = np.nan, np.nan
     innovations = np.array([epoch.innovations for epoch in epochs])
+    outliers, suspected = _outliers(history, epochs)
     events = sorted([*state.alarms, *_step_events(state)], key=lambda event: event.epoch)
     return Track(
         stage=history.stage,
@@ -285,7 +288,8 @@ def _published(state: TrackState) -> Track:
         effects=_effects(state),
         events=tuple(events),
         steps=space.steps,
-        outliers=tuple(_outliers(history, epochs)),
+        outliers=tuple(outliers),
+        suspected=suspected,
         nis=np.array([epoch.nis for epoch in epochs]),
         nis_dof=degrees_of_freedom(state.space, innovations),
         innovations=innovations,
@@ -295,13 +299,17 @@ def _published(state: TrackState) -> Track:
     )
 
 
-def _outliers(history: History, epochs: Sequence[Epoch]) -> Iterator[tuple[int, str]]:
-    """Yield the logs and modes that are outliers, except of modes that have changed.
+def _outliers(
+    history: History, epochs: Sequence[Epoch]
+) -> tuple[list[tuple[int, str]], Step | None]:
+    """List the logs and modes that are outliers, and return the step that the last ones may be.
 
-    Two or more last logs that deviate to the same side have something in common, even if it cannot
-    be told yet what: they are no outliers.
+    Two or more last logs in which a mode deviates to the same side have something in common, even
+    if it cannot be told yet what: they are no outliers.
     """
     n_series = len(history.series)
+    found: list[tuple[int, str]] = []
+    begun: list[int] = []  # first logs of what has changed
     for mode in history.modes:
         own = [*history.columns(mode), *(n_series + i for i in history.columns(mode))]
         sides: list[tuple[int, int, float]] = []  # log, and the row and side that deviates most
@@ -314,8 +322,11 @@ def _outliers(history: History, epochs: Sequence[Epoch]) -> Iterator[tuple[int, 
                 sides.append((k, -1, 0.0))
         runs = [list(run) for _, run in groupby(sides, key=itemgetter(1, 2))]
         if runs and len(runs[-1]) > 1:
-            runs.pop()
-        yield from ((k, mode) for run in runs for k, worst, _ in run if worst >= 0)
+            first, worst, _ = runs.pop()[0]
+            if worst >= 0:
+                begun.append(first)
+        found += [(k, mode) for run in runs for k, worst, _ in run if worst >= 0]
+    return found, Step.found("step", min(begun), len(epochs)) if begun else None
 
 
 def _undetected(history: History) -> BoolArray:
@@ -416,15 +427,19 @@ def _effects(state: TrackState) -> tuple[Effect, ...]:
 
 
 def accepted_estimates(history: History, track: Track) -> History:
-    """Return a history with the steps of its track and without its outliers."""
+    """Return a history with the steps of its track and without its outliers.
+
+    A suspected step is among them: a life without it competes with those that have it.
+    """
     ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
+    steps = track.steps if track.suspected is None else (*track.steps, track.suspected)
     r = len(history.series)
     for k, mode in track.outliers:
         own = history.columns(mode)
         ln_f[k, own] = ln_zeta[k, own] = np.nan
         both = [*own, *(r + i for i in own)]
         cov[k, both], cov[k][:, both] = np.nan, np.nan
-    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=track.steps)
+    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=steps)
 
 
 def outlier_refusals(history: History, track: Track) -> list[Refusal]:

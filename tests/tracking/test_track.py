@@ -20,7 +20,7 @@ from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filters import state_space
 from lmshealth.tracking.filters.change_detection import Event, loop_evidence
 from lmshealth.tracking.history import History, StepKind
-from lmshealth.tracking.track import Track, consistency, track
+from lmshealth.tracking.track import Track, accepted_estimates, consistency, track
 from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
@@ -470,12 +470,17 @@ def test_last_logs_that_deviate_alike_are_no_outliers(stage: Stage) -> None:
     """
     off = -0.02
     assert track(jumping({14: off}), stage).outliers == ((14, "roll"),)
-    found = track(jumping({14: off, 15: off}), stage)
+    history = jumping({14: off, 15: off})
+    found = track(history, stage)
     assert (found.outliers, found.events) == ((), ())
+    assert found.suspected is not None
+    assert found.suspected.first == 14
+    assert accepted_estimates(history, found).steps == (found.suspected,)
     two = (14, "roll"), (15, "roll")
     assert track(jumping({14: off, 15: -off}), stage).outliers == two
     back = track(jumping({14: off, 15: off, 16: 0.0, 17: 0.0}), stage)
     assert (back.outliers, back.events) == (two, ())
+    assert back.suspected is None
 
 
 def test_a_jump_of_one_mode_is_an_event_of_it_alone(stage: Stage) -> None:
