@@ -192,6 +192,7 @@ CHANGES: dict[str, tuple[Severity, str]] = {
     "inspection-overdue": ("caution", "`inspect_by` has passed"),
     "silent": ("caution", "no log for long"),
     "no-log-since-maintenance": ("note", "no log after the last work"),
+    "unconfirmed-jump": ("note", "the last log is far from those before it, and left out"),
     "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
     "recovered": ("note", "a verdict, a silence, an alarm or a late log has ended"),
 }
@@ -201,7 +202,7 @@ kind that is a code of `conditions` begins with that; ``recovered`` has what end
 # Conditions that begin once per baseline: their dates and probabilities move with each log. Others
 # begin anew after they have ended, which is a change too.
 _ONCE = ("limit-reached", "large-drift", "unreliable", "service-due")
-_ENDING = ("inspection-overdue", "no-log-since-maintenance")
+_ENDING = ("inspection-overdue", "no-log-since-maintenance", "unconfirmed-jump")
 
 UNKNOWN = "unknown"
 """Verdict on a machine that was sound at its last log, which is too old to rely on."""
@@ -281,6 +282,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
         ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
         ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
+        ("CHECK_FUNCTION", "unconfirmed-jump", "last-logs-left-out" in status.warnings),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
         ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
         ("CHECK_FUNCTION", "silent", status.silent or today > _last_day(status)),

@@ -50,6 +50,7 @@ _WORDS = (
     *(mark("limit reached"), mark("alarm"), mark("step"), mark("outside map"), mark("large drift")),
     *(mark("unreliable"), mark("loss"), mark("service due"), mark("no verdict"), mark("silent")),
     *(mark("no log since maintenance"), mark("inspection overdue"), mark("regreasing")),
+    mark("unconfirmed jump"),
     *(mark("mains"), mark("reset"), mark("and"), mark("worn"), mark("epochs, 90 %")),
     mark("each epoch by itself"),
 )

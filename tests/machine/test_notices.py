@@ -170,3 +170,5 @@ def test_last_logs_that_are_left_out_are_counted(
     # Before a service is planned by the logs that are left, the jump is confirmed or refuted.
     steps = [summarise(one, one.service()).step.kind for one in (good, bad)]
     assert steps[0] != steps[1] == "check-drift"
+    status = make_status(bad, summarise(bad, bad.service()))
+    assert "unconfirmed-jump" in status.conditions and status.device_health != "NORMAL"
