@@ -19,8 +19,8 @@ _FREEDOM = 5
 _N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
 # Rounds after which a density that integrates to too little is not adapted to any more.
 _HOPELESS = 4
-# Effective share of the draws at which the proposal is good enough for the last round; and effective
-# draws from which it is once another round changes the log evidence by no more than this.
+# Effective share of the draws at which the proposal is good enough for the last round; and
+# effective draws from which it is once another round changes the log evidence by no more than this.
 _GOOD_SHARE, _SETTLED, _SAME = 0.3, 20.0, 0.3
 # Draws of another attempt over those before: least and most, and the margin by which those that are
 # missing are exceeded.
