@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -22,6 +22,8 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+
+from lmshealth.calibration.ranks import holm
 
 _PROPERTY = "statistical claim"
 
@@ -43,23 +45,6 @@ class Part:
     trials: int
     claims: tuple[str, ...]
     control: int = 0
-
-
-def holm(
-    p: Sequence[float], level: float, of: int
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Hold p values together to one level; those of ``of`` claims that are missing reject nothing.
-
-    Returns
-    -------
-    (ndarray, ndarray)
-        The level that each is held to, and whether it is rejected.
-    """
-    order = np.argsort(p, kind="stable")
-    asked, rejected = np.empty(len(p)), np.empty(len(p), dtype=bool)
-    asked[order] = level / (of - np.arange(len(p)))
-    rejected[order] = np.logical_and.accumulate(np.asarray(p)[order] <= asked[order])
-    return asked, rejected
 
 
 def generator(seed: int, name: str) -> np.random.Generator:

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from tests.claims import Claims, Part, generator, holm
+from lmshealth.calibration.ranks import holm
+from tests.claims import Claims, Part, generator
 from tests.statistical import evidence
 from tests.statistical.sizes import LEVEL, TESTS
 

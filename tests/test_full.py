@@ -17,11 +17,14 @@ from pathlib import Path
 from studies.harness.study import Study
 
 
+FACTOR = 1
+
+
 def main() -> None:
     study = Study(__file__, __doc__)
     with Path("runs.txt").open("a") as file:
         print("{name}", file=file)
-    study.conclude({{"value": 1, "passed": {{"asked": {passed}}}}})
+    study.conclude({{"value": FACTOR, "passed": {{"asked": {passed}}}}})
 
 
 if __name__ == "__main__":
@@ -50,10 +53,9 @@ def runs(fake: Path) -> list[str]:
 
 @pytest.mark.slow
 def test_all_are_recorded_and_failures_are_named(
-    fake: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    fake: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """What fails stops no other; a second run does only that which has no fresh record."""
-    monkeypatch.setattr(full, "commit", lambda: provenance.commit().rstrip("+"))
     kept = fake.parent / "kept"
     failed = full.run_all(fake, ("group",), kept)
     assert failed == ["fakes.group.broken", "fakes.group.second.run"]
@@ -63,35 +65,51 @@ def test_all_are_recorded_and_failures_are_named(
     out = capsys.readouterr().out
     assert "fakes.group.first.run: done" in out
     assert "fakes.group.second.run: FAILED, see" in out
-    made = {}
-    for name in ("first", "second", "third"):
-        record = fake / "group" / name / "result.json"
-        made[name] = json.loads(record.read_text())["recorded"]
-        # As from a clean checkout, in which this test need not run.
-        text = record.read_text().replace(made[name]["commit"], full.commit())
-        record.write_text(text)
+    made = {
+        name: json.loads((fake / "group" / name / "result.json").read_text())["recorded"]
+        for name in ("first", "second", "third")
+    }
     assert made["first"]["failed"] == []
     assert made["second"]["failed"] == ["asked"]
     assert str(os.cpu_count()) in made["first"]["machine"]
     assert full.run_all(fake, ("group",), kept) == failed
-    again = ["second"] if full.commit() else ["first", "second", "third"]  # without git all run
-    assert runs(fake) == ["first", "second", "third", *again]
+    assert runs(fake) == ["first", "second", "third", "second"]
+    # Text of no effect on the code leaves a record fresh; another constant does not.
+    for name, old, new in (("first", "1\n\n", "1  # of no unit\n\n"), ("third", "= 1", "= 2")):
+        script = fake / "group" / name / "run.py"
+        script.write_text(script.read_text().replace(old, new, 1))
+    forget()
+    assert full.run_all(fake, ("group",), kept) == failed
+    assert runs(fake)[4:] == ["second", "third"]
+
+
+def forget() -> None:
+    """Forget what was known of all code."""
+    for known in (provenance._digest, provenance._tree):
+        known.cache_clear()
 
 
 def test_records_of_other_code_are_not_fresh(tmp_path: Path) -> None:
-    """Nor those of changed code, of failed checks, of earlier versions, or none."""
+    """Nor those of failed checks, of other programs that they start, of earlier versions."""
     script, record = tmp_path / "run.py", tmp_path / "result.json"
-    assert not full.is_fresh(script, "abc")
-    for made, now, fresh in (
-        ({"commit": "abc", "failed": []}, "abc", True),
-        ({"commit": "abc", "failed": []}, "def", False),
-        ({"commit": "abc+", "failed": []}, "abc+", False),
-        ({"commit": "abc", "failed": ["asked"]}, "abc", False),
-        ({"commit": "", "failed": []}, "", False),
-        ({}, "abc", False),
+    script.write_text("def main() -> None:\n    print(1)\n")
+    forget()
+    code, of_program = (provenance.code_of_script(script, also) for also in ((), ("lmshealth",)))
+    assert code != of_program
+    assert not full.is_fresh(script)
+    for made, fresh in (
+        ({"code": code, "also": [], "failed": []}, True),
+        ({"code": of_program, "also": ["lmshealth"], "failed": []}, True),
+        ({"code": of_program, "also": [], "failed": []}, False),
+        ({"code": code, "also": [], "failed": ["asked"]}, False),
+        ({"commit": "abc", "failed": []}, False),
     ):
         record.write_text(json.dumps({"recorded": made}))
-        assert full.is_fresh(script, now) == fresh
+        assert full.is_fresh(script) == fresh
+    script.write_text("def main() -> None:\n    print(2)\n")
+    record.write_text(json.dumps({"recorded": {"code": code, "also": [], "failed": []}}))
+    forget()
+    assert not full.is_fresh(script)
 
 
 def test_every_study_is_among_them(root: Path) -> None:
@@ -103,6 +121,8 @@ def test_every_study_is_among_them(root: Path) -> None:
         if "\ndef claims(" in path.read_text(encoding="utf-8")
     }
     assert claiming <= set(found)
+    # Their code is that of this function.
+    assert all("\ndef main(" in path.read_text(encoding="utf-8") for path in found)
     assert len(found) == len(set(found)) >= 40
 
 

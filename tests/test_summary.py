@@ -130,6 +130,7 @@ def test_shares_are_drawn(tmp_path: Path) -> None:
 def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A record has the run time, and that of trials that were done before an interruption."""
     monkeypatch.setattr("sys.argv", ["run.py"])
+    (tmp_path / "run.py").write_text("def main() -> None:\n    pass\n")
     study = Study(str(tmp_path / "run.py"), "Is it so?\n\nMore.")
     study.trials.kept_s = 200.0
     study.conclude({"passed": {"it is": True}})
@@ -141,6 +142,7 @@ def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_quick_form_records_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The quick form keeps and records nothing, and fails where a check fails."""
     monkeypatch.setattr("sys.argv", ["run.py", "--quick"])
+    (tmp_path / "run.py").write_text("def main() -> None:\n    pass\n")
     study = Study(str(tmp_path / "run.py"), "Is it so?")
     study.trials.once(abs, -1)
     with pytest.raises(SystemExit, match="it is"):

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Generator, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.linalg import LinAlgError
+from scipy.stats import binom
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.result import Result
@@ -17,7 +18,16 @@ from lmshealth._private.tables import spell
 from lmshealth.batch.workers import Progress, processes
 from lmshealth.calibration import constants
 from lmshealth.calibration.lives import KINDS, Kind, Life, Schedule, draw
-from lmshealth.calibration.ranks import N_DRAWS, Row, judge, judge_places, place, share_row, uniform
+from lmshealth.calibration.ranks import (
+    LEVEL,
+    N_DRAWS,
+    Row,
+    holm,
+    judge,
+    judge_places,
+    place,
+    share_row,
+)
 from lmshealth.errors import BadQuestion, NotConverged, NotEnoughData
 from lmshealth.life.health import health_of
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
@@ -34,6 +44,7 @@ from lmshealth.life.verdict import (
 from lmshealth.machine.service import decide, remaining_days
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
+from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import accepted_estimates, track
 
@@ -61,6 +72,7 @@ class LifeOutcome(msgspec.Struct, frozen=True):
     published: bool = False  # whether health of some parameter is
     degraded: tuple[str, ...] = ()  # words of the parameters that truly are
     losses: dict[str, float] = {}  # true, of the parameters that change, by word
+    still: bool = False  # whether the tracker's declared rate of false alarms holds for it
     alarm: int | None = None  # number of the log that raises the first alarm
     service: str = ""  # kind of the service date
     wait: float = np.inf  # days until it
@@ -79,8 +91,9 @@ class Coverage:
     share: float
     low: float  # low, high: 95 % Clopper-Pearson interval of the share
     high: float
-    # ``as stated``, ``too narrow`` or ``too wide``, if the 99.9 % interval of the share excludes
-    # the level.
+    p_value: float  # exact, two-sided, of the level
+    # ``as stated``, ``too narrow`` or ``too wide``: of lives `DRAWN` by Holm's rule, of one kind if
+    # the 99.9 % interval of the share excludes the level.
     verdict: str
     width: float  # median width of the intervals that end; of health in shares of the baseline
     n_ends: int  # intervals that end within the horizon
@@ -98,7 +111,8 @@ class Rate:
     low: float  # low, high: 95 % Clopper-Pearson interval of the share
     high: float
     at_most: float | None = None  # stated
-    exceeded: bool = False  # whether the 99.9 % interval of the share lies above it
+    p_value: float = np.nan  # exact, of no more than that
+    exceeded: bool = False  # whether Holm's rule rejects it
     median_log: float | None = None  # median number of the log at which it happens
 
 
@@ -115,7 +129,10 @@ class CalibrationCheck(Result):
     # Of lives `DRAWN`, by quantity: judgement of the ranks, see `judge` of `ranks`.
     ranks: dict[str, Row]
     controls: dict[str, Row]  # likewise, of intervals of wrong width, which must fail
-    passed: dict[str, bool]  # whether intervals, ranks and rates are as stated
+    # Exact p values of the checks of the verdict: of ranks and intervals of lives `DRAWN`, and of
+    # rates that are stated; and whether each passes Holm's rule at `constants.FALSE_VERDICT`.
+    p_values: dict[str, float]
+    passed: dict[str, bool]
 
     def title(self) -> str:
         """Return what was checked."""
@@ -139,8 +156,16 @@ class CalibrationCheck(Result):
 
     @property
     def blind(self) -> tuple[str, ...]:
-        """Controls that the check does not find wrong: it could not find such a fault."""
-        return tuple(name for name, row in self.controls.items() if uniform({name: row}))
+        """Controls that the check does not find wrong: it could not find such a fault.
+
+        Found is what Holm's rule rejects even if all else is as stated.
+        """
+        strictest = constants.FALSE_VERDICT / len(self.p_values)
+        return tuple(
+            name
+            for name, row in self.controls.items()
+            if min(one["p_value"] for one in (row, *row["coverage"])) > strictest
+        )
 
 
 def check_calibration(
@@ -265,6 +290,7 @@ def outcome_of(
     shown = {name: own for name, own in draws.items() if name in shown_quantities(stage)}
     return msgspec.structs.replace(
         base,
+        still=drawn.still,
         truth=true,
         places=ranks_of(true, draws, rng),
         quantiles={
@@ -392,13 +418,13 @@ def summarise(
         for name, row in judged_ranks([o.controls.get(f"{factor:g}", {}) for o in drawn]).items()
     }
     rates = [row for kind, own in groups.items() for row in _rates(kind, own, stage)]
-    passed = {f"{name}: ranks are uniform": row["inside_band"] for name, row in ranks.items()}
-    passed |= {
-        f"{one.quantity}: {one.level:.0%} intervals": one.verdict == "as stated"
-        for one in coverage
-        if one.kind == DRAWN
-    }
-    passed |= {f"{one.kind}: {one.what}": False for one in rates if one.exceeded}
+    p_values = {f"{name}: ranks are uniform": row["p_value"] for name, row in ranks.items()}
+    p_values |= {_check_of(one): one.p_value for one in coverage if one.kind == DRAWN}
+    p_values |= {_check_of(one): one.p_value for one in rates if one.at_most is not None}
+    _, rejected = holm(list(p_values.values()), constants.FALSE_VERDICT, len(p_values))
+    passed = dict(zip(p_values, (~rejected).tolist(), strict=True))
+    coverage = [replace(one, verdict=_verdict(one, passed.get(_check_of(one)))) for one in coverage]
+    rates = [replace(one, exceeded=not passed.get(_check_of(one), True)) for one in rates]
     return CalibrationCheck(
         stage=stage.name,
         schedule=schedule,
@@ -408,8 +434,24 @@ def summarise(
         rates=tuple(rates),
         ranks=ranks,
         controls=controls,
+        p_values=p_values,
         passed=passed,
     )
+
+
+def _check_of(one: Coverage | Rate) -> str:
+    """Name the check of a coverage or a rate."""
+    if isinstance(one, Rate):
+        return f"{one.kind}: {one.what}"
+    intervals = f"{one.quantity}: {one.level:.0%} intervals"
+    return intervals if one.kind == DRAWN else f"{one.kind}: {intervals}"
+
+
+def _verdict(one: Coverage, passed: bool | None) -> str:
+    """Return how intervals are, where the verdict has no such check by their own p value."""
+    if one.p_value > 1 - LEVEL if passed is None else passed:
+        return "as stated"
+    return "too narrow" if one.share < one.level else "too wide"
 
 
 def _coverage(
@@ -421,16 +463,12 @@ def _coverage(
         return None
     places = np.array([one.places[quantity] for one in own])
     row = judge_places(places, level)
-    shown = share_row(row["hits"], row["n"], 0.95)
-    verdict = "as stated"
-    if not row["holds"]:
-        verdict = "too narrow" if row["share"] < level else "too wide"
+    shown = share_row(row["hits"], row["n"], 0.95) | {"p_value": row["p_value"], "verdict": ""}
     ends = np.array([one.quantiles[quantity] for one in own])
     ends = ends[np.isfinite(ends).all(axis=1)]  # the same lives at all levels
     first = 1 if level == LEVELS[0] else 0
     width = float(np.median(ends[:, -1 - first] - ends[:, first])) if len(ends) else np.nan
-    shown |= {"verdict": verdict, "width": width, "n_ends": len(ends)}
-    return Coverage(kind, quantity, level, **shown)
+    return Coverage(kind, quantity, level, width=width, n_ends=len(ends), **shown)
 
 
 def _rates(kind: str, lives: Sequence[LifeOutcome], stage: Stage) -> Iterator[Rate]:
@@ -440,9 +478,9 @@ def _rates(kind: str, lives: Sequence[LifeOutcome], stage: Stage) -> Iterator[Ra
         seen = [bool(one) for one in hits]
         if seen:
             row = share_row(sum(seen), len(seen), 0.95)
-            stated = more.get("at_most")
-            above = stated is not None and share_row(sum(seen), len(seen))["low"] > stated
-            yield Rate(kind, what, **row, exceeded=above, **more)
+            if "at_most" in more:
+                more["p_value"] = float(binom.sf(sum(seen) - 1, len(seen), more["at_most"]))
+            yield Rate(kind, what, **row, **more)
 
     done = [one for one in lives if not one.failed]
     yield from rate("health is published", (one.published for one in lives))
@@ -460,6 +498,10 @@ def _rates(kind: str, lives: Sequence[LifeOutcome], stage: Stage) -> Iterator[Ra
         yield from rate("reported as outside the map", (o.verdict == OUTSIDE_MAP for o in sound))
     if kind == "healthy":
         yield from rate("alarm of the tracker (false)", (o.alarm is not None for o in done))
+        still = (one.alarm is not None for one in done if one.still)
+        yield from rate(
+            "alarm of the tracker, nothing moves (false)", still, at_most=FALSE_ALARM_PROBABILITY
+        )
     if kind == "wearing":
         for low, high in pairwise(constants.LOSSES):
             found = [

@@ -34,6 +34,9 @@ MOST_TRIES = 1000
 """Lives that are drawn before a description whose laws leave its map is refused."""
 
 # Report.
+FALSE_VERDICT = 0.01
+"""Probability, at most, that a right program is called wrong: the family-wise level of all checks
+of the verdict together, whatever their number and dependence (Holm's rule)."""
 LEAST_OF_KIND = 0.25
 """Lives of each kind, at least, as a share of those drawn from the description."""
 LOSSES = (0.0, 0.02, 0.05, 0.1, 0.2, 1.0)

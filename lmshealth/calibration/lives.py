@@ -21,7 +21,7 @@ from lmshealth.life.prognosis import early_life, parameters_with_limit, rate_std
 from lmshealth.stage.degradation_laws import Unchanging
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
-from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
+from lmshealth.tracking.constants import BIAS_STD, HEALTHY_WALKS, JUMP_STD, LOGS_PER_LIFE
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History, Series, Step
 
@@ -146,6 +146,7 @@ class Life:
     history: History
     parts: tuple[Part, ...]  # one for each health parameter
     lone: int  # index of the mode that moves alone, or `NO_MODE`
+    walk: float  # standard deviation of ln f at the last log by its random walk
     rate: float  # mean travel in m per day
     scatter: float  # standard deviation of the travel from log to log, as a share of its mean
 
@@ -160,6 +161,17 @@ class Life:
         if self.lone != NO_MODE:
             return "foreign change"
         return "wearing" if any(part.changes for part in self.parts) else "healthy"
+
+    @property
+    def still(self) -> bool:
+        """Whether health is constant, and ln f wanders as the tracker has it for healthy machines.
+
+        The tracker declares its false alarms for these machines alone.
+        """
+        n_lives = (len(self.history.logs) - 1) / LOGS_PER_LIFE
+        most = max(walk for walk, _ in HEALTHY_WALKS) * np.sqrt(n_lives)
+        constant = self.kind == "healthy" and all(part.rate == 0 for part in self.parts)
+        return bool(constant and self.walk <= most)
 
     @property
     def health(self) -> FloatArray:
@@ -211,7 +223,7 @@ def draw(
     covariates, declared = _covariates(rng, stage, n), _declared(rng, series, n)
     if first is not None:
         declared = (*declared, Step.found("step", first, n))
-    level, lone = _modes(rng, stage, names, clock, (_path(stage, clock, parts), kind))
+    level, lone, walk = _modes(rng, stage, names, clock, (_path(stage, clock, parts), kind))
     level += _covariate_effects(rng, stage, covariates, n, len(names))
     mode = np.array([names.index(one.mode) for one in series])
     cov = _covariance(rng, stage, schedule, mode)
@@ -230,7 +242,7 @@ def draw(
         missing=rng.random((n, mode.size)) < constants.MISSING,
         every=schedule.every,
     )
-    return Life(history, parts, lone, rate, scatter)
+    return Life(history, parts, lone, walk, rate, scatter)
 
 
 def make_history(
@@ -343,19 +355,19 @@ def _modes(
     names: tuple[str, ...],
     clock: FloatArray,
     path_and_kind: tuple[FloatArray, Kind | None],
-) -> tuple[FloatArray, int]:
+) -> tuple[FloatArray, int, float]:
     """Return ln f of the modes: health through a map that is wrong, and drifts of other causes.
 
-    Last the index of the mode that moves alone, or `NO_MODE`.
+    Then as `without_health`.
     """
     path, kind = path_and_kind
     x, wrong_by = np.log(path), map_std(rng, stage)
     level, *alone = stage.drifts(x, names)
     for own in alone:
         level = level + wrong_by * rng.standard_normal(len(names)) * own
-    moved, lone = without_health(rng, stage, clock, len(names), kind)
+    moved, lone, walk = without_health(rng, stage, clock, len(names), kind)
     known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
-    return np.asarray(level + moved + known), lone
+    return np.asarray(level + moved + known), lone, walk
 
 
 def without_health(
@@ -364,10 +376,11 @@ def without_health(
     clock: FloatArray,
     n_modes: int,
     kind: Kind | None = None,
-) -> tuple[FloatArray, int]:
+) -> tuple[FloatArray, int, float]:
     """Draw intercepts, random walks, and the drift of a mode that moves alone.
 
-    Of ln f at each log, ``(n_logs, n_modes)``, and the index of that mode, or `NO_MODE`.
+    Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, or `NO_MODE`; and the
+    standard deviation of the walks at the last log.
     """
     which, alone = rng.random(), stage.description.life.lone_mode
     if kind is not None:
@@ -384,7 +397,8 @@ def without_health(
         cov = of_life.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]))
         # It is 0 at the baseline: no Cholesky factor.
         drift[:, lone] += rng.multivariate_normal(np.zeros(clock.size), cov, method="eigh")
-    return drift + constants.INTERCEPT_STD * rng.standard_normal(n_modes), lone
+    level = constants.INTERCEPT_STD * rng.standard_normal(n_modes)
+    return drift + level, lone, float(walk)
 
 
 def _covariates(rng: np.random.Generator, stage: Stage, n: int) -> dict[str, FloatArray]:

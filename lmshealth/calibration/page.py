@@ -21,7 +21,6 @@ from lmshealth.report.figures import BLUE, INK, MUTED, RED, svg
 from lmshealth.report.rendering import render
 from lmshealth.report.tables import csv_text
 from lmshealth.report.text import GAP, coarse, percent
-from lmshealth.tracking.constants import FALSE_ALARM_PROBABILITY
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -136,18 +135,21 @@ def render_page(
 def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
     """Return state, headline and reasons of a check, for page and terminal."""
     drawn = f"{sum(one.drawn for one in check.outcomes)} lives drawn from the description"
+    family = (
+        f"{len(check.p_values)} checks are held to {percent(constants.FALSE_VERDICT)} together: at "
+        "most so often a right program is called wrong."
+    )
     if check.wrong:
-        return (
-            "bad",
-            "The stated uncertainty is wrong",
-            [f"By {drawn}, not so: {'; '.join(map(_spelled, check.wrong))}."],
-        )
+        found = (f"{_spelled(name)} (p = {check.p_values[name]:.2g})" for name in check.wrong)
+        why = f"By {drawn}, not so: {'; '.join(found)}."
+        return "bad", "The stated uncertainty is wrong", [why, family]
     if check.blind:
         faults = "; ".join(map(_spelled, check.blind))
         why = f"By {drawn} these faults would not be found: {faults}."
-        return "open", "No fault found, in too few lives to be sure", [f"{why} Draw more lives."]
+        why = f"{why} Draw more lives."
+        return "open", "No fault found, in too few lives to be sure", [why, family]
     why = f"Intervals and ranks of {drawn} agree with what is stated; wrong ones would be found."
-    return "good", "The stated uncertainty is right", [why]
+    return "good", "The stated uncertainty is right", [why, family]
 
 
 def _spelled(name: str) -> str:
@@ -260,7 +262,7 @@ def _ranks(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
             histogram_picture(
                 _spelled(name).capitalize(),
                 [one.places[name] for one in drawn if name in one.places],
-                f"Test of uniform ranks: {_tested(check.ranks[name])}.",
+                f"Test of uniform ranks: {_tested(check, name)}.",
                 salt=f"rank-{k}",
             )
             for k, name in enumerate(quantities)
@@ -270,8 +272,8 @@ def _ranks(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
             {
                 "quantity": _spelled(name),
                 "lives": str(row["n"]),
-                "test of uniform ranks": _tested(row),
-                "p of χ²": f"{row['p_value']:.2g}",
+                "test of uniform ranks": _tested(check, name),
+                "p": f"{row['p_value']:.2g}",
             }
             for name, row in check.ranks.items()
         ],
@@ -304,8 +306,8 @@ def _of_kinds(quantity: str) -> str:
     return "Other kinds show what to expect of such lives alone."
 
 
-def _tested(row: Row) -> str:
-    return "passed" if row["inside_band"] else "failed"
+def _tested(check: CalibrationCheck, name: str) -> str:
+    return "passed" if check.passed[f"{name}: ranks are uniform"] else "failed"
 
 
 def _detection(check: CalibrationCheck) -> Block:
@@ -334,9 +336,10 @@ def _detection(check: CalibrationCheck) -> Block:
     text = (
         "What is reported of lives whose truth is known. A loss is the share of its baseline that "
         "a parameter has truly lost at the last log.",
-        f"The tracker declares {percent(FALSE_ALARM_PROBABILITY)} of false alarms for healthy "
-        "machines whose modes wander as little as its own model has it. Some of these lives wander "
-        "more: they raise alarms, though hardly a verdict.",
+        "The tracker declares its false alarms for machines whose health is constant and whose "
+        "modes wander no more than its own model has it; only of these their rate is part of the "
+        "verdict. In other healthy lives modes wander more, or a parameter deviates by a few "
+        "percent: something does move, though hardly a verdict follows.",
     )
     return Block("What is detected, and what is reported by mistake", text, pictures,
                  rate_rows(check.rates))  # fmt: skip
@@ -386,7 +389,17 @@ def life_rows(check: CalibrationCheck) -> list[Row]:
 
 def document(check: CalibrationCheck) -> dict[str, Any]:
     """Return the check for other programs, without the single lives."""
-    names = ("stage", "schedule", "seed", "coverage", "rates", "ranks", "controls", "passed")
+    names = (
+        "stage",
+        "schedule",
+        "seed",
+        "coverage",
+        "rates",
+        "ranks",
+        "controls",
+        "p_values",
+        "passed",
+    )
     state, headline, _ = verdict_of(check)
     content = {name: getattr(check, name) for name in names}
     return {"schema": JSON_SCHEMA, "state": state, "verdict": headline, **content}

@@ -1,6 +1,6 @@
 """Record all studies in full, one after the other: ``make studies FULL=1``.
 
-A study whose record was made by the code of this commit without a failed check is not run again,
+A study whose record was made by the code that it has now, without a failed check, is not run again,
 and trials of an interrupted study are kept (`studies.harness.study`). A study that fails does not
 stop the others; the exit status is then 1. What studies print is in ``studies/.kept``.
 """
@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from studies.harness.provenance import PROJECT, commit
+from studies.harness.provenance import PROJECT, code_of_script
 from studies.harness.study import KEPT, record_of
 from studies.harness.summary import GROUPS
 
@@ -29,20 +29,25 @@ def scripts(root: Path, groups: Sequence[str]) -> Iterator[tuple[Path, str]]:
                 yield path, ".".join(path.relative_to(root.parent).with_suffix("").parts)
 
 
-def is_fresh(script: Path, now: str) -> bool:
-    """Return whether a record was made by a commit, of which nothing has been changed since."""
+def is_fresh(script: Path) -> bool:
+    """Return whether a record without a failed check is of the code that its study has now."""
     path = record_of(script)
     made = json.loads(path.read_text(encoding="utf-8"))["recorded"] if path.exists() else {}
-    return made.get("commit") == now != "" and not now.endswith("+") and not made.get("failed")
+    # Records of earlier versions have no digest.
+    return (
+        "code" in made
+        and not made["failed"]
+        and made["code"] == code_of_script(script, made["also"])
+    )
 
 
 def run_all(root: Path, groups: Sequence[str], kept: Path = KEPT) -> list[str]:
     """Run the studies of groups in a folder whose records are not fresh; return what failed."""
-    failed, now = [], commit()
+    failed = []
     kept.mkdir(parents=True, exist_ok=True)
     for script, module in scripts(root, groups):
-        if is_fresh(script, now):
-            print(f"{module}: recorded by {now}", flush=True)
+        if is_fresh(script):
+            print(f"{module}: recorded by the same code", flush=True)
             continue
         start, log = time.perf_counter(), kept / f"{module}.txt"
         with log.open("w", encoding="utf-8") as file:

@@ -68,6 +68,11 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     return _digest(_script(work), bare(work).__qualname__, also)
 
 
+def code_of_script(script: Path, also: Iterable[str] = ()) -> str:
+    """Digest the code that the function ``main`` of a script depends on, as `code_of`."""
+    return _digest(script.resolve(), "main", tuple(sorted(also)))
+
+
 def _script(work: Callable[..., Any]) -> Path:
     return Path(sys.modules[bare(work).__module__].__file__ or "").resolve()
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from scipy.stats import norm
 
 from lmshealth.calibration.ranks import NOMINAL, judge_coverage
-from studies.harness.provenance import code_of, commit, machine, name_of
+from studies.harness.provenance import code_of, code_of_script, commit, machine, name_of
 
 Row = dict[str, Any]
 Work = Callable[..., Any]
@@ -99,6 +99,8 @@ class Study:
             "recorded": {
                 "date": datetime.now(UTC).date().isoformat(),
                 "commit": commit(),
+                "code": code_of_script(self._script, self.trials.also),
+                "also": sorted(self.trials.also),
                 "machine": machine(),
                 "failed": failed,
                 "python": platform.python_version(),
@@ -114,11 +116,12 @@ class Study:
 class Trials:
     """Trials of a study, each computed once and kept in a file, if there is one.
 
-    ``kept_s`` is the run time in s of the trials whose values were kept before.
+    ``kept_s`` is the run time in s of the trials whose values were kept before, ``also`` the
+    modules that they need and do not import.
     """
 
     def __init__(self, path: Path | None) -> None:
-        self._path, self.kept_s = path, 0.0
+        self._path, self.kept_s, self.also = path, 0.0, set[str]()
 
     def once(self, work: Work, *task: Any, also: Iterable[str] = ()) -> Any:
         """Compute one trial, or read its kept value."""
@@ -138,10 +141,11 @@ class Trials:
         (``tasks``) and its value; ``also`` names modules of the project that it needs and does not
         import, as programs that it starts.
         """
-        tasks = [tuple(task) for task in tasks]
+        tasks, also = [tuple(task) for task in tasks], tuple(also)
+        self.also.update(also)
         if self._path is None:
             return [json.loads(json.dumps(value)) for value, _ in _compute(work, tasks, pool)]
-        name, code = name_of(work), code_of(work, tuple(also))
+        name, code = name_of(work), code_of(work, also)
         kept = _read(self._path, name, code)
         self.kept_s += sum(kept[key]["seconds"] for key in map(json.dumps, tasks) if key in kept)
         missing = [task for task in dict.fromkeys(tasks) if json.dumps(task) not in kept]

@@ -9,8 +9,7 @@ Method
     and a factor on each mode's drift, with small process noise in the filter and none in the
     prediction. It has advantages: the plant's map itself, that the mount stays, the
     distribution of the lengths, and the size of the map's error; temperature is removed by least
-    squares on temperature and powers of
-    the travel, and the first log is the baseline.
+    squares on temperature and powers of the travel, and the first log is the baseline.
     Scores of both on the same lives: coverage of 90 % intervals of health and of the remaining
     life, mean continuous ranked probability score of the remaining life up to 10,000 km, and
     processor time. Control, which must be worse: the distribution of lengths without any log.
@@ -97,16 +96,14 @@ def by_progpy(kind: str, k: int) -> Row:
             return self.StateContainer(dict.fromkeys(self.states, 0.0))
 
         def next_state(self, x: Row, u: object, dt: float) -> object:
-            return self.StateContainer(
-                {**{s: x[s] for s in self.states}, "travel": x["travel"] + dt}
-            )
+            kept = {name: x[name] for name in self.states}
+            return self.StateContainer(kept | {"travel": x["travel"] + dt})
 
         def output(self, x: Row) -> object:
             ln_health = np.atleast_1d(_ln_health(x))
             found = drift(np.stack([ln_health, 0 * ln_health], axis=-1))
-            return self.OutputContainer(
-                {mode: found[:, i] * x[_SCALES[i]] for i, mode in enumerate(MODES)}
-            )
+            scales = [x[name] for name in _SCALES]
+            return self.OutputContainer(dict(zip(MODES, found.T * scales, strict=True)))
 
         def event_state(self, x: Row) -> dict[str, Array]:
             return {"limit": 1 - _loss(x) / LOST}
@@ -122,10 +119,8 @@ def by_progpy(kind: str, k: int) -> Row:
         "ln_power": rng.normal(0.0, POWER_STD, PARTICLES),
         **{scale: rng.normal(1.0, MAP_ERROR, PARTICLES) for scale in _SCALES},
     }
-    particles = [
-        model.StateContainer({name: float(values[i]) for name, values in prior.items()})
-        for i in range(PARTICLES)
-    ]
+    rows = zip(*(values.tolist() for values in prior.values()), strict=True)
+    particles = [model.StateContainer(dict(zip(prior, row, strict=True))) for row in rows]
     begin = UnweightedSamples(particles, _type=model.StateContainer)
     own = ParticleFilter(model, begin, measurement_noise=dict.fromkeys(MODES, NOISE))
     # Ln f since the first log, without the effect of temperature.
@@ -133,23 +128,19 @@ def by_progpy(kind: str, k: int) -> Row:
     table = np.column_stack([travel[:, None] ** [0, 0.5, 1, 2], warm])
     seen = life.ln_f - np.outer(warm, np.linalg.lstsq(table, life.ln_f, rcond=None)[0][-1])
     seen -= seen[0]
-    for s, row in zip(travel, seen, strict=True):
+    for s, row in zip(travel, seen.tolist(), strict=True):
         if s > own.t:
-            own.estimate(s, {}, dict(zip(MODES, row.tolist(), strict=True)), dt=s - own.t)
-    state = own.x
-    now = {name: np.array(state.key(name), dtype=float) for name in model.states}
+            own.estimate(s, {}, dict(zip(MODES, row, strict=True)), dt=s - own.t)
+    now = {name: np.array(own.x.key(name), dtype=float) for name in model.states}
     model.parameters["process_noise"] = 0
     predicted = MonteCarlo(model).predict(
-        state.sample(SAMPLES), t0=travel[-1], dt=STEP_KM, horizon=travel[-1] + HORIZON_KM,
+        own.x.sample(SAMPLES), t0=travel[-1], dt=STEP_KM, horizon=travel[-1] + HORIZON_KM,
         save_freq=1e9,
     )  # fmt: skip
     ends = [np.inf if one is None else float(one) for one in predicted.time_of_event.key("limit")]
     left = np.minimum(np.array(ends) - travel[-1], HORIZON_KM)
-    return {
-        "health": _ln_health(now).tolist(),
-        "left": left.tolist(),
-        "cpu_s": time.process_time() - start,
-    }
+    cpu_s = time.process_time() - start
+    return {"health": _ln_health(now).tolist(), "left": left.tolist(), "cpu_s": cpu_s}
 
 
 def _loss(x: Row) -> Array:
@@ -169,12 +160,11 @@ def scored(kind: str, found: list[Row]) -> Row:
     health = [(one.ln_health[-1, 0], own["health"]) for one, own in both if own["health"]]
     left = [(one.left_km, np.array(own["left"])) for one, own in both if own["left"]]
     scores = [float(crps(own[:, None], np.array([t]), horizon=HORIZON_KM)[0]) for t, own in left]
+    off = [np.median(own) - t for t, own in health]
     return {
         "n": len(found),
         "health": _held([(t, np.array(own)) for t, own in health]),
-        "health_rms": float(np.sqrt(np.mean([(np.median(own) - t) ** 2 for t, own in health])))
-        if health
-        else None,
+        "health_rms": float(np.sqrt(np.mean(np.square(off)))) if off else None,
         "left": _held(left),
         "left_width": float(np.median([np.ptp(np.quantile(own, [0.05, 0.95])) for _, own in left])),
         "crps_km": float(np.mean(scores)),
@@ -221,12 +211,8 @@ def claims(answer: Row) -> Iterator[Claim]:
             beside=f"{PEER} {_counts(peer)}; preload now {_health(ours)}, {PEER} {_health(peer)}",
             met=answer["passed"][f"{kind}: intervals hold"],
         )
-    spans = {name: [rows[name][kind]["cpu_s"] for kind in KINDS] for name in (OURS, PEER)}
-    yield Claim(
-        "processor time a life",
-        f"{number(max(spans[OURS]))} s",
-        beside=f"{PEER} {number(max(spans[PEER]))} s",
-    )
+    ours, peer = (max(rows[name][kind]["cpu_s"] for kind in KINDS) for name in (OURS, PEER))
+    yield Claim("processor time a life", f"{number(ours)} s", beside=f"{PEER} {number(peer)} s")
 
 
 def _counts(row: Row) -> str:

@@ -8,9 +8,11 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from scipy import stats
 
 import lmshealth
 from lmshealth.calibration import check as checks
+from lmshealth.calibration import constants
 from lmshealth.calibration.check import (
     DAYS,
     DRAWN,
@@ -23,6 +25,7 @@ from lmshealth.calibration.check import (
     summarise,
 )
 from lmshealth.calibration.lives import KINDS, Schedule
+from lmshealth.calibration.ranks import place
 from lmshealth.errors import BadQuestion, BadStage, NotConverged
 from lmshealth.stage.description import Stage, load_stage
 from tests.calibration.conftest import SCHEDULE
@@ -31,7 +34,9 @@ from tests.lives import STILL_MOUNT, four_settings, make_stage
 HEALTH = "guide preload now"
 
 
-def outcomes(n: int, width: float = 1.0, alarms: float = 0.0, late: float = 0.0) -> Any:
+def outcomes(
+    n: int, width: float = 1.0, alarms: float = 0.0, late: float = 0.0, *, still: bool = False
+) -> Any:
     """Make outcomes of healthy lives by draws of a width, with a share of alarms and late dates."""
     rng, found = np.random.default_rng(3), []
     for k in range(n):
@@ -43,7 +48,7 @@ def outcomes(n: int, width: float = 1.0, alarms: float = 0.0, late: float = 0.0)
                 "healthy", True, k, truth={HEALTH: truth, DAYS: 100.0}, places=own["1"],
                 quantiles={HEALTH: (-1.0, -0.5, 0.0, 0.5, 1.0)},
                 controls={name: own[name] for name in ("0.5", "2")}, verdict="healthy",
-                published=True, alarm=5 if k < alarms * n else None, service="by",
+                published=True, still=still, alarm=5 if k < alarms * n else None, service="by",
                 wait=200.0 if k < late * n else 50.0,
             )
         )  # fmt: skip
@@ -104,6 +109,63 @@ def test_both_faults_are_found(width: float, word: str) -> None:
     found = summary(outcomes(120, width))
     assert word in {one.verdict for one in found.coverage if one.kind == DRAWN}
     assert f"{HEALTH}: 90% intervals" in found.wrong or f"{HEALTH}: 50% intervals" in found.wrong
+
+
+def family(rng: np.random.Generator, n: int, factor: float = 1.0) -> CalibrationCheck:
+    """Check n lives of eight quantities, in pairs of the same ranks, of draws of a width.
+
+    A right program has uniform ranks, and as many late dates and false alarms as it may have.
+    """
+    found = []
+    for k in range(n):
+        truth, draws = rng.standard_normal(4), factor * rng.standard_normal((4, 127))
+        names = [HEALTH, DAYS, "mount stiffness now", "remaining, first"]
+        places = {
+            name: float(place(draws[i][:, None], truth[i : i + 1], rng)[0])
+            for i, name in enumerate(names)
+        }
+        places |= {f"{name} again": own for name, own in places.items()}
+        found.append(
+            LifeOutcome(
+                "healthy", True, k, truth={DAYS: 100.0}, places=places,
+                quantiles=dict.fromkeys(names, (-1.0, -0.5, 0.0, 0.5, 1.0)),
+                verdict="healthy", still=True, alarm=5 if rng.random() < 0.01 else None,
+                service="by", wait=200.0 if rng.random() < 0.05 else 50.0,
+            )
+        )  # fmt: skip
+    return summary(found)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("n", [15, 60])
+def test_a_right_program_is_called_wrong_as_seldom_as_stated(n: int) -> None:
+    """In 1 % of checks at most, however few lives. Negative control: each check by itself."""
+    rng = np.random.default_rng(n)
+    checks = [family(rng, n) for _ in range(500)]
+    level = constants.FALSE_VERDICT
+    assert len(checks[0].p_values) == 16
+    wrong = sum(bool(one.wrong) for one in checks)
+    assert stats.binomtest(wrong, 500, level, alternative="greater").pvalue > 1e-3
+    alone = sum(min(one.p_values.values()) <= level for one in checks)
+    assert stats.binomtest(alone, 500, level, alternative="greater").pvalue < 1e-6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("factor", [0.5, 2.0])
+def test_wrong_widths_are_found_in_a_hundred_lives(factor: float) -> None:
+    """In all of 100 checks of intervals of half and of double width."""
+    rng = np.random.default_rng(9)
+    assert all(family(rng, 100, factor).wrong for _ in range(100))
+
+
+def test_false_alarms_count_where_they_are_declared() -> None:
+    """Of lives in which something moves they are reported; of those that are still they judge."""
+    what = "healthy: alarm of the tracker, nothing moves (false)"
+    assert what not in summary(outcomes(100, alarms=0.1)).passed
+    assert summary(outcomes(100, alarms=0.01, still=True)).passed[what]
+    found = summary(outcomes(100, alarms=0.1, still=True))
+    assert found.wrong == (what,)
+    assert found.p_values[what] == pytest.approx(stats.binom.sf(9, 100, 0.01))
 
 
 def test_too_few_lives_are_named_as_that() -> None:

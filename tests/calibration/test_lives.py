@@ -42,6 +42,22 @@ def test_kinds_are_as_frequent_as_described(rng: np.random.Generator) -> None:
     assert 0.13 < kinds.count("healthy") / n < 0.37
 
 
+def test_a_still_life_is_as_the_tracker_declares_it(rng: np.random.Generator) -> None:
+    """Healthy, without deviation, and with a walk of ln f that the tracker calls healthy."""
+    stage, lives = load_stage("lms-y"), []
+    for kind in ("healthy", "wearing", "foreign change"):
+        lives += [draw(rng, stage, Schedule(logs=40), kind) for _ in range(20)]
+    still = [life for life in lives if life.still]
+    assert 2 <= len(still) <= 15
+    for life in still:
+        assert life.kind == "healthy"
+        assert np.ptp(life.health) == 0
+        assert life.walk <= 5e-4
+    assert not replace(still[0], walk=1e-3).still
+    moved = replace(still[0].parts[0], rate=1e-9)
+    assert not replace(still[0], parts=(moved, *still[0].parts[1:])).still
+
+
 def test_a_life_has_its_schedule(rng: np.random.Generator, tmp_path: Path) -> None:
     """Number, distance and travel of logs, and errors of the size that is asked for."""
     stage = make_stage(tmp_path, (FADING,))

@@ -6,7 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth.calibration.ranks import clopper_pearson, judge, judge_places, place, uniform
+from lmshealth.calibration.ranks import (
+    clopper_pearson,
+    judge,
+    judge_places,
+    place,
+    rank_p_value,
+    uniform,
+)
 from tests.oracles import check_coverage
 from tests.test_metrics import NEVER, lives
 
@@ -49,6 +56,34 @@ def test_clopper_pearson_is_exact() -> None:
     assert stats.binom.cdf(7, 20, high) == pytest.approx(0.05)
     assert clopper_pearson(0, 20)[0] == 0
     assert clopper_pearson(20, 20)[1] == 1
+
+
+def test_p_values_of_coverage_are_those_of_its_interval() -> None:
+    """Twice the smaller tail: the level of the interval that just contains the nominal."""
+    p = judge_places(np.repeat([0.01, 0.5], [7, 13]), 0.9)["p_value"]
+    assert p == pytest.approx(2 * stats.binom.cdf(13, 20, 0.9))
+    assert clopper_pearson(13, 20, 1 - p)[1] == pytest.approx(0.9)
+    assert judge_places(np.full(10, 0.5), 0.9)["p_value"] == pytest.approx(2 * 0.9**10)
+
+
+@pytest.mark.parametrize("n", [1, 2, 15, 100])
+def test_p_values_of_ranks_are_exact(n: int) -> None:
+    """Of 4,000 uniform sets the p value is below a level as often as that, and no more."""
+    rng = np.random.default_rng(n)
+    p = np.array([rank_p_value(rng.uniform(size=n)) for _ in range(4000)])
+    for level in (0.3, 0.05, 0.01):
+        at = p[p <= level].max(initial=0.0)  # the level is met exactly where p has a value
+        hits = int(np.sum(p <= level))
+        assert stats.binomtest(hits, p.size, max(at, 1e-9)).pvalue > 1e-4 or hits == 0
+        assert stats.binomtest(hits, p.size, level, alternative="greater").pvalue > 1e-4
+
+
+def test_ranks_off_at_either_end_or_in_the_middle_are_improbable() -> None:
+    """Negative controls: biased, too narrow and too wide posteriors of 120 lives."""
+    u = (np.arange(120) + 0.5) / 120
+    assert rank_p_value(u) > 0.99
+    for wrong in (u**2, 1 - u**2, 0.25 + u / 2, stats.beta(0.4, 0.4).ppf(u)):
+        assert rank_p_value(wrong) < 1e-3
 
 
 def test_coverage_counts_and_judges() -> None:

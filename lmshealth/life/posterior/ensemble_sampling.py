@@ -21,9 +21,9 @@ from lmshealth.life.posterior.importance_sampling import (
 if TYPE_CHECKING:
     import emcee
 
-_FIRST_STEPS = 200
-# Vectorised, many walkers cost little more than few.
-_MIN_WALKERS, _WALKERS_PER_DIMENSION = 32, 8
+_FIRST_STEPS = 100
+_MIN_WALKERS, _WALKERS_PER_DIMENSION = 16, 2
+_MOST_TRIES = 16  # proposals for a walker in a step
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -41,6 +41,34 @@ class Sample(ReadOnly):
     def flat(self) -> FloatArray:
         """Draws of the ensembles in turn, shape ``(n_ensembles n_draws, n_dim)``."""
         return np.swapaxes(self.draws, 0, 1).reshape(-1, self.draws.shape[-1])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Resampling:
+    """Move of emcee: every walker is drawn anew among proposals and itself, by their weights.
+
+    Iterated sampling importance resampling [Andrieu2018]: a step of many proposals, computed at
+    once, leaves less autocorrelation than as many steps of one.
+    """
+
+    proposal: Proposal
+    n_tries: int
+
+    def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
+        """Return the next state, and which walkers moved."""
+        shape, rng = state.coords.shape, model.random
+        points = self.proposal.draw(rng, self.n_tries * shape[0])
+        log_density = model.compute_log_prob_fn(points)[0]
+        all_points = np.concatenate([state.coords, points]).reshape(-1, *shape)
+        density = np.concatenate([state.log_prob, log_density]).reshape(-1, shape[0])
+        log_weight = density - self.proposal.log_density(all_points.reshape(-1, shape[1])).reshape(
+            density.shape
+        )
+        # The largest of log weights with Gumbel noise is a draw by the weights.
+        chosen = (log_weight + rng.gumbel(size=density.shape)).argmax(axis=0)
+        walkers = np.arange(shape[0])
+        drawn = all_points[chosen, walkers], density[chosen, walkers]
+        return type(state)(drawn[0], log_prob=drawn[1]), chosen > 0
 
 
 def thin(draws: FloatArray, n: int) -> FloatArray:
@@ -63,6 +91,8 @@ def sample(
     """
     import emcee  # late: it imports scipy.stats
 
+    # As many proposals as have one effective draw.
+    n_tries = int(np.clip(np.ceil(draws.weight.size / draws.ess), 1, _MOST_TRIES))
     streams = seed.spawn(2 * constants.N_ENSEMBLES)
     samplers = []
     for start_seed, chain_seed in zip(streams[::2], streams[1::2], strict=True):
@@ -72,9 +102,9 @@ def sample(
         # Differences of walkers reach tails beyond it, and with gamma0 = 1 jump between modes of
         # the posterior. DESnookerMove of emcee 3.1.6 does not keep the target: it narrows a
         # Gaussian of six dimensions by 9 %.
-        independent = emcee.moves.MHMove(Proposal.near(draws, rng).move)
+        independent = _Resampling(Proposal.near(draws, rng), n_tries)
         moves = [independent, emcee.moves.DEMove(), emcee.moves.DEMove(gamma0=1.0)]
-        weighted = list(zip(moves, (0.8, 0.15, 0.05), strict=True))
+        weighted = list(zip(moves, (0.9, 0.07, 0.03), strict=True))
         options = {"vectorize": True, "moves": weighted}
         sampler = emcee.EnsembleSampler(*points.shape, log_probability, **options)
         # emcee ignores a Generator; without a state all samplers of a process draw the same.

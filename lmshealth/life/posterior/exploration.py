@@ -12,9 +12,9 @@ from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior.importance_sampling import (
     WeightedDraws,
+    draw_to_ess,
     importance_sample,
     importance_sample_again,
-    importance_sample_to_ess,
 )
 from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood, kept_weights
 from lmshealth.life.posterior.scenarios import DegradationPath, Scenario
@@ -113,18 +113,21 @@ class _Exploration:
 
         These are draws of the posterior with fewer logs, else of the same paths elsewhere.
         """
-        start, earlier = scenario.draw(rng, _N_ROUGH), np.empty((0, 0))
+        start, earlier = scenario.draw(rng, _N_ROUGH), np.empty((0, scenario.n_dim))
         if self.before is not None:
             earlier = self.before.of(scenario)
         pairs = list(zip(self.known, scenario.paths, strict=True))
-        if not earlier.shape[0] and all(path in own or not path.names for own, path in pairs):
-            empty = np.empty((_N_ROUGH, 0))
-            parts = [own[path][1] if path in own else empty for own, path in pairs]
-            earlier = np.hstack([rng.permutation(part) for part in parts])
         if earlier.shape[0]:
             # Draws of the prior stay among them, for a mode that the others did not show.
-            start = np.concatenate([earlier, start[: _N_START // 4]])
-        return start
+            start = start[: _N_START // 4]
+        elif all(path in own or not path.names for own, path in pairs):
+            empty = np.empty((_N_ROUGH, 0))
+            parts = [own[path][1] if path in own else empty for own, path in pairs]
+            known = np.hstack([rng.permutation(part) for part in parts])
+            start = np.concatenate([known, start[: _N_START // 4]])
+        if scenario.steps:
+            start = self.likelihood.steps_given_laws(self.grid, scenario, start, rng)
+        return np.concatenate([earlier, start])
 
     def narrow(self, anchors: Sequence[int]) -> None:
         """Leave out grid points that the anchors do without, as far as they are likely.
@@ -178,11 +181,11 @@ class _Exploration:
 
         Of a probable one of an update the weights must be reliable too.
         """
-        density, draws = self.found[k]
-        if draws.ess < min_ess or (updated and draws.pareto_k >= constants.MAX_PARETO_K):
-            start = draws.resampled(self.generators[k], _N_ROUGH)
-            how = start, self.generators[k], 3 * n, min_ess
-            self.found[k] = density, importance_sample_to_ess(density.log_probability, *how)
+        (density, draws), rng = self.found[k], self.generators[k]
+        if updated and draws.pareto_k >= constants.MAX_PARETO_K:
+            start = draws.resampled(rng, _N_ROUGH)
+            draws = importance_sample(density.log_probability, start, rng, 3 * n)
+        self.found[k] = density, draw_to_ess(density.log_probability, draws, rng, min_ess)
 
     def next_start(self) -> LifeStart:
         """Return draws of all scenarios, with those that an update has left out."""

@@ -19,8 +19,12 @@ _FREEDOM = 5
 _N_KERNELS, _MAX_ROUNDS, _MAX_ATTEMPTS = 100, 15, 4
 # Rounds after which a density that integrates to too little is not adapted to any more.
 _HOPELESS = 4
-# Effective share of the draws at which the proposal is good enough for the last round.
-_GOOD_SHARE = 0.3
+# Effective share of the draws at which the proposal is good enough for the last round; and
+# effective draws from which it is once another round changes the log evidence by no more than this.
+_GOOD_SHARE, _SETTLED, _SAME = 0.3, 20.0, 0.3
+# Draws of another attempt over those before: least and most, and the margin by which those that are
+# missing are exceeded.
+_GROWTH, _MARGIN = (2.0, 3.0), 1.3
 # Effective draws per dimension from which a proposal is made.
 _LEAST_PER_DIMENSION = 20.0
 # Share of a wide component about all draws, which covers tails between and beyond the kernels, and
@@ -74,12 +78,14 @@ def importance_sample(
     number of draws of the last round. Adaptation ends early where no draw contributes as much as
     `least` to the log integral. `NotConverged` is raised if no point has a density above 0.
     """
-    points, proposal = start, np.zeros(start.shape[0])
+    points, proposal, before = start, np.zeros(start.shape[0]), np.inf
     few = max(200, n // 4)
     for k in range(_MAX_ROUNDS):
         log_weight = log_probability(points) - proposal
         draws = _weighted(points, log_weight)
-        is_good = draws.ess >= _GOOD_SHARE * few and points is not start
+        is_settled = draws.ess >= _SETTLED and abs(draws.log_evidence - before) < _SAME
+        is_good = points is not start and (draws.ess >= _GOOD_SHARE * few or is_settled)
+        before = np.inf if points is start else draws.log_evidence
         is_hopeless = k >= _HOPELESS and log_weight.max() < least
         # Enough draws to place kernels by: some are left of a density that most of them miss.
         wanted = min(_LEAST_PER_DIMENSION * points.shape[1], 0.3 * draws.weight.size)
@@ -117,19 +123,33 @@ def importance_sample_to_ess(
     n: int,
     min_ess: float = constants.MIN_ESS,
 ) -> WeightedDraws:
-    """Repeat `importance_sample` with three times the draws until enough of them are effective.
+    """Return `importance_sample`, followed by `draw_to_ess`."""
+    found = importance_sample(log_probability, start, rng, n)
+    return draw_to_ess(log_probability, found, rng, min_ess)
+
+
+def draw_to_ess(
+    log_probability: LogProbability,
+    draws: WeightedDraws,
+    rng: np.random.Generator,
+    min_ess: float,
+) -> WeightedDraws:
+    """Draw again from a density, more often, unless enough of the draws are effective.
 
     Raises `NotConverged`, with the points, if the fourth attempt has fewer.
     """
+    n = draws.weight.size
     for _ in range(_MAX_ATTEMPTS):
-        found = importance_sample(log_probability, start, rng, n)
-        if found.ess >= min_ess:
-            return found
-        start, n = found.resampled(rng, 500), 3 * n
+        if draws.ess >= min_ess:
+            return draws
+        n = int(n * np.clip(_MARGIN * min_ess / draws.ess, *_GROWTH))
+        draws = importance_sample_again(log_probability, draws, rng, n)
+    if draws.ess >= min_ess:
+        return draws
     raise NotConverged(
-        f"{found.ess:.0f} effective draws of {found.weight.size} by importance sampling; needed "
+        f"{draws.ess:.0f} effective draws of {draws.weight.size} by importance sampling; needed "
         f"are {min_ess:.0f}: the posterior may have several modes far apart",
-        found.points,
+        draws.points,
     )
 
 
@@ -198,7 +218,9 @@ class Proposal(ReadOnly):
             factor = np.linalg.cholesky(cov + _RIDGE * np.diag(draws.points.var(axis=0) + 1e-18))
         # Silverman's width, of the effective number of kernels.
         width = (4 / (d + 2)) ** (1 / (d + 4)) * min(_N_KERNELS, draws.ess) ** (-1 / (d + 4))
-        centres = draws.resampled(rng, _N_KERNELS)
+        # Drawn to the mean, so that the mixture is as wide as the draws [Liu2001].
+        drawn = draws.resampled(rng, _N_KERNELS) - mean
+        centres = mean + np.sqrt(max(1 - width**2, 0.0)) * drawn
         return cls(centres, mean, np.asarray(factor, dtype=float), float(width))
 
     def draw(self, rng: Any, n: int) -> FloatArray:
@@ -222,11 +244,6 @@ class Proposal(ReadOnly):
         about_all = _log_t((unit**2).sum(1), _WHOLE_WIDTH, d)
         total = np.logaddexp(kernels + np.log1p(-_WHOLE_SHARE), about_all + np.log(_WHOLE_SHARE))
         return np.asarray(total - np.sum(np.log(np.diag(self.factor))))
-
-    def move(self, points: FloatArray, rng: Any) -> tuple[FloatArray, FloatArray]:
-        """Propose points whatever the present ones are, with the log ratio that emcee asks for."""
-        proposed = self.draw(rng, len(points))
-        return proposed, self.log_density(points) - self.log_density(proposed)
 
 
 def _propose(

@@ -36,6 +36,10 @@ _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed a
 _ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 _CACHED = 2_000_000  # whitened drifts that are computed at a time
 
+# Draws of steps given laws: iterations, step of the slopes in ln health, points of the grid, and
+# width in standard deviations.
+_NEWTON_STEPS, _SLOPE_STEP, _START_POINTS, _START_WIDTH = 3, 1e-3, 4, 2.0
+
 # Share of the posterior of the grid points that are dropped once a scenario is sampled.
 _NEGLIGIBLE = 0.01
 
@@ -286,6 +290,47 @@ class LifeLikelihood:
         if (pivots <= 0).any():
             raise np.linalg.LinAlgError("the covariance of the errors of a map is not positive")
         return grid.rest[:, None] + pivots[-1] - 1, np.log(pivots[:-1]).sum(axis=0)
+
+    def steps_given_laws(
+        self, grid: Grid, scenario: Scenario, y: FloatArray, rng: np.random.Generator
+    ) -> FloatArray:
+        """Return coordinates ``(n, n_dim)`` with other factors at the steps, drawn given the laws.
+
+        Drifts are nearly linear in the ln factors, and their prior is Gaussian, as that of the
+        errors of the map: the conditional mode by Gauss and Newton, for each life at one of a few
+        points of a grid. The draws scatter wider than the posterior: they are only a start.
+        """
+        stage, n_nodes, columns = self.data.stage, self.basis.nodes.size, scenario.step_columns
+        nodes, k = self.basis.moments[:n_nodes], columns.size
+        y = y.copy()
+        y[:, columns] = 0.0
+        law = np.nan_to_num(ln_health(stage, scenario, y, nodes)[0])
+        after = nodes >= np.array(scenario.steps)[:, None]
+        # Which ln parameters each factor moves at which nodes, ``(k, n_nodes, n_parameters)``.
+        moves = np.einsum("pq,kt->pktq", np.eye(law.shape[2]), after).reshape(k, n_nodes, -1)
+        moved = _SLOPE_STEP * np.concatenate([np.zeros_like(moves[:1]), moves])
+        assert stage.modal_map is not None  # LifeData.select() has checked
+        low, high = stage.modal_map.low, stage.modal_map.high - _SLOPE_STEP
+        points = np.linspace(0, grid.walk.size - 1, _START_POINTS).astype(int)
+        for point, own in zip(points, np.array_split(np.arange(len(y)), points.size), strict=True):
+            size = np.zeros((own.size, k))
+            for _ in range(_NEWTON_STEPS):
+                x = np.clip(law[own] + np.tensordot(size, moves, 1), low, high)
+                lives = (x[:, None] + moved).reshape(-1, *x.shape[1:])
+                rows = self._residuals(grid[[point]], lives)[0]
+                rows = rows.reshape(own.size, k + 1, *rows.shape[1:])
+                r, errors = rows[:, 0, -1], stage.map_errors[0][0] * rows[:, 0, :-1]
+                slopes = (rows[:, 1:, -1] - r[:, None]) / _SLOPE_STEP
+                a = np.concatenate([slopes, errors], axis=1)
+                prior = np.repeat([constants.STEP_PRIOR.std**-2, 1.0], [k, errors.shape[1]])
+                cov = np.linalg.inv(a @ np.swapaxes(a, 1, 2) + np.diag(prior))
+                gradient = a @ r[:, :, None]
+                gradient[:, :k, 0] += prior[0] * size
+                size = size - (cov @ gradient)[:, :k, 0]
+            unit = rng.standard_normal((*size.shape, 1))
+            size += _START_WIDTH * (np.linalg.cholesky(cov[:, :k, :k]) @ unit)[..., 0]
+            y[own[:, None], columns] = size
+        return y
 
     def conditional(
         self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray

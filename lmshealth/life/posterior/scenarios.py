@@ -100,6 +100,12 @@ class Scenario:
         return sum(self.sizes)
 
     @property
+    def step_columns(self) -> np.ndarray:
+        """Indices of the coordinates that are ln factors at steps, parameter after parameter."""
+        ends, n = np.cumsum(self.sizes), len(self.steps)
+        return np.asarray((ends[:, None] + np.arange(-n, 0)).ravel())
+
+    @property
     def steps(self) -> tuple[float, ...]:
         """Steps of the modes, in m since the baseline."""
         return self.paths[0].steps

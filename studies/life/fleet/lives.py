@@ -148,6 +148,6 @@ def _modes(
     """Ln f of the modes: health through a map that is wrong, and what moves without health."""
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
     error = map_std(rng, fleet) * rng.standard_normal(len(names))
-    moved, _ = without_health(rng, fleet, clock, len(names))
+    moved, *_ = without_health(rng, fleet, clock, len(names))
     known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])
     return np.asarray((1 + error) * fleet.drift(path, names) + moved + known)

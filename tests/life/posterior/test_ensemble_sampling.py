@@ -18,7 +18,7 @@ from lmshealth.life.posterior.ensemble_sampling import Sample, _start, sample
 from lmshealth.life.posterior.importance_sampling import WeightedDraws
 
 MEAN = np.array([0.3, -1.2])
-WALKERS = 32
+WALKERS = 16
 COV = np.array([[0.04, 0.018], [0.018, 0.01]])
 
 
@@ -210,10 +210,11 @@ def test_modes_that_no_proposal_joins_are_refused_with_their_chains(
         def near(self, _: WeightedDraws, __: np.random.Generator) -> Local:
             return self
 
-        def move(
-            self, points: FloatArray, rng: np.random.RandomState
-        ) -> tuple[FloatArray, FloatArray]:
-            return rng.standard_normal(points.shape), np.zeros(points.shape[0])
+        def draw(self, rng: np.random.RandomState, n: int) -> FloatArray:
+            return rng.standard_normal((n, 3))
+
+        def log_density(self, points: FloatArray) -> FloatArray:
+            return np.zeros(points.shape[0])
 
     monkeypatch.setattr(sampling, "_start", near)
     monkeypatch.setattr(sampling, "Proposal", Local())
@@ -278,7 +279,7 @@ def test_a_walker_that_never_moves_is_no_convergence(monkeypatch: pytest.MonkeyP
     assert (np.asarray(caught.value.chains)[:, :, 0] == MEAN).all()
 
 
-@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 32), (2, 32), (5, 40)])
+@pytest.mark.parametrize(("n_dim", "walkers"), [(1, 16), (2, 16), (10, 20)])
 def test_starts_among_draws_are_some_of_them(n_dim: int, walkers: int) -> None:
     """So many walkers as the dimensions ask for begin at draws, no two at the same."""
     rng = np.random.default_rng(5)
@@ -318,7 +319,7 @@ def test_starts_among_few_draws_of_weight_spread_out() -> None:
 
 def test_too_few_draws_are_refused() -> None:
     """Where there are fewer draws than an ensemble has walkers the error gives both numbers."""
-    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 32 are needed.*widen") as caught:
+    with pytest.raises(NotConverged, match=r"7 draws lie inside .* 16 are needed.*widen") as caught:
         sample(gaussian, even(BEGIN.points[:7]), stream(3))
     assert np.asarray(caught.value.chains).shape == (7, 2)
 
