@@ -182,6 +182,8 @@ def reason(error: Exception, address: str) -> str:
     return without_secrets(first, address)
 
 
+# Addresses
+
 # A password that contains characters with a meaning in URLs could be read as a host or a port: such
 # an address does not match.
 _URL = re.compile(

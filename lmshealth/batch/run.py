@@ -376,6 +376,8 @@ def _record(
     return MachineRecord(machine, file, assessment, logs, before, language)
 
 
+# Watch
+
 _Files = dict[Path, tuple[int, int]]
 
 

@@ -553,6 +553,8 @@ def _seal(content: bytes, *place: Any) -> bytes:
     ).digest()
 
 
+# Cached functions
+
 Piece = TypeVar("Piece")
 Job = TypeVar("Job")
 Value = TypeVar("Value")
