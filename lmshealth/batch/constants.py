@@ -44,9 +44,6 @@ server has to answer when it is opened, ms in which it has to confirm what is se
 SCHEMA = 10
 """Version of the table of values, part of its name: tables of other versions are not read."""
 
-DASHBOARD_SCHEMA = 9
-"""Version of the tables of dashboards, part of their names."""
-
 SETTLED_S = 10
 """Seconds (s) after its last change from which the digest of a file may be kept: clocks of file
 systems have steps of up to 2 s, in which a file may change again unnoticed."""
@@ -81,10 +78,6 @@ ALERT_OUTPUT_BYTES = 1000
 ALERT_OUTPUT_S = 1.0
 """Seconds (s) that the end of its output may come after its own: a child that it leaves behind may
 hold its output open without end."""
-
-TRACK_POINTS = 1000
-"""Newest rows of track.csv of a machine that are in the store for dashboards: a year of daily logs
-of three modes. Writing them takes about 0.2 s, however many logs there are."""
 
 NOTIFY = "LMSHEALTH_NOTIFY"
 """Variable of the environment with the addresses of messengers, separated by blanks: they hold

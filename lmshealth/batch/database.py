@@ -13,7 +13,7 @@ from urllib.parse import parse_qsl, quote, unquote
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql, sqlite
-from sqlalchemy.engine import URL, Connection, Engine, make_url
+from sqlalchemy.engine import URL, Engine, make_url
 from sqlalchemy.exc import SQLAlchemyError
 from sqlalchemy.schema import CreateTable
 
@@ -38,57 +38,17 @@ class _Bytes(sql.LargeBinary):
         """Convert nothing: `Store` checks what it reads."""
 
 
-_METADATA = sql.MetaData()
-_DIGEST, _MOMENT = sql.String(64), sql.DateTime(timezone=True)
-
-
-def _key(name: str) -> sql.Column[str]:
-    return sql.Column(name, _DIGEST, primary_key=True)
-
-
-def _columns(kind: Any, names: str, *, nullable: bool = False) -> list[sql.Column[Any]]:
-    return [sql.Column(name, kind, nullable=nullable) for name in names.split()]
-
-
+_DIGEST = sql.String(64)
 VALUES = sql.Table(
     f"values_{constants.SCHEMA}",
-    _METADATA,
-    *(_key("kind"), _key("owner"), _key("key")),
-    *_columns(sql.Text, "name"),
-    *_columns(_Bytes, "content"),
+    sql.MetaData(),
+    *(sql.Column(name, _DIGEST, primary_key=True) for name in ("kind", "owner", "key")),
+    sql.Column("name", sql.Text, nullable=False),
+    sql.Column("content", _Bytes, nullable=False),
 )
 """All values that runs read, by their kind, the machine that they are of, and the fingerprint of
 what they depend on. The owner is a digest, because the name of a machine may be longer than an
 index allows; the name is for people."""
-
-# For dashboards: the present status of each machine, its values at logs, changes between runs.
-_N = constants.DASHBOARD_SCHEMA
-STATUS = sql.Table(
-    f"status_{_N}",
-    _METADATA,
-    _key("machine"),
-    *_columns(sql.Text, "name verdict service state alarms silent"),
-    *_columns(_MOMENT, "recorded_at"),
-    *_columns(sql.Float, "probability", nullable=True),
-    *_columns(sql.Date, "service_by inspect_by", nullable=True),
-)
-POINTS = sql.Table(
-    f"points_{_N}",
-    _METADATA,
-    *(_key("machine"), _key("key")),
-    *_columns(sql.Text, "name quantity subject"),
-    *_columns(_MOMENT, "recorded_at"),
-    *_columns(sql.Float, "low median high", nullable=True),
-)
-CHANGES = sql.Table(
-    f"changes_{_N}",
-    _METADATA,
-    *(_key("machine"), _key("key")),
-    *_columns(sql.Text, "name what before now"),
-    *_columns(_MOMENT, "recorded_at noticed_at"),
-)
-_CREATE_VIEW = {"sqlite": "CREATE VIEW IF NOT EXISTS", "postgresql": "CREATE OR REPLACE VIEW"}
-_VIEWS = {f"lmshealth_{one.name.split('_')[0]}": one for one in (STATUS, POINTS, CHANGES)}
 
 
 def is_older(tables: Iterable[str]) -> bool:
@@ -108,7 +68,7 @@ def connect(url: str | URL, *, create: bool) -> tuple[Engine, str, bool]:
     engine: Engine | None = None
     try:
         engine = _engine(make_url(url), create=create)
-        is_made_anew = create and _create_tables(engine)
+        is_made_anew = create and _create_table(engine)
         with engine.connect():
             return engine, address, is_made_anew
     except (SQLAlchemyError, ImportError, TypeError, ValueError) as error:
@@ -168,20 +128,18 @@ def _unwritable(path: Path) -> dict[str, str]:
     return {"mode": "ro"} | ({} if is_used else {"immutable": "1"})
 
 
-def _create_tables(engine: Engine) -> bool:
-    """Create the tables that are missing; another run may do so at the same time.
+def _create_table(engine: Engine) -> bool:
+    """Create the table if it is missing; another run may do so at the same time.
 
     Return whether there were tables of an older store, and none of this one.
     """
-    attempts = 3  # PostgreSQL may fail where two runs create the same table
+    attempts = 3  # PostgreSQL may fail where two runs create it
     for attempt in range(attempts):
         try:
             with engine.begin() as connection:
                 existing = set(sql.inspect(connection).get_table_names())
-                for table in _METADATA.sorted_tables:
-                    if table.name not in existing:
-                        connection.execute(CreateTable(table, if_not_exists=True))
-                _create_views(connection)
+                if VALUES.name not in existing:
+                    connection.execute(CreateTable(VALUES, if_not_exists=True))
             return VALUES.name not in existing and is_older(existing)
         except SQLAlchemyError:
             if attempt == attempts - 1:
@@ -189,27 +147,11 @@ def _create_tables(engine: Engine) -> bool:
     raise AssertionError  # the last attempt returns or raises
 
 
-def _create_views(connection: Connection) -> None:
-    """Create the views of dashboards, or make them those of this schema; rights on them stay."""
-    there = sql.inspect(connection)
-    existing = there.get_view_names()
-    for name, table in _VIEWS.items():
-        if name in existing:
-            if table.name in (there.get_view_definition(name) or ""):
-                continue
-            connection.execute(sql.text(f"DROP VIEW {name}"))
-        names = [column.name for column in table.columns if not column.primary_key]
-        columns = ", ".join("name AS stage" if name == "name" else name for name in names)
-        create = _CREATE_VIEW[connection.dialect.name]
-        query = f"SELECT {columns} FROM {table.name}"  # noqa: S608 (names of this module)
-        connection.execute(sql.text(f"{create} {name} AS {query}"))
-
-
 # SQLite (beginning of its codes): faults of the computer, another process or its rights.
 _PASSING = ("FULL", "BUSY", "LOCKED", "IOERR", "NOMEM", "INTERRUPT", "PROTOCOL", "PERM", "AUTH")
 _COST = (
     "the next run then identifies all logs and assesses all machines again; comparisons with "
-    "earlier reports, earlier runs on dashboards and alerts that were not sent are lost"
+    "earlier reports and alerts that were not sent are lost"
 )
 
 
@@ -239,6 +181,8 @@ def reason(error: Exception, address: str) -> str:
     first = text.splitlines()[0] if text else type(error).__name__
     return without_secrets(first, address)
 
+
+# Addresses
 
 # A password that contains characters with a meaning in URLs could be read as a host or a port: such
 # an address does not match.

@@ -42,39 +42,6 @@ _logger = logging.getLogger(__name__)
 class Settings:
     """Settings of a run.
 
-    Attributes
-    ----------
-    store : str or None
-        SQLAlchemy URL; None for a SQLite file in the folder of the output.
-    workers : int
-        Processes of this machine; results do not depend on it. The command line takes one per
-        processor by default.
-    scheduler : str or None
-        Address of a Dask scheduler, whose workers replace the processes.
-    epochs : int
-        Most epochs per machine at which health is inferred.
-    seed : int
-        Of all random numbers.
-    columns : ColumnMap or None
-        How logs are read (`lmshealth.io.column_map.column_map`); None where their columns are those
-        of the log contract.
-    max_memory : float
-        Most memory in bytes that reading a log may take.
-    seconds_per_log : float
-        Most processor time in s that the identification of a log may take.
-    latest : datetime or None
-        Latest moment of a log or of maintenance; None for a day from now.
-    follow_links : bool
-        Whether symbolic links out of the folder of logs are followed.
-    alerts : Alerts
-        Which changes since the last run are delivered, and how.
-    today : date or None
-        Day whose end statuses are judged at, for runs that repeat; None for the moment of the run.
-    language : str
-        Of the pages, ``en`` or ``de``; tables, status files and messages are English.
-    growing : frozenset of Path
-        Files that are left to a later run.
-
     Examples
     --------
     Two processes, and a store for a team; the password that its address may hold is not shown:
@@ -85,20 +52,23 @@ class Settings:
     (2, 40, False)
     """
 
-    store: str | None = field(default=None, repr=False)  # it may contain a password
-    workers: int = 1
-    scheduler: str | None = None
-    epochs: int = 40
-    seed: int = 0
+    # SQLAlchemy URL, which may contain a password; None for a SQLite file in the output's folder.
+    store: str | None = field(default=None, repr=False)
+    workers: int = 1  # processes of this machine; results do not depend on it
+    scheduler: str | None = None  # address of that of Dask, whose workers replace the processes
+    epochs: int = 40  # at most per machine, at which health is inferred
+    seed: int = 0  # of all random numbers
+    # How logs are read (`column_map`); None where their columns are those of the log contract.
     columns: ColumnMap | None = None
-    max_memory: float = MAX_MEMORY
-    seconds_per_log: float = constants.LOG_SECONDS
-    latest: datetime | None = None
-    follow_links: bool = False
-    alerts: Alerts = field(default_factory=Alerts)
+    max_memory: float = MAX_MEMORY  # in bytes, that reading a log may take
+    seconds_per_log: float = constants.LOG_SECONDS  # of the processor, to identify it
+    latest: datetime | None = None  # of logs and maintenance; None for a day from now
+    follow_links: bool = False  # out of the folder of logs
+    alerts: Alerts = field(default_factory=Alerts)  # which changes are delivered, and how
+    # At the end of this day statuses are judged, for runs that repeat; None for the present moment.
     today: date | None = None
-    language: Language = "en"
-    growing: frozenset[Path] = frozenset()
+    language: Language = "en"  # of the pages; tables, status files and messages are English
+    growing: frozenset[Path] = frozenset()  # files that are left to a later run
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""

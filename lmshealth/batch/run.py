@@ -30,8 +30,6 @@ from lmshealth.batch.outputs import (
     MachineOutput,
     MachineRecord,
     output_or_reason,
-    put_points,
-    put_status,
     write_tables,
 )
 from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
@@ -139,7 +137,6 @@ def run(
         done, made, tables, excluded = _report(usable, refused, resources, out, judging)
         with store.alone():  # a run that ends before its tables are written has announced nothing
             statuses, changes, notes = announce(store, made, judging.moment, settings.alerts, scope)
-            put_status(store, statuses, changes, judging.moment)
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
@@ -361,7 +358,6 @@ def _outputs(
     for [(machine, drawn)], is_new in drawing.values(machines, resources):
         name = machine.name
         if is_new and isinstance(drawn, MachineOutput):
-            put_points(store, name, drawn.points)
             store.put_part(name, own[name], pack(drawn))
         if drawn is not None:
             yield name, drawn
@@ -379,6 +375,8 @@ def _record(
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
     return MachineRecord(machine, file, assessment, logs, before, language)
 
+
+# Watch
 
 _Files = dict[Path, tuple[int, int]]
 

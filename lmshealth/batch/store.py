@@ -478,7 +478,12 @@ class Store:
             for key, content in values.items()
             for sealed in [_seal(content, kind, owner, key) + content]
         ]
-        self.upsert(VALUES, rows)
+        insert = INSERT[self._engine.dialect.name](VALUES).values(rows[0])
+        keys = [column.name for column in VALUES.primary_key]
+        rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
+        with self.transaction() as connection:
+            statement = insert.on_conflict_do_update(index_elements=keys, set_=rest)
+            connection.execute(statement, rows)
 
     def _keep(self, kind: str, machine: str, keys: Iterable[str]) -> None:
         """Delete the values of a machine under other keys."""
@@ -489,17 +494,6 @@ class Store:
     def _remove(self, kind: str, owner: str, key: str) -> None:
         with self.transaction() as connection:
             connection.execute(sql.delete(VALUES).filter_by(kind=kind, owner=owner, key=key))
-
-    def upsert(self, table: sql.Table, rows: Sequence[dict[str, Any]]) -> None:
-        """Write rows of a table in one statement; they replace those of the same keys."""
-        if not rows:
-            return
-        insert = INSERT[self._engine.dialect.name](table).values(rows[0])
-        keys = [column.name for column in table.primary_key]
-        rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
-        with self.transaction() as connection:
-            statement = insert.on_conflict_do_update(index_elements=keys, set_=rest)
-            connection.execute(statement, list(rows))
 
     # Statements
 
@@ -558,6 +552,8 @@ def _seal(content: bytes, *place: Any) -> bytes:
         content, digest_size=_SEAL_BYTES, key=hashlib.sha256(subject).digest()
     ).digest()
 
+
+# Cached functions
 
 Piece = TypeVar("Piece")
 Job = TypeVar("Job")

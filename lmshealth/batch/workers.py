@@ -55,15 +55,9 @@ class SchedulerError(LmshealthError):
 
 
 class Pool:
-    """Execute tasks in this process, one after the other.
+    """Execute tasks in this process, one after the other; other pools run ``size`` at a time."""
 
-    Other pools run ``size`` tasks at a time. Their executor is for the parts of one task, and its
-    futures raise one of ``crashes`` where a worker died.
-    """
-
-    executor: Executor | None = None
     size: int = 1
-    crashes: tuple[type[Exception], ...] = (BrokenExecutor,)
 
     def map_unordered(
         self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
@@ -275,19 +269,15 @@ class _Cluster(Pool):
     """Workers of a Dask cluster; its scheduler reruns what was on a worker that died."""
 
     def __init__(self, client: Any) -> None:
-        from distributed import KilledWorker
-
-        self.crashes = (BrokenExecutor, KilledWorker)
         self.client = client
-        self.executor: Executor = client.get_executor(pure=False)
         self.size = max(1, sum(client.nthreads().values()))
 
     def map_unordered(
         self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
-        # Not `submit` of the executor: a result that arrives as its worker dies is neither
+        # Not by the executor of the client: a result that arrives as its worker dies is neither
         # finished nor cancelled, which distributed/cfexecutor.py takes for an error.
-        from distributed import as_completed
+        from distributed import KilledWorker, as_completed
 
         completed: Any = as_completed  # the library has no types
         done = completed(loop=self.client.loop)
@@ -305,7 +295,7 @@ class _Cluster(Pool):
                 item = running.pop(future)
                 try:
                     result = future.result()
-                except self.crashes:
+                except (BrokenExecutor, KilledWorker):
                     result = on_crash(item, "every worker that took it ended")
                 yield item, result
         finally:

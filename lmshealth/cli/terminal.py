@@ -55,7 +55,7 @@ def _charset() -> str:
     return getattr(sys.stdout, "charset", None) or sys.stdout.encoding or "utf-8"
 
 
-def lost() -> OSError | None:
+def _lost() -> OSError | None:
     """Return why standard output takes no more, if it does not."""
     found: OSError | None = getattr(sys.stdout, "lost", None)
     return found
@@ -139,7 +139,7 @@ def standard_streams() -> Iterator[None]:
         yield
     except SystemExit as end:
         sys.stdout.flush()
-        error = lost()
+        error = _lost()
         if error is None:
             raise
         if error.errno != errno.EPIPE:  # of `| head`, which has read what it needs
@@ -147,6 +147,8 @@ def standard_streams() -> Iterator[None]:
             click.echo(f"lmshealth: {why}; files are not concerned", err=True)
         sys.exit(end.code or 1)
 
+
+# Texts, tables and progress bars
 
 # Columns of text in a pipe, and the most on a terminal; of a table in a pipe, which is never cut.
 _WIDTH, _WIDEST, _UNLIMITED = 78, 100, 10_000

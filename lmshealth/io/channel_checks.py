@@ -170,6 +170,8 @@ def _replaced(values: Samples, where: IntArray, what: FloatArray) -> Samples:
     return spool.samples()
 
 
+# Missing samples, constant value, clipping, dependence
+
 # Standard deviation of normal noise over the median of its magnitude, and samples of a block from
 # which the usual second difference is taken.
 _NORMAL, _SAMPLE = 1.4826, 1 << 12
@@ -323,6 +325,8 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
     n_below = sum(int(np.count_nonzero(sign * b > floor)) for _, b in blocks(values)) - n_at
     return n_at if n_at > constants.CLIPPING_RATIO * n_below else 0
 
+
+# Counters, bad samples, lost signs, levels
 
 # Samples over which what follows a blow is one with it.
 _BLOW = 10 * _ORDER

@@ -66,6 +66,8 @@ def _checked(given: Any, others: Sequence[Key]) -> Key:
 
 
 ChannelKind = Literal["displacement", "acceleration", "current"]
+# Logs
+
 _SUFFIXES = {"displacement": "m", "acceleration": "m_s2", "current": "a"}
 SI_UNITS = {"displacement": "m", "acceleration": "m/s²", "current": "A"}
 MOMENTS = f"from {constants.FIRST_MOMENT.date()} on, before {constants.LAST_MOMENT.date()}"
@@ -229,6 +231,8 @@ class Log(Result):
         kinds = [one.kind for one in self.channels]
         return {"channel": names, "kind": kinds, "unit": [SI_UNITS[kind] for kind in kinds]}
 
+
+# Metadata as text
 
 # Characters that no name has, as a class of regular expressions: control and bidirectional ones,
 # and those that nobody sees (soft hyphens, fillers, byte order marks, tags, selectors of variants).

@@ -166,6 +166,8 @@ def to_moments(path: Path, table: "pd.DataFrame", latest: datetime | None = None
     table["recorded_at"] = pd.Series(moments, table.index, dtype=object)
 
 
+# Folders and manifests
+
 MANIFEST = "manifest.csv"
 NOT_LOGS = frozenset({MANIFEST, "maintenance.csv", "truth.csv"})
 

@@ -176,6 +176,8 @@ def chi_square_band(dof: FloatArray) -> FloatArray:
     return np.stack([2 * gammaincinv(dof / 2, level) for level in (0.025, 0.975)])
 
 
+# Status
+
 DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINTENANCE_REQUIRED"]
 """State by NAMUR NE 107, as OPC 10000-100 names the values of ``DeviceHealthEnumeration``."""
 

@@ -130,6 +130,9 @@ State = Literal["good", "bad", "open"]
 _KM = 1000.0
 
 
+# Summaries
+
+
 @dataclass(frozen=True, slots=True)
 class ParameterHealth:
     """A health parameter now."""

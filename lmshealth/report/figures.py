@@ -350,12 +350,6 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     return legend(ax)
 
 
-def bars(ax: Axes, x: FloatArray, bounds: FloatArray, label: str, size: float) -> None:
-    """Draw points with bars from low, middle and high values, shape ``(3, n)``."""
-    style: Any = {"fmt": "o", "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
-    ax.errorbar(x, bounds[1], np.diff(bounds, axis=0), ms=size, label=label, **style)
-
-
 def _bands(ax: Axes, x: FloatArray, bands: FloatArray, name: str, *, informed: bool) -> None:
     """Draw median, 50 and 90 % bands; hatched and grey when mostly prior."""
     colour, line = (BLUE, "-") if informed else (MUTED, (0, (1, 2)))
@@ -747,7 +741,8 @@ def _logs(
     seen = seen[_thinned(seen.size)]
     bounds = per * np.exp(level[seen] + np.array([-2, 0, 2])[:, None] * std[seen])
     x = along(history)[seen]
-    bars(ax, x, bounds, tr("each log, ±2σ"), 3)
+    style: Any = {"fmt": "o", "ms": 3, "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
+    ax.errorbar(x, bounds[1], np.diff(bounds, axis=0), label=tr("each log, ±2σ"), **style)
     texts = [
         f"{title(history, k)}\n{fixed(value, 2)} ± {fixed(value * std[k], 2)}{GAP}{name}"
         for k, value in zip(seen.tolist(), bounds[1], strict=True)

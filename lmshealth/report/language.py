@@ -18,7 +18,7 @@ Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
 DOMAIN = "lmshealth"
 FACT = "fact"
-"""Context of sentences of results (`_private.names.fact`), which tables have in English."""
+"""Context of sentences of results (`_private.tables.fact`), which tables have in English."""
 
 _language: ContextVar[Language] = ContextVar("language", default="en")
 _MOST_TEXT = 3000  # characters of sentences that are looked up: a file may hold any text

@@ -390,6 +390,8 @@ def _seen(history: History) -> list[str]:
     return [mode for mode in history.modes if found[:, history.columns(mode)].any()]
 
 
+# Fleet page
+
 # Names of devices on Windows, with any file name extension.
 _DEVICES = re.compile(r"con|prn|aux|nul|(com|lpt)[0-9\u00b9\u00b2\u00b3]", re.IGNORECASE)
 _NAME_LENGTH = 60

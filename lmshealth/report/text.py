@@ -330,6 +330,9 @@ def _cell(form: str, row: Any, common: Sequence[Mapping[str, Any]]) -> str:
     return "–" if value is None or value != value else _FORMATTER.vformat(form, common, row)
 
 
+# Sentences of a summary
+
+
 def verdict_text(summary: Summary) -> str:
     """Return a verdict in words, with the parameters as the description names them."""
     from lmshealth.life.verdict import OUTSIDE_MAP  # late, as above

@@ -93,6 +93,9 @@ def decompose(values: FloatArray, sample_rate: float) -> Harmonics:
     )
 
 
+# Following error
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class FollowingError(ReadOnly):
     """Statistics and harmonics of one following-error channel of a log."""
@@ -194,6 +197,8 @@ def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, f
     scatter = float(np.average(var + (mean - total) ** 2, weights=size))
     return float(low.min()), float(high.max()), float(np.sqrt(scatter)), total
 
+
+# Levels of accelerations
 
 BandKind = Literal["mode", "grid", "health", "watch"]
 

@@ -218,6 +218,8 @@ def _basis(ordinates: slice, place: float, terms: int) -> FloatArray:
     return np.asarray(basis)
 
 
+# Spectra
+
 # Shortest period over the lag of the second difference of a displacement.
 _LAG_PERIODS = 8.0
 # Samples that fit into the processor's cache. Longer segments lose a few at their end for a fast

@@ -305,6 +305,9 @@ def _peak(power: FloatArray, at: int) -> float:
     return at + min(max(off, -0.5), 0.5)
 
 
+# Lines
+
+
 @dataclass(frozen=True, slots=True)
 class Line:
     """A narrow spectral line of a channel that is not a mode.

@@ -179,6 +179,9 @@ def marginal_covariance(fisher: FloatArray, n: int) -> FloatArray:
 Hindrance = Literal["too-short", "baseline", "parameters", ""]
 
 
+# Plans
+
+
 @dataclass(frozen=True, slots=True)
 class Effort:
     """Detection by logs of one duration."""

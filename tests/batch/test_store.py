@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import json
 import os
-import re
 import socket
 import sqlite3
 import sys
@@ -23,10 +21,8 @@ from sqlalchemy.exc import OperationalError
 
 from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
-from lmshealth.batch import store as store_module
 from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.database import StoreError
-from lmshealth.batch.outputs import points, put_points, put_status
 from lmshealth.batch.store import (
     Announced,
     Identified,
@@ -38,12 +34,11 @@ from lmshealth.batch.store import (
 )
 from lmshealth.io.log import Metadata, Refusal
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.status import Change, Status, compare, make_status
+from lmshealth.machine.status import Change, make_status
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
-from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from studies.harness.servers import wait_until
 from tests.assessments import leaves, worn
@@ -586,7 +581,7 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
 
 
 def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: Path) -> None:
-    """Of every table and view the other may be a moment quicker: both have it."""
+    """The other may be a moment quicker: both have the table."""
     path = tmp_path / "store.sqlite"
     made = []
 
@@ -601,7 +596,7 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
         Store(f"sqlite:///{path}").close()
     finally:
         event.remove(Engine, "before_cursor_execute", be_quicker)
-    assert len(made) == 4 + 3
+    assert len(made) == 1
 
 
 @pytest.mark.slow
@@ -668,89 +663,18 @@ def test_a_store_in_a_folder_of_any_name_is_opened_as_it_is(tmp_path: Path) -> N
     again.close()
 
 
-# Views for dashboards
-
-
-def rows_of(url: str, statement: str) -> list[dict[str, object]]:
-    """Ask a database, and give the rows by column."""
-    engine = create_engine(url)
-    try:
-        with engine.connect() as connection:
-            return [dict(row) for row in connection.execute(text(statement)).mappings()]
-    finally:
-        engine.dispose()
-
-
-def show(url: str, assessment: Assessment, changes: tuple[Change, ...] = ()) -> Status:
-    """Write what dashboards show of a machine."""
-    summary = summarise(assessment, assessment.service(), "a.html")
-    moment = summary.recorded_at + timedelta(hours=12)
-    status, _ = compare(None, make_status(assessment, summary), moment, None)
-    store = Store(url)
-    put_points(store, summary.identity, points(machine_tables(assessment)))
-    put_status(store, [status], changes, moment)
-    store.close()
-    return status
-
-
-def test_views_show_status_points_and_changes_once(url: str, tmp_path: Path) -> None:
-    """What is written twice is there once; values are those of the machine, moments in UTC."""
-    assessment = worn(tmp_path)
-    zone = timezone(timedelta(hours=2))
-    recorded_at = datetime(2026, 3, 1, 1, 30, tzinfo=zone)
-    changes = (Change("M7-Y", "alarm", "", "roll", recorded_at),)
-    for _ in range(2):
-        status = show(url, assessment, changes)
-    (shown,) = rows_of(url, "SELECT * FROM lmshealth_status")
-    assert (shown["stage"], shown["verdict"]) == ("M7-Y", "both")
-    assert shown["state"] == status.device_health == "MAINTENANCE_REQUIRED"
-    assert status.service_by is not None
-    assert str(shown["service_by"]) == status.service_by.isoformat()
-    (change,) = rows_of(url, "SELECT stage, recorded_at, what, now FROM lmshealth_changes")
-    moment = change.pop("recorded_at")
-    if isinstance(moment, datetime):
-        assert moment == recorded_at
-    else:
-        assert str(moment).startswith("2026-02-28 23:30:00")
-    assert change == {"stage": "M7-Y", "what": "alarm", "now": "roll"}
-    found = rows_of(url, "SELECT quantity, count(*) AS n FROM lmshealth_points GROUP BY quantity")
-    assert {row["quantity"]: row["n"] for row in found} == {
-        "health": 2 * len(assessment.history.logs),
-        "frequency_hz": 3 * len(assessment.history.logs),
-        "remaining_km": 3,
-    }
-
-
-def test_points_are_replaced_but_remaining_lives_stay(file_url: str, tmp_path: Path) -> None:
-    """A new assessment replaces what the old one had; what it predicted then is history."""
-    assessment = worn(tmp_path)
-    found = points(machine_tables(assessment))
-    later = [own | {"recorded_at": "2027-01-01T00:00:00+01:00"} for own in found]
-    store = Store(file_url)
-    put_points(store, "M7-Y", found)
-    put_points(store, "M7-Y", [own for own in later if own["subject"] in ("roll", "any")])
-    put_points(store, "M8-Y", [])
-    store.close()
-    rows = rows_of(file_url, "SELECT DISTINCT quantity, subject FROM lmshealth_points")
-    subjects = sorted(f"{row['quantity']} {row['subject']}" for row in rows)
-    expected = ["any", "guide_preload", "mount_stiffness"]
-    assert subjects == ["frequency_hz roll", *(f"remaining_km {name}" for name in expected)]
-    remaining = "SELECT * FROM lmshealth_points WHERE subject = 'any'"
-    assert len(rows_of(file_url, remaining)) == 2
+# Other formats
 
 
 def test_a_store_of_another_format_is_made_anew(url: str, tmp_path: Path) -> None:
-    """Its values are computed again, which is noted once; what dashboards show stays.
+    """Its values are computed again, which is noted once.
 
     Earlier formats were copied where no run computes a value again; a format is now only a cache.
     """
     assessment = worn(tmp_path)
     with closing(Store(url)) as store:
         assert store.notes == []
-        put_points(store, "M7-Y", points(machine_tables(assessment)))
         keep(store, "M7-Y", "k1", assessment)
-    shown = "SELECT * FROM lmshealth_points ORDER BY quantity, subject, recorded_at"
-    before = rows_of(url, shown)
     engine = create_engine(url)
     with engine.begin() as connection:
         connection.execute(text(f"ALTER TABLE {VALUES} RENAME TO values_{SCHEMA - 1}"))
@@ -758,56 +682,8 @@ def test_a_store_of_another_format_is_made_anew(url: str, tmp_path: Path) -> Non
     with closing(Store(url)) as store:
         assert "results of another version" in store.notes[0] and len(store.notes) == 1
         assert not store.has_assessment("M7-Y", "k1")
-        assert rows_of(url, shown) == before != []
     with closing(Store(url)) as store:
         assert store.notes == []
-
-
-def test_views_of_another_schema_are_replaced(file_url: str, tmp_path: Path) -> None:
-    """Dashboards keep their names of views; those of this schema stay as they are."""
-    Store(file_url).close()
-    path = tmp_path / "store.sqlite"
-    with closing(sqlite3.connect(path)) as older, older:
-        older.execute("DROP VIEW lmshealth_status")
-        older.execute("CREATE TABLE status_1 (name TEXT)")
-        older.execute("CREATE VIEW lmshealth_status AS SELECT name FROM status_1")
-    for _ in range(2):
-        Store(file_url).close()
-        assert rows_of(file_url, "SELECT state FROM lmshealth_status") == []
-
-
-def test_a_store_without_the_tables_of_dashboards_can_be_reported(file_url: str) -> None:
-    """They hold no results: a report does not need them."""
-    Store(file_url).close()
-    engine = create_engine(file_url)
-    with engine.begin() as connection:
-        for view in ("status", "points", "changes"):
-            connection.execute(text(f"DROP VIEW lmshealth_{view}"))
-            connection.execute(text(f"DROP TABLE {view}_{constants.DASHBOARD_SCHEMA}"))
-    engine.dispose()
-    Store(file_url, create=False).close()
-
-
-def queries() -> list[str]:
-    """List the queries of the dashboard, with what Grafana puts in for its macros."""
-    content = json.loads((Path(store_module.__file__).parent / "dashboard.json").read_text())
-    sql = [target["rawSql"] for panel in content["panels"] for target in panel["targets"]]
-    sql += [one["query"] for one in content["templating"]["list"] if one["type"] == "query"]
-    within = r"\1 BETWEEN '2020-01-01T00:00:00Z' AND '2030-01-01T00:00:00Z'"
-    filled = [re.sub(r"\$__timeFilter\((\w+)\)", within, one) for one in sql]
-    filled = [one.replace("${stage:sqlstring}", "'M7-Y'") for one in filled]
-    assert not [one for one in filled if "$" in one]
-    return filled
-
-
-def test_every_query_of_the_dashboard_has_rows(url: str, tmp_path: Path) -> None:
-    """The dashboard shows what the views have; a time series has a column of that name."""
-    assessment = worn(tmp_path)
-    change = Change("M7-Y", "verdict", "healthy", "both", assessment.judgement.recorded_at)
-    show(url, assessment, (change,))
-    found = [rows_of(url, query) for query in queries()]
-    assert len(found) == 7 and all(found)
-    assert [{"time", "metric", "median"} <= rows[0].keys() for rows in found].count(True) == 3
 
 
 def test_a_missing_driver_names_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:

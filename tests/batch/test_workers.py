@@ -379,7 +379,6 @@ def test_a_pool_of_one_is_this_process() -> None:
     """Nothing is started for it."""
     with processes(1) as pool:
         assert type(pool) is Pool
-        assert pool.executor is None
         assert dict(pool.map_unordered(process_of, [1], lost)) == {1: os.getpid()}
 
 

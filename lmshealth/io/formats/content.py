@@ -273,6 +273,8 @@ def over_frequency(column: str) -> Unusable:
     return Unusable("format", f"{what}; {needed}; {step} and phase_deg")
 
 
+# Channels
+
 # Names that exporters give to the column of times.
 _TIME = re.compile(r"(time|zeit|temps|tiempo|tempo|t|x_value|timestamp)\b", re.IGNORECASE)
 
@@ -435,6 +437,8 @@ def _with_unit(channel: Described, columns: ColumnMap) -> str:
         raise Unusable("unit", detail)
     return channel.name
 
+
+# Columns of times
 
 # End of the note of what was taken for what.
 SINCE_EPOCH = "since an epoch"
