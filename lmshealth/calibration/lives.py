@@ -223,7 +223,8 @@ def draw(
     covariates, declared = _covariates(rng, stage, n), _declared(rng, series, n)
     if first is not None:
         declared = (*declared, Step.found("step", first, n))
-    level, lone, walk = _modes(rng, stage, names, clock, (_path(stage, clock, parts), kind))
+    at = () if first is None else (float(clock[first - 1] + clock[first]) / 2,)
+    level, lone, walk = _modes(rng, stage, names, clock, (_path(stage, clock, parts), kind, at))
     level += _covariate_effects(rng, stage, covariates, n, len(names))
     mode = np.array([names.index(one.mode) for one in series])
     cov = _covariance(rng, stage, schedule, mode)
@@ -354,18 +355,19 @@ def _modes(
     stage: Stage,
     names: tuple[str, ...],
     clock: FloatArray,
-    path_and_kind: tuple[FloatArray, Kind | None],
+    course: tuple[FloatArray, Kind | None, tuple[float, ...]],
 ) -> tuple[FloatArray, int, float]:
     """Return ln f of the modes: health through a map that is wrong, and drifts of other causes.
 
-    Then as `without_health`.
+    The course of a life is that of its health, ``(n_logs, n_parameters)``, its kind, and the steps
+    that the tracker reports. Returned as by `without_health`.
     """
-    path, kind = path_and_kind
+    path, kind, steps = course
     x, wrong_by = np.log(path), map_std(rng, stage)
     level, *alone = stage.drifts(x, names)
     for own in alone:
         level = level + wrong_by * rng.standard_normal(len(names)) * own
-    moved, lone, walk = without_health(rng, stage, clock, len(names), kind)
+    moved, lone, walk = without_health(rng, stage, clock, len(names), kind, steps)
     known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
     return np.asarray(level + moved + known), lone, walk
 
@@ -376,8 +378,9 @@ def without_health(
     clock: FloatArray,
     n_modes: int,
     kind: Kind | None = None,
+    steps: tuple[float, ...] = (),
 ) -> tuple[FloatArray, int, float]:
-    """Draw intercepts, random walks, and the drift of a mode that moves alone.
+    """Draw intercepts, random walks, and the drift of a mode that moves alone, or jumps at a step.
 
     Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, or `NO_MODE`; and the
     standard deviation of the walks at the last log.
@@ -391,10 +394,10 @@ def without_health(
     else:
         stds, weights = zip(*of_life.LONE_WALKS, strict=True)
         walk = rng.choice(stds, p=weights)
-    steps = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
-    drift = np.cumsum(steps[:, None] * rng.standard_normal((clock.size, n_modes)), axis=0)
+    stds_of_logs = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
+    drift = np.cumsum(stds_of_logs[:, None] * rng.standard_normal((clock.size, n_modes)), axis=0)
     if lone != NO_MODE:
-        cov = of_life.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]))
+        cov = of_life.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]), steps)
         # It is 0 at the baseline: no Cholesky factor.
         drift[:, lone] += rng.multivariate_normal(np.zeros(clock.size), cov, method="eigh")
     level = constants.INTERCEPT_STD * rng.standard_normal(n_modes)
