@@ -239,7 +239,8 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
-    states: dict[str, State] = {"healthy": "good", OUTSIDE_MAP: "open"}
+    healthy: State = "open" if assessment.left_out else "good"  # until a jump is confirmed or not
+    states: dict[str, State] = {"healthy": healthy, OUTSIDE_MAP: "open"}
     states |= dict.fromkeys(NO_HEALTH, "open")
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     words = degraded_words(judgement.verdict)

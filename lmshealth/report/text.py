@@ -364,6 +364,8 @@ def headline(summary: Summary) -> str:
     if summary.alarmed:
         return tr("Alarm: unexplained change of {names}", names=joined(map(spell, summary.alarmed)))
     words = verdict_text(summary)
+    if summary.step.kind == "check-drift" and summary.probability >= 0:
+        words = tr("{verdict} before the last log, which deviates", verdict=words)
     return words[0].upper() + words[1:]
 
 

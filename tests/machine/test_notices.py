@@ -18,6 +18,7 @@ from lmshealth.machine.status import make_status, notices
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables
+from lmshealth.report.text import headline
 from tests.assessments import Assessment, Maker, make, nothing
 from tests.lives import FREQUENCY, MODES, make_reading, make_stage
 
@@ -168,7 +169,7 @@ def test_last_logs_that_are_left_out_are_counted(
     assert (told.severity, told.where) == (severity, "roll")
     assert ("last 2 logs" in told.what) == (len(epochs) > 1)
     # Before a service is planned by the logs that are left, the jump is confirmed or refuted.
-    steps = [summarise(one, one.service()).step.kind for one in (good, bad)]
-    assert steps[0] != steps[1] == "check-drift"
-    status = make_status(bad, summarise(bad, bad.service()))
-    assert "unconfirmed-jump" in status.conditions and status.device_health != "NORMAL"
+    before, after = (summarise(one, one.service()) for one in (good, bad))
+    assert before.step.kind != after.step.kind == "check-drift"
+    assert headline(after) == f"{headline(before)} before the last log, which deviates"
+    assert "unconfirmed-jump" in make_status(bad, after).conditions
