@@ -38,8 +38,7 @@ BEGIN, MONTHS, SECONDS, EDGE, LONE, HORIZON_DAYS = date(2025, 1, 1), 12, 6.0, 0.
 REPAIR, ENTERED, SILENT, SILENT_AFTER, FOREIGN = 130, 155, 170, 45, 185  # days
 LIMITS = {"guide preload": 0.6, "mount stiffness": 0.7}
 LOST = {part: 1 - 0.25 * (1 - limit) for part, limit in LIMITS.items()}
-_LEFT_OUT = "the first log after a jump or a repair not yet entered is left out until a second"
-NOT_MET = {"no sentence is false": _LEFT_OUT,
+NOT_MET = {"no sentence is false": "health is that before a jump until a second log shows it",
            "no alert of a healthy machine": "pages ask for more logs"}  # fmt: skip
 _PLAIN = str.maketrans("\u2011\u2212\u202f\xa0", "--  ")
 _DAY, _RANGE = r"(\d{4}-\d\d-\d\d)", r"(\d+)(?: %)? to (\d+) %"
@@ -182,9 +181,9 @@ def _sentences(page: str) -> Iterator[str]:
 class Truth:
     """What is true of a machine at the last log before a run."""
 
-    def __init__(self, machine: Machine, month: int) -> None:
+    def __init__(self, machine: Machine, month: int, back: int = 0) -> None:
         self.machine, self.month, self.today = machine, month, run_day(month)
-        self.n_logs, self.last = len(machine.days(self.today)), machine.days(self.today)[-1]
+        self.last = machine.days(self.today)[-1 - back]
         restored = [day for day, action in machine.works(self.today) if action == "preload-adjust"]
         self.base = next(day for day in machine.days() if day > max(restored, default=-1.0))
         days = range(int(self.base), int(self.last) + HORIZON_DAYS)
@@ -219,6 +218,9 @@ RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
     (f"Written on {_DAY}, last log {_DAY}", False,
      lambda m, t: (at(m[1]), at(m[2])) == (t.today, int(t.last))),
     (r".*no log for (\d+) days", False, lambda m, t: int(m[1]) == t.today - int(t.last)),
+    (r"(?:Verdict: )?(?:. )?(.*) before the last log, which deviates", False,
+     lambda m, t: Truth(t.machine, t.month, 1).verdict(m[1])),
+    ("Record a log at once", False, lambda m, t: t.unexplained),
     (r"(?:Verdict: )?(?:. )?(At the last log: healthy|Healthy|Loss of.*|Sudden change.*|A mode "
      r"moved alone.*)", False, lambda m, t: t.verdict(m[1])),
     ("(?:.*: )?(?:Ver|ver|reco)[a-z]+: (?:still|.* →) (.*)", False, lambda m, t: t.verdict(m[1])),
