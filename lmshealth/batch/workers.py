@@ -33,10 +33,10 @@ from urllib.parse import urlsplit
 from loky import ProcessPoolExecutor
 from threadpoolctl import threadpool_limits
 
-from lmshealth._private.interrupts import INTERRUPTS, ignore_interrupts
 from lmshealth._private.serialize import VERSION
 from lmshealth.batch import constants
 from lmshealth.errors import LmshealthError
+from lmshealth.io.formats.isolation import INTERRUPTS, ignore_interrupts
 
 Item = TypeVar("Item")
 Result = TypeVar("Result")

@@ -16,7 +16,6 @@ from typing import Any, NoReturn
 
 import click
 
-from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli.terminal import print_errors, standard_streams
 from lmshealth.errors import LmshealthError
 
@@ -41,7 +40,7 @@ _COMMANDS = {
     "watch": ("archive_commands", "Run over a folder of logs whenever logs arrive."),
 }
 # Python itself raises KeyboardInterrupt for SIGINT.
-_ENDS = INTERRUPTS - {signal.SIGINT}
+_ENDS = [one for one in signal.Signals if one.name in ("SIGTERM", "SIGHUP")]
 
 
 class _Interrupted(KeyboardInterrupt):

@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 
 from lmshealth.batch import alerts as alerting
-from lmshealth.batch import constants, ingest, outputs
+from lmshealth.batch import constants, ingest
 from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts, announce, run_command
 from lmshealth.batch.ingest import Settings
@@ -53,8 +53,8 @@ class Nights:
 
         monkeypatch.setattr(running, "datetime", Clock)
         monkeypatch.setattr(ingest, "identify_log", self.identify)
-        monkeypatch.setattr(outputs, "make_page", lambda *_, **__: "")
-        monkeypatch.setattr(outputs, "date_page", lambda *_: "")
+        monkeypatch.setattr(running, "make_page", lambda *_, **__: "")
+        monkeypatch.setattr(running, "date_page", lambda *_: "")
 
     def identify(
         self, task: Any, stages: tuple[Stage, ...], how: dict[str, Any], limit: float

@@ -11,7 +11,7 @@ import pytest
 from lmshealth._private.serialize import pack
 from lmshealth._private.tables import RUN_TABLES, TABLES
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.outputs import MachineRecord, machine_output, write_tables
+from lmshealth.batch.run import MachineRecord, machine_output, write_tables
 from lmshealth.io.log import Refusal
 from lmshealth.report.tables import csv_text, refused_rows
 from tests.assessments import worn

@@ -31,8 +31,9 @@ from lmshealth import examples
 from lmshealth._private.serialize import pack, unpack
 from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import assess as assessing
-from lmshealth.batch import constants, outputs, workers
+from lmshealth.batch import constants, workers
 from lmshealth.batch import ingest as ingesting
+from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, report, run
@@ -328,7 +329,7 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
         drawn.append(summary.file)
         return make_page(found, summary, **options)
 
-    monkeypatch.setattr(outputs, "make_page", counted)
+    monkeypatch.setattr(running, "make_page", counted)
     run(logs, [modes_only], out)
     before = tables(out), pages(out)
     (out / "test-A.html").unlink()
@@ -397,7 +398,7 @@ def run_twice(
     count(ingesting, "content_digest", "hashed", lambda path: path.name)
     count(ingesting, "read_log", "read", lambda path: path.name)
     count(assessing, "_assess_packed", "assessed", lambda job: job[0].name)
-    count(outputs, "make_page", "drawn", lambda found, *_: found.history.stage)
+    count(running, "make_page", "drawn", lambda found, *_: found.history.stage)
     patch.setattr(constants, "OTHERS_POLL_S", 0.05)
     patch.setattr(constants, "SETTLED_S", -1)
     patch.setattr(constants, "FILES_PER_HASH_TASK", 2)
@@ -675,7 +676,7 @@ def test_an_assessment_that_never_can_be_read_does_not_end_the_batch(
 ) -> None:
     """It is made once more, then its machine is named, and the run comes to its end."""
     logs = write_archive(tmp_path / "logs", 2)
-    monkeypatch.setattr(outputs, "unpack_or_none", lambda content, kind: None)
+    monkeypatch.setattr(running, "unpack_or_none", lambda content, kind: None)
     result = run(logs, [modes_only], tmp_path / "out")
     assert result.rows == ()
     assert result.failed == {"test-A": "its assessment cannot be read back from the store"}

@@ -13,9 +13,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lmshealth._private.interrupts import INTERRUPTS
 from lmshealth.cli import main as command_line
 from lmshealth.cli import terminal
+from lmshealth.io.formats.isolation import INTERRUPTS
 from tests.signals import write_archive_stage, write_log
 
 

@@ -19,7 +19,7 @@ from jinja2 import Environment
 from lmshealth._private.serialize import unpack
 from lmshealth._private.tables import REFUSALS, fact
 from lmshealth.batch.assess import pack_assessment
-from lmshealth.batch.outputs import MachineRecord, machine_output
+from lmshealth.batch.run import MachineRecord, machine_output
 from lmshealth.io.log import Refusal
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.life.verdict import OUTSIDE_MAP, judge

@@ -28,7 +28,6 @@ from typing import IO, Annotated, Any, NamedTuple
 import msgspec
 import numpy as np
 
-from lmshealth._private.interrupts import ignore_interrupts
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
 from lmshealth.io.buffers import Spool
@@ -36,6 +35,17 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable
+
+# Signals by which a user, a supervisor or a terminal that is closed ends a program.
+_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
+INTERRUPTS = frozenset(one for one in signal.Signals if one.name in _NAMES)
+
+
+def ignore_interrupts() -> None:
+    """Leave interrupts to the parent of this process: a group of processes gets them as one."""
+    for one in INTERRUPTS:
+        signal.signal(one, signal.SIG_IGN)
+
 
 _START = (
     "import sys; sys.path[:] = sys.argv[1:]; "
