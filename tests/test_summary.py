@@ -142,7 +142,6 @@ def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.Monkey
 def test_quick_form_records_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The quick form keeps and records nothing, and fails where a check fails."""
     monkeypatch.setattr("sys.argv", ["run.py", "--quick"])
-    (tmp_path / "run.py").write_text("def main() -> None:\n    pass\n")
     study = Study(str(tmp_path / "run.py"), "Is it so?")
     study.trials.once(abs, -1)
     with pytest.raises(SystemExit, match="it is"):

@@ -519,7 +519,7 @@ def test_no_life_without_convergence(
     monkeypatch.setattr("lmshealth.life.constants.MAX_CHAIN_STEPS", 40)
     with pytest.raises(NotConverged, match="after 40 steps") as caught:
         fit_life(history, stage, 1)
-    assert np.asarray(caught.value.chains).shape == (4, 40, 32, 4)
+    assert np.asarray(caught.value.chains).shape == (4, 40, 16, 4)
 
 
 # Changes without a law, modes that move alone, and fit
