@@ -28,18 +28,12 @@ SQLITE_BUSY_TIMEOUT_S = 300
 """Seconds (s) that a writer waits while other processes write to the same SQLite file: longer than
 a run that delivers its changes by two commands, each of which hangs."""
 
-KEEPALIVE = {"idle": 30, "interval": 10, "count": 3}
-"""When both ends of a connection to PostgreSQL probe one that is silent (s), again (s), and how
-often in vain: after a minute a run ends whose server was cut off, and the work of a computer that
-was cut off is left to other runs."""
+SERVER_TIMEOUT_S = 20
+"""Seconds (s) that a database server has to answer, unless its URL has ``connect_timeout``."""
 
-SERVER_LIMITS = {
-    "connect_timeout": 20,
-    "tcp_user_timeout": 60_000,
-    **{f"keepalives_{name}": value for name, value in KEEPALIVE.items()},
-}
-"""Options of libpq for a connection to PostgreSQL, which those of its URL override: s in which the
-server has to answer when it is opened, ms in which it has to confirm what is sent."""
+ANSWER_TIMEOUT_S = 60
+"""Seconds (s) that a PostgreSQL server has for an answer: a frozen one would be waited for without
+end. The largest answers, some 10 MB, take as long at 1.5 Mbit/s."""
 
 SCHEMA = 10
 """Version of the table of values, part of its name: tables of other versions are not read."""
@@ -50,6 +44,10 @@ systems have steps of up to 2 s, in which a file may change again unnoticed."""
 
 OTHERS_POLL_S = 1.0
 """Seconds (s) between two looks at work that other runs on the store have begun."""
+
+KEEPALIVE = {"idle": 30, "interval": 10, "count": 3}
+"""When PostgreSQL probes the connection of a run that is silent (s), again (s), and how often in
+vain: after a minute work of a computer that was cut off is left to other runs."""
 
 RETRIED_REASONS = ("missing-file", "changed", "too-large", "too-slow", "future")
 """Reasons of refusal that depend on more than the log: on the moment, ``--max-memory``,

@@ -5,9 +5,11 @@ No message quotes the secrets of an address.
 
 import os
 import re
+import socket
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
+from threading import Event, Timer
 from typing import Any
 from urllib.parse import parse_qsl, quote, unquote
 
@@ -88,8 +90,12 @@ def _engine(url: URL, *, create: bool) -> Engine:
     if kind != "sqlite":
         if url.drivername == kind:
             url = url.set(drivername="postgresql+psycopg")  # the driver that the extra installs
-        limits = {k: v for k, v in constants.SERVER_LIMITS.items() if k not in url.query}
-        return sql.create_engine(url, pool_pre_ping=True, connect_args=limits)
+        timeout = constants.SERVER_TIMEOUT_S
+        wait = {} if "connect_timeout" in url.query else {"connect_timeout": timeout}
+        engine = sql.create_engine(url, pool_pre_ping=True, connect_args=wait)
+        if url.drivername == "postgresql+psycopg":
+            sql.event.listen(engine, "do_connect", _connect_bounded)
+        return engine
     name = url.database or ":memory:"
     is_uri = name.startswith("file:")
     if create and not is_uri and not Path(name).parent.is_dir():
@@ -126,6 +132,39 @@ def _unwritable(path: Path) -> dict[str, str]:
         return {}
     is_used = path.with_name(path.name + "-wal").exists()
     return {"mode": "ro"} | ({} if is_used else {"immutable": "1"})
+
+
+def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, Any]) -> Any:
+    """Connect to PostgreSQL; a server that is frozen then ends a statement, a ping or a commit."""
+    from psycopg import Connection, OperationalError
+
+    class Bounded(Connection[Any]):
+        def wait(self, *given: Any, **more: Any) -> Any:
+            # libpq waits without end for a server whose system still confirms packets.
+            late = Event()
+            timer = Timer(constants.ANSWER_TIMEOUT_S, _hang_up, [self.fileno(), late])
+            timer.daemon = True
+            timer.start()
+            try:
+                return super().wait(*given, **more)
+            except OperationalError as error:
+                if late.is_set():
+                    why = f"the server has not answered for {constants.ANSWER_TIMEOUT_S} s"
+                    raise OperationalError(why) from error
+                raise
+            finally:
+                timer.cancel()
+
+    return Bounded.connect(*arguments, **options)
+
+
+def _hang_up(number: int, late: Event) -> None:
+    """Close both directions of a socket, which whoever waits for it notices."""
+    late.set()
+    connection = socket.socket(fileno=number)
+    with suppress(OSError):
+        connection.shutdown(socket.SHUT_RDWR)
+    connection.detach()
 
 
 def _create_table(engine: Engine) -> bool:

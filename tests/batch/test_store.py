@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import socket
 import sqlite3
 import sys
@@ -40,7 +41,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import SpectraSummary
 from lmshealth.signal.spectral_lines import Line
-from studies.harness.servers import wait_until
+from studies.harness.servers import Postgres, wait_until
 from tests.assessments import leaves, worn
 
 SCHEMA, VALUES = constants.SCHEMA, f"values_{constants.SCHEMA}"
@@ -209,13 +210,42 @@ def test_a_server_that_says_nothing_is_not_waited_for(
 ) -> None:
     """Its port may be that of something else. Two seconds are the shortest time-out of libpq."""
     needs("postgres")
-    monkeypatch.setitem(constants.SERVER_LIMITS, "connect_timeout", 60 if query else 2)
+    monkeypatch.setattr(constants, "SERVER_TIMEOUT_S", 60 if query else 2)
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
         begun = time.monotonic()
         with pytest.raises(StoreError, match="timeout"):
             Store(f"postgresql://me@127.0.0.1:{port}/fleet{query}")
     assert time.monotonic() - begun < 30
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("whole", [False, True])
+def test_a_frozen_server_is_not_waited_for(
+    whole: bool, postgres: Postgres, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A process of the server that is stopped, or all, ends a statement by a StoreError."""
+    monkeypatch.setattr(constants, "ANSWER_TIMEOUT_S", 1)
+    with postgres.database() as url, closing(Store(f"{url}?connect_timeout=2")) as store:
+        put_in(store, "before", reading())
+        with pytest.raises(StoreError, match="has not answered for 1 s; its results are kept"):
+            _ask(store, "SELECT pg_sleep(20)")
+        [frozen] = [int(str(row[0])) for row in _ask(store, "SELECT pg_backend_pid()")]
+        begun = time.monotonic()
+        try:
+            os.kill(frozen, signal.SIGSTOP)
+            if whole:
+                postgres.signal(signal.SIGSTOP)
+                with pytest.raises(StoreError, match=r"timeout|not answered"):
+                    put_in(store, "during", reading())
+            else:
+                # The connection is pinged first, and replaced.
+                put_in(store, "during", reading())
+        finally:
+            postgres.signal(signal.SIGCONT)
+            os.kill(frozen, signal.SIGCONT)
+        assert time.monotonic() - begun < 30
+        assert [key for key, _ in store.identified(["before"])] == ["before"]
 
 
 def test_runs_on_a_server_divide_their_work(database: str) -> None:
