@@ -104,6 +104,10 @@ class JointModel:
             r=block_diag(self.r, np.eye(1)),
         )
 
+    def with_static(self, static: float) -> JointModel:
+        """Return the model of the same expectation with another static response of all modes."""
+        return replace(self, static=static, rho=self.rho + self.phi * (self.static - static))
+
     def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
         floor, phi, rho = (own[list(kept)] for own in (self.floor, self.phi, self.rho))
