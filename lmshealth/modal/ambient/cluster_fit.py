@@ -49,6 +49,8 @@ _MOST_LINE_ROUNDS = 4
 _MOST_SLOPES = 400_000
 # Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
 _DOUBTFUL = 200.0
+# The bins of a first fit resolve this part of the median bandwidth.
+_FINER = 2.0
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
 _NARROWER = 0.7
 
@@ -98,6 +100,8 @@ class _Optimum:
     likelihood: Likelihood
     p: FloatArray
     misfit: float
+    near: FloatArray  # resonances in Hz that its bins are fine at
+    bandwidth: float  # that these bins resolve, in Hz
 
     @property
     def poles(self) -> FloatArray:
@@ -221,8 +225,9 @@ def fit_modes(
         return ClusterFit(None, short)
     data = mask_prominent_lines(data)
     collapsed: dict[str, Rejection] = {}
+    optimum: _Optimum | None = None
     for _ in range(_MOST_LINE_ROUNDS):
-        data, optimum, lines = _fit_beside_lines(data, targets)
+        data, optimum, lines = _fit_beside_lines(data, targets, optimum)
         collapsed |= lines
         if optimum is None:
             return ClusterFit(None, collapsed)
@@ -237,16 +242,16 @@ def fit_modes(
 
 
 def _fit_beside_lines(
-    data: ClusterData, targets: tuple[Target, ...]
+    data: ClusterData, targets: tuple[Target, ...], before: _Optimum | None
 ) -> tuple[ClusterData, _Optimum | None, dict[str, Rejection]]:
     """Fit modes, and mask lines that poles become; None where no mode is left.
 
-    A pole begins anew beside the first line that it became, as a mode may be there, too.
+    The fit starts from that ``before``, of the same targets with fewer lines masked. A pole begins anew beside the first line that it became, as a mode may be there, too.
     """
     begun: set[str] = set()
     rejected: dict[str, Rejection] = {}
     while targets:
-        optimum = _fit_and_prune(data, targets)
+        optimum = _fit_and_prune(data, targets, before)
         lines = optimum.likelihood.collapsed(optimum.p)
         if not lines:
             return data, optimum, rejected
@@ -264,7 +269,9 @@ def _fit_beside_lines(
     return data, None, rejected
 
 
-def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
+def _fit_and_prune(
+    data: ClusterData, targets: tuple[Target, ...], before: _Optimum | None
+) -> _Optimum:
     """Fit all modes, and drop those without evidence, the least likely first.
 
     Modes are tried without whose loss, all others fixed, is small; one that left its start is
@@ -272,10 +279,13 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
     """
 
     def solved(some: tuple[Target, ...]) -> _Optimum:
+        if before is not None and some is before.targets:
+            f, zeta = before.poles
+            return _solve(data, some, f, 2 * float(np.min(f * zeta)), before.p)
+        f = np.array([t.frequency for t in some])
         widths = [2 * t.frequency * t.damping_ratio for t in some]
-        # A pole that is narrow by error would need the finest bins.
-        bandwidth = max(min(widths), float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
-        return _solve(data, make_blocks(data, bandwidth, [t.frequency for t in some]), some)
+        # A pole that is narrow by error, as beside a line, would need the finest bins.
+        return _solve(data, some, f, max(min(widths), sorted(widths)[len(widths) // 2] / _FINER))
 
     pairs = zip(data.spectra.spectra, data.masks, strict=True)
     n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
@@ -506,11 +516,11 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
     if optimum.likelihood.collapsed(optimum.p):
         return optimum
     f, zeta = optimum.poles
-    bandwidth, expected = 2 * zeta * f, [2 * t.frequency * t.damping_ratio for t in optimum.targets]
-    apart = np.abs(f - [target.frequency for target in optimum.targets])
-    if (apart < bandwidth / 2).all() and bandwidth.min() > _NARROWER * min(expected):
+    bandwidth = 2 * zeta * f
+    moved = np.abs(f - optimum.near) >= bandwidth / 2
+    if not moved.any() and bandwidth.min() > _NARROWER * optimum.bandwidth:
         return optimum
-    least = max(float(bandwidth.min()), min(expected) / constants.DAMPING_SPAN)
+    least = max(float(bandwidth.min()), optimum.bandwidth / constants.DAMPING_SPAN)
     blocks = make_blocks(data, least, f.tolist())
     # One pole that is narrow by error must not make the bins of a wide band fine.
     while sum(b.frequency.size for b in blocks) * optimum.p.size > _MOST_SLOPES:
@@ -518,15 +528,21 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
         blocks = make_blocks(data, least, f.tolist())
     likelihood = replace(optimum.likelihood, blocks=blocks)
     p = likelihood.minimise(optimum.p)
-    return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p))
+    return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p), f, least)
 
 
 def _solve(
     data: ClusterData,
-    blocks: tuple[MeanOrdinates, ...],
     targets: tuple[Target, ...],
+    near: FloatArray,
+    bandwidth: float,
+    p: FloatArray | None = None,
 ) -> _Optimum:
-    """Find the posterior mode of a set of modes."""
+    """Find the posterior mode of a set of modes, with bins for a bandwidth at resonances, in Hz.
+
+    ``p`` is where the search starts, by default at the targets.
+    """
+    blocks = make_blocks(data, bandwidth, near.tolist())
     n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
@@ -566,8 +582,8 @@ def _solve(
         known_floors=n_channels < data.unit.size,
         narrowest=_COLLAPSED / data.duration,
     )
-    p = likelihood.minimise(start)
-    return _Optimum(targets, likelihood, p, likelihood.data_value(p))
+    p = likelihood.minimise(start if p is None else p)
+    return _Optimum(targets, likelihood, p, likelihood.data_value(p), near, bandwidth)
 
 
 def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:

@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth.modal import constants
 from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import (
     ClusterData,
@@ -22,9 +23,12 @@ from lmshealth.modal.ambient.cluster_fit import (
 )
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
+from lmshealth.modal.ambient.whittle import Likelihood
+from lmshealth.modal.identification import identify
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
+from studies.modes.described.worlds import case
 from tests.bands import PITCH, RATE, ROLL, both, fit, fit_spectra, found, spectra_of, with_mean
 from tests.signals import (
     Mode,
@@ -33,6 +37,7 @@ from tests.signals import (
     cut_band,
     displacements,
     make_log,
+    make_stage,
     mean_ordinate,
     of_channel,
     sine,
@@ -396,6 +401,28 @@ def band_of(*spectra: CrossSpectrum) -> ClusterData:
     log = LogSpectra(("acc_a", "acc_b", "acc_c"), ("acc",) * 3, spectra)
     binned = bin_spectra(log, LOW, HIGH, 0.8)
     return prepare(log, binned, (ROLL,), (LOW, HIGH))
+
+
+def test_a_pole_that_a_line_narrows_does_not_make_all_bins_fine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Mains on the flank of a mode: bins of its start (control) cost five times the work."""
+    one = case("mains in the band of a mode", 15)
+    rows = {f"acc_{c}": row for c, row in enumerate(one.samples.T)}
+    log = make_log(rows, one.sample_rate)
+    machine = make_stage([(f"m{k}", f, 0.012) for k, f in enumerate(one.declared)])
+    plain, work = Likelihood.derivatives, [0]
+
+    def derivatives(self: Likelihood, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        work[0] += sum(block.grid.size for block in self.blocks)
+        return plain(self, p)
+
+    monkeypatch.setattr(Likelihood, "derivatives", derivatives)
+    found, coarse = identify(log, machine), work[0]
+    np.testing.assert_allclose(found.frequency, one.frequency, rtol=0.005)
+    monkeypatch.setattr(cluster_fit, "_FINER", constants.SIMILAR_BANDWIDTH)
+    identify(log, machine)
+    assert work[0] - coarse > 5 * coarse
 
 
 def test_channels_that_see_the_mode_are_kept_in_units_of_their_noise() -> None:
