@@ -602,8 +602,8 @@ def _fit_group(
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    around, static = found.around(near, low, high), found.model.static
-    fit = fit_modes(around, binned, near, (low, high), static)
+    around, noise = found.around(near, low, high), found.noise(max(low, binned.frequency[0]), high)
+    fit = fit_modes(around, binned, near, (low, high), found.model.static, noise)
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

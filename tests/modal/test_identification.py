@@ -557,9 +557,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         targets: tuple[Target, ...],
         band: tuple[float, float],
         static: float,
+        noise: np.ndarray,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, binned, targets, band, static)
+        return fit_modes(view, binned, targets, band, static, noise)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen

@@ -212,12 +212,14 @@ def fit_modes(
     targets: tuple[Target, ...],
     band: tuple[float, float],
     static: float = 0.0,
+    noise: FloatArray | None = None,
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
 
-    ``static`` is the expected static response of the modes over their shapes.
+    ``static`` is the expected static response of the modes over their shapes, ``noise`` as in
+    `prepare`.
     """
-    data = replace(prepare(spectra, binned, targets, band), static=static)
+    data = replace(prepare(spectra, binned, targets, band, noise), static=static)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -334,14 +336,21 @@ def prepare(
     binned: BinnedSpectra,
     present: tuple[Target, ...],
     band: tuple[float, float],
+    noise: FloatArray | None = None,
 ) -> ClusterData:
-    """Cut out the band in Hz of the channels that show any of the modes, in units of noise."""
+    """Cut out the band in Hz of the channels that show any of the modes, in units of noise.
+
+    ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, by default what
+    binned levels show beside the modes and their neighbours.
+    """
     strength, misfit = fit_strengths(binned, present)
     gains = fit_strengths(binned, ())[1] - misfit
     index = [c for c, gain in enumerate(gains) if gain >= constants.ABSENT]
     index = index or [int(np.argmax(gains))]
     level = binned.level[index]
-    noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
+    if noise is None:
+        noise = np.maximum(strength[:, -1], 1e-2 * binned.level.min(axis=1))
+    noise = noise[index]
     unit = np.sqrt(noise)
     whole = spectra.select(index).each(partial(_over, unit=unit))
     cut = whole.each(lambda spectrum: spectrum.band(*band))
@@ -624,7 +633,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     observed = data.spectra.spectra, data.masks, expected
     unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
     # Squares of the ordinates near a mode are correlated where its excitation is not steady.
-    wider = np.sqrt([max(one.ratio, 1.0) for one in unsteady] * 2)
+    wider = np.sqrt([one.expected for one in unsteady] * 2)
     strength = likelihood.strength(p).sum(axis=0) / np.sum(shapes**2, axis=1)
     strength = strength * (seen**2 @ data.unit**2)
     each = zip(f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
@@ -656,7 +665,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     lines = _excluded_lines(data, f[narrow])
-    fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
+    fewer = max([one.expected for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
     return ClusterFit(ClusterModes(modes, np.array(_losses(optimum)), lines, fitted), rejected)

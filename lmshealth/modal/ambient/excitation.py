@@ -18,6 +18,8 @@ from lmshealth.signal.spectra import CrossSpectrum
 # then count over the same lags as those of the scores of ln f and ln ζ, whose correlation falls to
 # one half at a lag of the half-power bandwidth.
 _BAND = 3.4
+# Logarithms of the ratios over which the posterior is averaged.
+_LARGEST, _STEPS = 5.0, 501
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
@@ -26,7 +28,10 @@ _UNLIKELY = -4.0
 
 
 class Unsteadiness(NamedTuple):
-    """Mean square of the intensity over the square of its mean, and the ordinates it is from."""
+    """Mean square of the intensity over the square of its mean, and the ordinates it is from.
+
+    It is known to (r / n)^½: as many ordinates of a force of the true ratio r are independent.
+    """
 
     ratio: float
     n: int
@@ -36,6 +41,19 @@ class Unsteadiness(NamedTuple):
         """Whether a steady force would not show this ratio: its standard deviation is n^-½."""
         least = 1 + constants.UNSTEADY_SIGMAS / np.sqrt(max(self.n, 1))
         return bool(self.ratio > max(constants.UNSTEADY, least))
+
+    @property
+    def expected(self) -> float:
+        """Posterior mean of the ratio: of a force that is steady, or whose ratio is a power law."""
+        if not self.n:
+            return 1.0
+        x = np.linspace(0.0, _LARGEST, _STEPS)
+        std = np.sqrt(np.exp(x) / self.n)
+        log = -0.5 * ((np.log(self.ratio) - x) / std) ** 2 - np.log(std)
+        prior = np.exp(-x / constants.MEAN_LN_UNSTEADY)
+        weight = np.exp(log - log.max()) * prior / prior.sum()
+        weight[0] += np.exp(log[0] - log.max())
+        return float(weight @ np.exp(x) / weight.sum())
 
 
 def unsteadiness(
@@ -109,24 +127,33 @@ def average_colours(
         coloured = coloured.with_bump_std(std)
         moved = coloured.minimise(q)
         one = marginalise(coloured, moved)
-        # Another resonance than that of the white force is no estimate of it.
-        most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
-        same = (np.abs(one.mean - white.mean) < most).all()
-        if one.decrement < constants.WORST_DECREMENT and same:
+        if one.decrement < constants.WORST_DECREMENT:
             q = moved
-            found.append(one)
+            found.append(_of_same_modes(one, white))
             if one.log_evidence - flat.log_evidence < _UNLIKELY:
                 break
     if len(found) == 1:
         return Colour(white.mean, white.cov, 1.0)
-    chance, n_widths = constants.COLOURED_PROBABILITY, len(constants.WIDTHS_COLOUR)
-    prior = np.array([1 - chance] + [chance / n_widths] * (len(found) - 1))
-    weight = softmax([one.log_evidence for one in found] + np.log(prior))
+    weight = softmax([one.log_evidence for one in found])
     mean = weight @ [one.mean for one in found]
     apart = np.array([one.mean for one in found]) - mean
     cov = np.tensordot(weight, [one.cov for one in found], axes=1)
     cov = cov + (weight[:, None] * apart).T @ apart
     return Colour(white.mean + mean - flat.mean, cov / ratio, 1.0 - float(weight[0]))
+
+
+def _of_same_modes(coloured: Marginal, white: Marginal) -> Marginal:
+    """Replace the estimate of each mode that is another resonance than for a white force.
+
+    It was a pole that described the spectrum of the force, and is free where that has one.
+    """
+    n = white.mean.size // 2
+    most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
+    same = (np.abs(coloured.mean - white.mean) < most).reshape(2, n).all(axis=0)
+    kept = np.tile(same, 2)
+    both = kept[:, None] == kept
+    cov = np.where(kept[:, None] & kept, coloured.cov, np.where(both, white.cov, 0.0))
+    return coloured._replace(mean=np.where(kept, coloured.mean, white.mean), cov=cov)
 
 
 def place_bumps(f: FloatArray, zeta: FloatArray) -> FloatArray:

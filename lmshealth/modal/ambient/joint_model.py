@@ -196,6 +196,11 @@ class JointModel:
         b = part._columns(frequency) * self.data.scale[:, None]
         return np.asarray(b @ np.linalg.cholesky(part.r))
 
+    def floor_at(self, frequency: float) -> FloatArray:
+        """Return the floor of each channel at a frequency in Hz."""
+        place = int(np.abs(self.data.frequency - frequency).argmin())
+        return np.asarray(self.floor @ self.data.basis[:, place])
+
     def dispersions(self) -> FloatArray:
         """Return the dispersion of the residual of each channel given the others; 1 for noise.
 

@@ -86,9 +86,12 @@ class Found:
         """
         model = self.model
         mode = int(np.abs(model.f - target.frequency).argmin())
-        place = int(np.abs(model.data.frequency - target.frequency).argmin())
-        floor = model.floor @ model.data.basis[:, place]
+        floor = model.floor_at(target.frequency)
         return float((np.abs(model.phi[:, mode]) / (2 * model.zeta[mode] * np.sqrt(floor))).max())
+
+    def noise(self, low: float, high: float) -> FloatArray:
+        """Return the density of the noise of each channel in a band in Hz, in (m/s²)²/Hz."""
+        return self.model.floor_at((low * high) ** 0.5) * self.model.data.scale**2
 
     def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
         """Return the spectra from low to high Hz, with the other modes as foreign."""
