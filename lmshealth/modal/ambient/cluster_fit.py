@@ -248,7 +248,8 @@ def _fit_beside_lines(
 ) -> tuple[ClusterData, _Optimum | None, dict[str, Rejection]]:
     """Fit modes, and mask lines that poles become; None where no mode is left.
 
-    The fit starts from that ``before``, of the same targets with fewer lines masked. A pole begins anew beside the first line that it became, as a mode may be there, too.
+    The fit starts from that ``before``, of the same targets with fewer lines masked. A pole begins
+    anew beside the first line that it became, as a mode may be there, too.
     """
     begun: set[str] = set()
     rejected: dict[str, Rejection] = {}

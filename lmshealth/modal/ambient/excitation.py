@@ -18,8 +18,8 @@ from lmshealth.signal.spectra import CrossSpectrum
 # then count over the same lags as those of the scores of ln f and ln ζ, whose correlation falls to
 # one half at a lag of the half-power bandwidth.
 _BAND = 3.4
-# Logarithms of the ratios over which the posterior is averaged.
-_LARGEST, _STEPS = 5.0, 501
+# Values of the ratio's logarithm over which its posterior is averaged.
+_STEPS = 501
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
@@ -47,7 +47,7 @@ class Unsteadiness(NamedTuple):
         """Posterior mean of the ratio: of a force that is steady, or whose ratio is a power law."""
         if not self.n:
             return 1.0
-        x = np.linspace(0.0, _LARGEST, _STEPS)
+        x = np.linspace(0.0, 1 + np.log(self.n), _STEPS)  # at least one is independent
         std = np.sqrt(np.exp(x) / self.n)
         log = -0.5 * ((np.log(self.ratio) - x) / std) ** 2 - np.log(std)
         prior = np.exp(-x / constants.MEAN_LN_UNSTEADY)
@@ -111,7 +111,7 @@ def average_colours(
     unsteadiness ``ratio`` are correlated, and count as so many fewer. Where the search for a
     posterior mode of coloured forces fails, the posterior remains, with a probability of one.
     """
-    flat, n = white, white.mean.size // 2
+    flat = white
     if ratio > 1:
         blocks = tuple(replace(b, count=b.count / ratio) for b in likelihood.blocks)
         likelihood = replace(likelihood, blocks=blocks)
@@ -143,16 +143,17 @@ def average_colours(
 
 
 def _of_same_modes(coloured: Marginal, white: Marginal) -> Marginal:
-    """Replace the estimate of each mode that is another resonance than for a white force.
+    """Leave modes that are other resonances than for a white force where they were.
 
-    It was a pole that described the spectrum of the force, and is free where that has one.
+    They may be poles that described the spectrum of the force: their covariance covers both.
     """
     n = white.mean.size // 2
     most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
     same = (np.abs(coloured.mean - white.mean) < most).reshape(2, n).all(axis=0)
     kept = np.tile(same, 2)
-    both = kept[:, None] == kept
-    cov = np.where(kept[:, None] & kept, coloured.cov, np.where(both, white.cov, 0.0))
+    apart = np.where(kept, 0.0, coloured.mean - white.mean)
+    cov = np.where(np.outer(~kept, ~kept), white.cov, 0.0) + np.outer(apart, apart)
+    cov = np.where(np.outer(kept, kept), coloured.cov, cov)
     return coloured._replace(mean=np.where(kept, coloured.mean, white.mean), cov=cov)
 
 

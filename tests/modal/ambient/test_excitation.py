@@ -71,7 +71,7 @@ def test_the_ratio_is_that_of_the_intensity(n_parts: int) -> None:
 
 @pytest.mark.parametrize("n", [50, 400])
 def test_the_ratio_is_as_sure_as_its_ordinates_are_many(n: int) -> None:
-    """What chance explains hardly widens; a clear ratio is itself; without ordinates there is none."""
+    """Chance hardly widens, a clear ratio is itself, and without ordinates there is none."""
     chance = Unsteadiness(1 + 1 / np.sqrt(n), n).expected
     assert 1 < chance < 1 + 0.7 / np.sqrt(n)
     assert Unsteadiness(1 - 2 / np.sqrt(n), n).expected == pytest.approx(1, abs=0.03)

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from lmshealth import Modes, identify
+from lmshealth._private.arrays import FloatArray
 from lmshealth.io.log import Log
-from lmshealth.modal.ambient import search
+from lmshealth.modal.ambient import cluster_fit, search
+from lmshealth.modal.ambient.cluster_fit import ClusterData
 from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
 from lmshealth.modal.ambient.whittle import response
@@ -135,6 +137,29 @@ def test_more_channels_lose_no_mode(n: int) -> None:
         assert np.abs((found.ln_frequency - truth) / std).max() < 4
     assert all_.shape_channels == tuple(f"acc_{k:02d}" for k in range(n))
     assert not any(row.channel for row in all_.refused)
+
+
+def test_more_channels_make_no_interval_wider(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twelve as of four of them: flanks of modes elsewhere are no noise (the control)."""
+    rng = np.random.default_rng([45, 0])
+    shapes = rng.standard_normal((4, 12))
+    places = [(12.0, 0.012), (17.0, 0.01), (24.0, 0.013), (31.0, 0.01)]
+    modes = [Mode(f, zeta, 1.0, tuple(x)) for (f, zeta), x in zip(places, shapes, strict=True)]
+    values = accelerations(rng, modes, 24_000, 200.0, 0.1)
+    few, all_ = identified_from(values[:4]), identified_from(values)
+    plain, units = cluster_fit.prepare, list[FloatArray]()
+
+    def prepare(*given: Any) -> ClusterData:
+        units.append(plain(*given[:-1]).unit ** 2)
+        return plain(*given[:-1])
+
+    monkeypatch.setattr(cluster_fit, "prepare", prepare)
+    control = identified_from(values)
+    wider, less = (np.log(one.frequency_std / few.frequency_std) for one in (control, all_))
+    assert less.mean() < np.log(1.05)
+    assert less.max() < np.log(1.1)
+    assert wider.mean() > np.log(1.05)
+    assert np.median(np.concatenate(units)) > 10 * 0.1
 
 
 @pytest.mark.slow
