@@ -227,9 +227,8 @@ def fit_modes(
         return ClusterFit(None, short)
     data = mask_prominent_lines(data)
     collapsed: dict[str, Rejection] = {}
-    optimum: _Optimum | None = None
     for _ in range(_MOST_LINE_ROUNDS):
-        data, optimum, lines = _fit_beside_lines(data, targets, optimum)
+        data, optimum, lines = _fit_beside_lines(data, targets)
         collapsed |= lines
         if optimum is None:
             return ClusterFit(None, collapsed)
@@ -244,17 +243,16 @@ def fit_modes(
 
 
 def _fit_beside_lines(
-    data: ClusterData, targets: tuple[Target, ...], before: _Optimum | None
+    data: ClusterData, targets: tuple[Target, ...]
 ) -> tuple[ClusterData, _Optimum | None, dict[str, Rejection]]:
     """Fit modes, and mask lines that poles become; None where no mode is left.
 
-    The fit starts from that ``before``, of the same targets with fewer lines masked. A pole begins
-    anew beside the first line that it became, as a mode may be there, too.
+    A pole begins anew beside the first line that it became, as a mode may be there, too.
     """
     begun: set[str] = set()
     rejected: dict[str, Rejection] = {}
     while targets:
-        optimum = _fit_and_prune(data, targets, before)
+        optimum = _fit_and_prune(data, targets)
         lines = optimum.likelihood.collapsed(optimum.p)
         if not lines:
             return data, optimum, rejected
@@ -272,9 +270,7 @@ def _fit_beside_lines(
     return data, None, rejected
 
 
-def _fit_and_prune(
-    data: ClusterData, targets: tuple[Target, ...], before: _Optimum | None
-) -> _Optimum:
+def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
     """Fit all modes, and drop those without evidence, the least likely first.
 
     Modes are tried without whose loss, all others fixed, is small; one that left its start is
@@ -282,13 +278,11 @@ def _fit_and_prune(
     """
 
     def solved(some: tuple[Target, ...]) -> _Optimum:
-        if before is not None and some is before.targets:
-            f, zeta = before.poles
-            return _solve(data, some, f, 2 * float(np.min(f * zeta)), before.p)
         f = np.array([t.frequency for t in some])
         widths = [2 * t.frequency * t.damping_ratio for t in some]
         # A pole that is narrow by error, as beside a line, would need the finest bins.
-        return _solve(data, some, f, max(min(widths), sorted(widths)[len(widths) // 2] / _FINER))
+        bandwidth = max(min(widths), sorted(widths)[len(widths) // 2] / _FINER)
+        return _solve(data, some, f, bandwidth)
 
     pairs = zip(data.spectra.spectra, data.masks, strict=True)
     n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
@@ -546,12 +540,8 @@ def _solve(
     targets: tuple[Target, ...],
     near: FloatArray,
     bandwidth: float,
-    p: FloatArray | None = None,
 ) -> _Optimum:
-    """Find the posterior mode of a set of modes, with bins for a bandwidth at resonances, in Hz.
-
-    ``p`` is where the search starts, by default at the targets.
-    """
+    """Find the posterior mode of a set of modes, with bins for a bandwidth at resonances, in Hz."""
     blocks = make_blocks(data, bandwidth, near.tolist())
     n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
@@ -592,7 +582,7 @@ def _solve(
         known_floors=n_channels < data.unit.size,
         narrowest=_COLLAPSED / data.duration,
     )
-    p = likelihood.minimise(start if p is None else p)
+    p = likelihood.minimise(start)
     return _Optimum(targets, likelihood, p, likelihood.data_value(p), near, bandwidth)
 
 
