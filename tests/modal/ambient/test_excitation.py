@@ -132,17 +132,18 @@ def humped(seed: int) -> Log:
 def test_intervals_hold_beside_a_hump_of_the_force_as_they_do_not_for_a_white_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """95 % intervals of f miss in at most 2 of 8; of the control, a white force, in half of them.
+    """95 % intervals of f miss in at most 3 of 16; of the control, a white force, in 5 or more.
 
+    Calibrated intervals miss as often as the first once in 140 times, as the control once in 1000.
     The hump may be taken for another resonance, beside which the mode has a doubtful name or none.
     """
-    logs = [humped(seed) for seed in range(8)]
+    logs = [humped(seed) for seed in range(16)]
     ours = [identify(log, STAGE) for log in logs]
-    assert missed(ours) <= 2  # 0.6 % of calibrated intervals fail
-    assert sum(len(modes.names) for modes in ours) >= 7
+    assert missed(ours) <= 3
+    assert sum(len(modes.names) for modes in ours) >= 14
     monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
     control = [identify(log, STAGE) for log in logs]
-    assert missed(control) >= 4
+    assert missed(control) >= 5
     assert not any("coloured" in flags for modes in control for flags in modes.flags)
 
 
