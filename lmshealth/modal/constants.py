@@ -63,11 +63,12 @@ STABLE, LEAST_START, LEAST_EXCESS, MOST_FOUND = 0.4, 15.0, 40.0, 5
 # poor-fit; and the ordinates needed to measure it.
 LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30
 # Mean square of the intensity of a mode's excitation over the square of its mean, flagged as
-# unsteady: intervals are wider by a tenth; and standard deviations of steady noise above one.
-UNSTEADY, UNSTEADY_SIGMAS = 1.2, 5.0
-# Standard deviations of the heights of the log spectrum of coloured forces, prior probability of
-# them, and probability of one from which on modes are flagged.
-WIDTHS_COLOUR, COLOURED_PROBABILITY, COLOURED = (0.2, 0.5), 0.2, 0.99
+# unsteady: intervals are wider by a tenth; standard deviations of steady noise above one; and mean
+# of the exponential prior of the logarithm of an unsteady one, as probable as a steady one.
+UNSTEADY, UNSTEADY_SIGMAS, MEAN_LN_UNSTEADY = 1.2, 5.0, 0.5
+# Standard deviations of the heights of the log spectrum of coloured forces, each as probable as a
+# white force, and probability of a coloured one from which on modes are flagged.
+WIDTHS_COLOUR, COLOURED = (0.2, 0.5, 1.2), 0.99
 # Fourier frequencies in the half-power bandwidth below which a mode is flagged resolution-limited.
 RESOLVED = 4.0
 # Share of the search, or of the span of dampings, beyond which a mode is flagged at-bound.

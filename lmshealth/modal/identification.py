@@ -326,10 +326,14 @@ def read_ambient(
     tested = _thomson_lines(log, stretches, spans)
     masked_at = [f for _, f, _ in tested]
     cut = whole.each(lambda spectrum: spectrum.without(masked_at))
-    explore = partial(_explore, cut, spans, hints, masked_at, _TOP * log.sample_rate, progress)
-    sought, fits = explore(())
-    if suspected := _lines_at_modes(fits):
-        sought, fits = explore(suspected)
+    seek = partial(_search, cut, spans, hints, masked_at, progress)
+    fit = partial(_fit_groups, top=_TOP * log.sample_rate, progress=progress)
+    fits = fit(sought := seek(()))
+    # Without a further harmonic the search finds the same again.
+    if (suspected := _lines_at_modes(fits)) and _n_harmonics(
+        again := seek(suspected)
+    ) > _n_harmonics(sought):
+        fits = fit(sought := again)
     # Modes of the description outside the band take part where they are searched for.
     every = () if stage is None else choose_targets(stage)
     near = tuple(t for t in every if any(low <= t.frequency <= high for low, high in spans))
@@ -506,17 +510,14 @@ def _thomson_lines(
     ]
 
 
-def _explore(
-    spectra: LogSpectra,
-    spans: Sequence[tuple[float, float]],
-    hints: tuple[Target, ...],
-    lines: list[float],
-    top: float,
-    progress: Callable[[str, int, int], None],
-    suspected: Sequence[float],
-) -> tuple[tuple[Found, ...], list[ClusterFit]]:
-    """Search bands for modes, and fit these below ``top``; lines are masked; all are in Hz."""
-    sought = _search(spectra, spans, hints, lines, progress, suspected)
+def _n_harmonics(sought: Sequence[Found]) -> int:
+    return sum(len(part.harmonics) for part in sought)
+
+
+def _fit_groups(
+    sought: Sequence[Found], *, top: float, progress: Callable[[str, int, int], None]
+) -> list[ClusterFit]:
+    """Fit the modes that a search found, below ``top`` in Hz."""
     groups: dict[tuple[Target, ...], tuple[Found, tuple[Target, ...]]] = {}
     for part in sought:
         for group in split_groups(part.modes):
@@ -527,7 +528,7 @@ def _explore(
         progress("fitting", k, len(groups))
         fits += _fit_group(part, group, near, top)
     progress("fitting", len(groups), len(groups))
-    return sought, fits
+    return fits
 
 
 def _search(
@@ -601,8 +602,8 @@ def _fit_group(
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    around, static = found.around(near, low, high), found.model.static
-    fit = fit_modes(around, binned, near, (low, high), static)
+    around, noise = found.around(near, low, high), found.noise(max(low, binned.frequency[0]), high)
+    fit = fit_modes(around, binned, near, (low, high), found.model.static, noise)
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

@@ -557,9 +557,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         targets: tuple[Target, ...],
         band: tuple[float, float],
         static: float,
+        noise: np.ndarray,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, binned, targets, band, static)
+        return fit_modes(view, binned, targets, band, static, noise)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen
@@ -991,3 +992,27 @@ def test_stops_that_excite_nothing_leave_the_log_too_short() -> None:
     refused = r"too-short.*no segment of constant velocity.*decays after stops: no resonance"
     with pytest.raises(BadLog, match=refused):
         identify(log, make_stage([("a", 62.0, 0.02)]))
+
+
+def test_a_line_at_a_mode_that_is_no_harmonic_costs_no_second_fit(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The search for it finds nothing further, and its groups are those that were fitted."""
+    plain, fitted = modal._fit_group, [0]
+
+    def fit_group(*given: Any) -> list[ClusterFit]:
+        fitted[0] += 1
+        return plain(*given)
+
+    log, stage = one_mode_log(), make_stage(ROLL)
+    monkeypatch.setattr(modal, "_fit_group", fit_group)
+    found, once = identify(log, stage), fitted[0]
+    monkeypatch.setattr(modal, "_lines_at_modes", lambda _: [found.frequency[0]])
+    again = identify(log, stage)
+    assert fitted[0] == 2 * once
+    np.testing.assert_array_equal(again.estimate, found.estimate)
+    # Control: with a further harmonic the groups are fitted again.
+    counts = iter((1, 0))
+    monkeypatch.setattr(modal, "_n_harmonics", lambda _: next(counts))
+    identify(log, stage)
+    assert fitted[0] == 4 * once

@@ -49,6 +49,8 @@ _MOST_LINE_ROUNDS = 4
 _MOST_SLOPES = 400_000
 # Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
 _DOUBTFUL = 200.0
+# The bins of a first fit resolve this part of the median bandwidth.
+_FINER = 2.0
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
 _NARROWER = 0.7
 
@@ -98,6 +100,8 @@ class _Optimum:
     likelihood: Likelihood
     p: FloatArray
     misfit: float
+    near: FloatArray  # resonances in Hz that its bins are fine at
+    bandwidth: float  # that these bins resolve, in Hz
 
     @property
     def poles(self) -> FloatArray:
@@ -208,12 +212,14 @@ def fit_modes(
     targets: tuple[Target, ...],
     band: tuple[float, float],
     static: float = 0.0,
+    noise: FloatArray | None = None,
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
 
-    ``static`` is the expected static response of the modes over their shapes.
+    ``static`` is the expected static response of the modes over their shapes, ``noise`` as in
+    `prepare`.
     """
-    data = replace(prepare(spectra, binned, targets, band), static=static)
+    data = replace(prepare(spectra, binned, targets, band, noise), static=static)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -272,10 +278,11 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
     """
 
     def solved(some: tuple[Target, ...]) -> _Optimum:
+        f = np.array([t.frequency for t in some])
         widths = [2 * t.frequency * t.damping_ratio for t in some]
-        # A pole that is narrow by error would need the finest bins.
-        bandwidth = max(min(widths), float(np.median(widths)) / constants.SIMILAR_BANDWIDTH)
-        return _solve(data, make_blocks(data, bandwidth, [t.frequency for t in some]), some)
+        # A pole that is narrow by error, as beside a line, would need the finest bins.
+        bandwidth = max(min(widths), sorted(widths)[len(widths) // 2] / _FINER)
+        return _solve(data, some, f, bandwidth)
 
     pairs = zip(data.spectra.spectra, data.masks, strict=True)
     n_ordinates = sum(spectrum.count * int(mask.sum()) for spectrum, mask in pairs)
@@ -324,14 +331,21 @@ def prepare(
     binned: BinnedSpectra,
     present: tuple[Target, ...],
     band: tuple[float, float],
+    noise: FloatArray | None = None,
 ) -> ClusterData:
-    """Cut out the band in Hz of the channels that show any of the modes, in units of noise."""
+    """Cut out the band in Hz of the channels that show any of the modes, in units of noise.
+
+    ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, by default what
+    binned levels show beside the modes and their neighbours.
+    """
     strength, misfit = fit_strengths(binned, present)
     gains = fit_strengths(binned, ())[1] - misfit
     index = [c for c, gain in enumerate(gains) if gain >= constants.ABSENT]
     index = index or [int(np.argmax(gains))]
     level = binned.level[index]
-    noise = np.maximum(strength[index, -1], 1e-2 * level.min(axis=1))
+    if noise is None:
+        noise = np.maximum(strength[:, -1], 1e-2 * binned.level.min(axis=1))
+    noise = noise[index]
     unit = np.sqrt(noise)
     whole = spectra.select(index).each(partial(_over, unit=unit))
     cut = whole.each(lambda spectrum: spectrum.band(*band))
@@ -506,11 +520,11 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
     if optimum.likelihood.collapsed(optimum.p):
         return optimum
     f, zeta = optimum.poles
-    bandwidth, expected = 2 * zeta * f, [2 * t.frequency * t.damping_ratio for t in optimum.targets]
-    apart = np.abs(f - [target.frequency for target in optimum.targets])
-    if (apart < bandwidth / 2).all() and bandwidth.min() > _NARROWER * min(expected):
+    bandwidth = 2 * zeta * f
+    moved = np.abs(f - optimum.near) >= bandwidth / 2
+    if not moved.any() and bandwidth.min() > _NARROWER * optimum.bandwidth:
         return optimum
-    least = max(float(bandwidth.min()), min(expected) / constants.DAMPING_SPAN)
+    least = max(float(bandwidth.min()), optimum.bandwidth / constants.DAMPING_SPAN)
     blocks = make_blocks(data, least, f.tolist())
     # One pole that is narrow by error must not make the bins of a wide band fine.
     while sum(b.frequency.size for b in blocks) * optimum.p.size > _MOST_SLOPES:
@@ -518,15 +532,17 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
         blocks = make_blocks(data, least, f.tolist())
     likelihood = replace(optimum.likelihood, blocks=blocks)
     p = likelihood.minimise(optimum.p)
-    return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p))
+    return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p), f, least)
 
 
 def _solve(
     data: ClusterData,
-    blocks: tuple[MeanOrdinates, ...],
     targets: tuple[Target, ...],
+    near: FloatArray,
+    bandwidth: float,
 ) -> _Optimum:
-    """Find the posterior mode of a set of modes."""
+    """Find the posterior mode of a set of modes, with bins for a bandwidth at resonances, in Hz."""
+    blocks = make_blocks(data, bandwidth, near.tolist())
     n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
     # A strength of zero would leave a mode without a gradient.
@@ -567,7 +583,7 @@ def _solve(
         narrowest=_COLLAPSED / data.duration,
     )
     p = likelihood.minimise(start)
-    return _Optimum(targets, likelihood, p, likelihood.data_value(p))
+    return _Optimum(targets, likelihood, p, likelihood.data_value(p), near, bandwidth)
 
 
 def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
@@ -608,7 +624,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     observed = data.spectra.spectra, data.masks, expected
     unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
     # Squares of the ordinates near a mode are correlated where its excitation is not steady.
-    wider = np.sqrt([max(one.ratio, 1.0) for one in unsteady] * 2)
+    wider = np.sqrt([one.expected for one in unsteady] * 2)
     strength = likelihood.strength(p).sum(axis=0) / np.sum(shapes**2, axis=1)
     strength = strength * (seen**2 @ data.unit**2)
     each = zip(f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
@@ -640,7 +656,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     }
     narrow = [why is not None and why.reason == "line-not-mode" for why in judged]
     lines = _excluded_lines(data, f[narrow])
-    fewer = max([one.ratio for one in unsteady if one.is_clear], default=1.0)
+    fewer = max([one.expected for one in unsteady if one.is_clear], default=1.0)
     colour = average_colours(likelihood, p, white, fewer)
     modes = _averaged(modes, colour, wider, targets, duration)
     return ClusterFit(ClusterModes(modes, np.array(_losses(optimum)), lines, fitted), rejected)

@@ -18,6 +18,8 @@ from lmshealth.signal.spectra import CrossSpectrum
 # then count over the same lags as those of the scores of ln f and ln ζ, whose correlation falls to
 # one half at a lag of the half-power bandwidth.
 _BAND = 3.4
+# Values of the ratio's logarithm over which its posterior is averaged.
+_STEPS = 501
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
@@ -26,7 +28,10 @@ _UNLIKELY = -4.0
 
 
 class Unsteadiness(NamedTuple):
-    """Mean square of the intensity over the square of its mean, and the ordinates it is from."""
+    """Mean square of the intensity over the square of its mean, and the ordinates it is from.
+
+    It is known to (r / n)^½: as many ordinates of a force of the true ratio r are independent.
+    """
 
     ratio: float
     n: int
@@ -36,6 +41,19 @@ class Unsteadiness(NamedTuple):
         """Whether a steady force would not show this ratio: its standard deviation is n^-½."""
         least = 1 + constants.UNSTEADY_SIGMAS / np.sqrt(max(self.n, 1))
         return bool(self.ratio > max(constants.UNSTEADY, least))
+
+    @property
+    def expected(self) -> float:
+        """Posterior mean of the ratio: of a force that is steady, or whose ratio is a power law."""
+        if not self.n:
+            return 1.0
+        x = np.linspace(0.0, 1 + np.log(self.n), _STEPS)  # at least one is independent
+        std = np.sqrt(np.exp(x) / self.n)
+        log = -0.5 * ((np.log(self.ratio) - x) / std) ** 2 - np.log(std)
+        prior = np.exp(-x / constants.MEAN_LN_UNSTEADY)
+        weight = np.exp(log - log.max()) * prior / prior.sum()
+        weight[0] += np.exp(log[0] - log.max())
+        return float(weight @ np.exp(x) / weight.sum())
 
 
 def unsteadiness(
@@ -93,7 +111,7 @@ def average_colours(
     unsteadiness ``ratio`` are correlated, and count as so many fewer. Where the search for a
     posterior mode of coloured forces fails, the posterior remains, with a probability of one.
     """
-    flat, n = white, white.mean.size // 2
+    flat = white
     if ratio > 1:
         blocks = tuple(replace(b, count=b.count / ratio) for b in likelihood.blocks)
         likelihood = replace(likelihood, blocks=blocks)
@@ -109,24 +127,34 @@ def average_colours(
         coloured = coloured.with_bump_std(std)
         moved = coloured.minimise(q)
         one = marginalise(coloured, moved)
-        # Another resonance than that of the white force is no estimate of it.
-        most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
-        same = (np.abs(one.mean - white.mean) < most).all()
-        if one.decrement < constants.WORST_DECREMENT and same:
+        if one.decrement < constants.WORST_DECREMENT:
             q = moved
-            found.append(one)
+            found.append(_of_same_modes(one, white))
             if one.log_evidence - flat.log_evidence < _UNLIKELY:
                 break
     if len(found) == 1:
         return Colour(white.mean, white.cov, 1.0)
-    chance, n_widths = constants.COLOURED_PROBABILITY, len(constants.WIDTHS_COLOUR)
-    prior = np.array([1 - chance] + [chance / n_widths] * (len(found) - 1))
-    weight = softmax([one.log_evidence for one in found] + np.log(prior))
+    weight = softmax([one.log_evidence for one in found])
     mean = weight @ [one.mean for one in found]
     apart = np.array([one.mean for one in found]) - mean
     cov = np.tensordot(weight, [one.cov for one in found], axes=1)
     cov = cov + (weight[:, None] * apart).T @ apart
     return Colour(white.mean + mean - flat.mean, cov / ratio, 1.0 - float(weight[0]))
+
+
+def _of_same_modes(coloured: Marginal, white: Marginal) -> Marginal:
+    """Leave modes that are other resonances than for a white force where they were.
+
+    They may be poles that described the spectrum of the force: their covariance covers both.
+    """
+    n = white.mean.size // 2
+    most = np.append(2 * np.exp(white.mean[n:]), np.ones(n))
+    same = (np.abs(coloured.mean - white.mean) < most).reshape(2, n).all(axis=0)
+    kept = np.tile(same, 2)
+    apart = np.where(kept, 0.0, coloured.mean - white.mean)
+    cov = np.where(np.outer(~kept, ~kept), white.cov, 0.0) + np.outer(apart, apart)
+    cov = np.where(np.outer(kept, kept), coloured.cov, cov)
+    return coloured._replace(mean=np.where(kept, coloured.mean, white.mean), cov=cov)
 
 
 def place_bumps(f: FloatArray, zeta: FloatArray) -> FloatArray:

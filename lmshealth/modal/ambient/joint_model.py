@@ -104,6 +104,10 @@ class JointModel:
             r=block_diag(self.r, np.eye(1)),
         )
 
+    def with_static(self, static: float) -> JointModel:
+        """Return the model of the same expectation with another static response of all modes."""
+        return replace(self, static=static, rho=self.rho + self.phi * (self.static - static))
+
     def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
         floor, phi, rho = (own[list(kept)] for own in (self.floor, self.phi, self.rho))
@@ -191,6 +195,11 @@ class JointModel:
         part = self.subset(kept)
         b = part._columns(frequency) * self.data.scale[:, None]
         return np.asarray(b @ np.linalg.cholesky(part.r))
+
+    def floor_at(self, frequency: float) -> FloatArray:
+        """Return the floor of each channel at a frequency in Hz."""
+        place = int(np.abs(self.data.frequency - frequency).argmin())
+        return np.asarray(self.floor @ self.data.basis[:, place])
 
     def dispersions(self) -> FloatArray:
         """Return the dispersion of the residual of each channel given the others; 1 for noise.

@@ -11,7 +11,7 @@ is proportional to their number.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 
@@ -86,9 +86,12 @@ class Found:
         """
         model = self.model
         mode = int(np.abs(model.f - target.frequency).argmin())
-        place = int(np.abs(model.data.frequency - target.frequency).argmin())
-        floor = model.floor @ model.data.basis[:, place]
+        floor = model.floor_at(target.frequency)
         return float((np.abs(model.phi[:, mode]) / (2 * model.zeta[mode] * np.sqrt(floor))).max())
+
+    def noise(self, low: float, high: float) -> FloatArray:
+        """Return the density of the noise of each channel in a band in Hz, in (m/s²)²/Hz."""
+        return self.model.floor_at((low * high) ** 0.5) * self.model.data.scale**2
 
     def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
         """Return the spectra from low to high Hz, with the other modes as foreign."""
@@ -131,7 +134,7 @@ def search(
         first = _informative(spectra, low, high)
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
-    model = _without_splits(model, len(hints)).refined(_SWEEPS)
+    model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
@@ -240,7 +243,10 @@ def _explain(
         ]
         candidates += candidates_at(spectra, hints, high)
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
-        model = _select(_start(_bin(spectra, candidates, low, high), candidates).refined(6))
+        start = _start(_bin(spectra, candidates, low, high), candidates)
+        # Floors and strengths of a start are those of c = 0: refined models are compared.
+        refined = [replace(start, static=c).refined(6) for c in _STATICS]
+        model = _select(_with_likelier_static(min(refined, key=lambda one: one.misfit)))
         harmonic = find_harmonic(model, recording, harmonics, suspected)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
             return model, tuple(harmonics), spectra, poles
@@ -251,6 +257,15 @@ def _explain(
             )
         else:
             spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=harmonic.expected))
+
+
+def _with_likelier_static(model: JointModel) -> JointModel:
+    """Choose the static response of all modes that leaves least to that of each.
+
+    The expectation is the same: which of two refined models has the higher likelihood depends more
+    on where their refinement ended.
+    """
+    return min((model.with_static(c) for c in _STATICS), key=lambda one: one.misfit)
 
 
 def _without_splits(model: JointModel, most: int) -> JointModel:
@@ -471,8 +486,7 @@ def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
     r = np.real(s * np.outer(turn.conj(), turn)) / np.outer(root, root)
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
     real = np.real(phi[chosen] * turn[:, None]).T * (root / peak[chosen])
-    poles = f[chosen], zeta[chosen], real, np.zeros_like(real), r
-    return min((JointModel(data, floor, *poles, c) for c in _STATICS), key=lambda one: one.misfit)
+    return JointModel(data, floor, f[chosen], zeta[chosen], real, np.zeros_like(real), r)
 
 
 def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:

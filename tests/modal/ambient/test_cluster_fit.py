@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth.modal import constants
 from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import (
     ClusterData,
@@ -22,10 +23,24 @@ from lmshealth.modal.ambient.cluster_fit import (
 )
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
+from lmshealth.modal.ambient.whittle import Likelihood
+from lmshealth.modal.identification import identify
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
-from tests.bands import PITCH, RATE, ROLL, both, fit, fit_spectra, found, spectra_of, with_mean
+from studies.modes.described.worlds import case
+from tests.bands import (
+    PITCH,
+    RATE,
+    ROLL,
+    as_if_white,
+    both,
+    fit,
+    fit_spectra,
+    found,
+    spectra_of,
+    with_mean,
+)
 from tests.signals import (
     Mode,
     Spectrum,
@@ -33,6 +48,7 @@ from tests.signals import (
     cut_band,
     displacements,
     make_log,
+    make_stage,
     mean_ordinate,
     of_channel,
     sine,
@@ -281,8 +297,12 @@ def fit_mean(
 
 
 @pytest.mark.slow
-def test_the_mean_of_parts_is_as_sure_as_the_whole_record() -> None:
-    """Ten parts of 20 s averaged have their truth within 4σ, and the σ of 200 s within a tenth."""
+def test_the_mean_of_parts_is_as_sure_as_the_whole_record(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Ten parts of 20 s averaged have their truth within 4σ, and the σ of 200 s within a tenth.
+
+    Of forces that are taken as white: what one record shows of their colour is chance.
+    """
+    monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
     values = both(seed=7, n=200_000)
     whole, mean = fit_mean(mean_of(values, 1)), fit_mean(mean_of(values, 10))
     assert np.abs(off(mean)).max() < 4
@@ -396,6 +416,28 @@ def band_of(*spectra: CrossSpectrum) -> ClusterData:
     log = LogSpectra(("acc_a", "acc_b", "acc_c"), ("acc",) * 3, spectra)
     binned = bin_spectra(log, LOW, HIGH, 0.8)
     return prepare(log, binned, (ROLL,), (LOW, HIGH))
+
+
+def test_a_pole_that_a_line_narrows_does_not_make_all_bins_fine(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Mains on the flank of a mode: bins of its start (control) cost five times the work."""
+    one = case("mains in the band of a mode", 15)
+    rows = {f"acc_{c}": row for c, row in enumerate(one.samples.T)}
+    log = make_log(rows, one.sample_rate)
+    machine = make_stage([(f"m{k}", f, 0.012) for k, f in enumerate(one.declared)])
+    plain, work = Likelihood.derivatives, [0]
+
+    def derivatives(self: Likelihood, p: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        work[0] += sum(block.grid.size for block in self.blocks)
+        return plain(self, p)
+
+    monkeypatch.setattr(Likelihood, "derivatives", derivatives)
+    found, coarse = identify(log, machine), work[0]
+    np.testing.assert_allclose(found.frequency, one.frequency, rtol=0.005)
+    monkeypatch.setattr(cluster_fit, "_FINER", constants.SIMILAR_BANDWIDTH)
+    identify(log, machine)
+    assert work[0] - coarse > 5 * coarse
 
 
 def test_channels_that_see_the_mode_are_kept_in_units_of_their_noise() -> None:

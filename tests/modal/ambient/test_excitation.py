@@ -69,8 +69,19 @@ def test_the_ratio_is_that_of_the_intensity(n_parts: int) -> None:
     assert shaken.is_clear
 
 
-def test_bursts_widen_the_intervals_and_are_flagged() -> None:
-    """The control, a steady force, is neither."""
+@pytest.mark.parametrize("n", [50, 400])
+def test_the_ratio_is_as_sure_as_its_ordinates_are_many(n: int) -> None:
+    """Chance hardly widens, a clear ratio is itself, and without ordinates there is none."""
+    chance = Unsteadiness(1 + 1 / np.sqrt(n), n).expected
+    assert 1 < chance < 1 + 0.7 / np.sqrt(n)
+    assert Unsteadiness(1 - 2 / np.sqrt(n), n).expected == pytest.approx(1, abs=0.03)
+    assert Unsteadiness(3.0, n).expected == pytest.approx(3, rel=0.05)
+    assert Unsteadiness(1.0, 0).expected == 1
+
+
+def test_bursts_widen_the_intervals_and_are_flagged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The control, a steady force, is neither; of forces that are taken as white."""
+    monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
     unsteady, steady = (identify(forced(3, i), STAGE) for i in (bursts(0.3), np.ones(24_000)))
     assert unsteady.flags == ("unsteady",)
     assert steady.flags == ("",)
@@ -121,17 +132,18 @@ def humped(seed: int) -> Log:
 def test_intervals_hold_beside_a_hump_of_the_force_as_they_do_not_for_a_white_one(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """95 % intervals of f miss in at most 2 of 8; of the control, a white force, in half of them.
+    """95 % intervals of f miss in at most 3 of 16; of the control, a white force, in 5 or more.
 
+    Calibrated intervals miss as often as the first once in 140 times, as the control once in 1000.
     The hump may be taken for another resonance, beside which the mode has a doubtful name or none.
     """
-    logs = [humped(seed) for seed in range(8)]
+    logs = [humped(seed) for seed in range(16)]
     ours = [identify(log, STAGE) for log in logs]
-    assert missed(ours) <= 2  # 0.6 % of calibrated intervals fail
-    assert sum(len(modes.names) for modes in ours) >= 7
+    assert missed(ours) <= 3
+    assert sum(len(modes.names) for modes in ours) >= 14
     monkeypatch.setattr(cluster_fit, "average_colours", as_if_white)
     control = [identify(log, STAGE) for log in logs]
-    assert missed(control) >= 4
+    assert missed(control) >= 5
     assert not any("coloured" in flags for modes in control for flags in modes.flags)
 
 
@@ -173,9 +185,9 @@ def test_a_search_without_end_leaves_the_estimate_for_a_white_force_with_a_flag(
 
     monkeypatch.setattr(Likelihood, "minimise", astray)
     found = identify(log, STAGE)
-    # The hump is a second resonance, as part of the mode.
-    assert found.flags == ("coloured cluster",)
-    assert found.frequency[0] == pytest.approx(100.8, abs=0.8)
+    # The hump is a second resonance, beside which the name is doubtful.
+    assert found.flags == ("coloured doubtful-name",)
+    assert found.frequency[0] == pytest.approx(100.3, abs=0.2)
 
 
 def test_an_average_that_is_not_credible_leaves_the_mode(monkeypatch: pytest.MonkeyPatch) -> None:

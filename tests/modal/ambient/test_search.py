@@ -3,12 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lmshealth import Modes, identify
-from lmshealth.modal.ambient import search
+from lmshealth._private.arrays import FloatArray
+from lmshealth.io.log import Log
+from lmshealth.modal.ambient import cluster_fit, search
+from lmshealth.modal.ambient.cluster_fit import ClusterData
 from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
 from lmshealth.modal.ambient.whittle import response
@@ -135,6 +139,29 @@ def test_more_channels_lose_no_mode(n: int) -> None:
     assert not any(row.channel for row in all_.refused)
 
 
+def test_more_channels_make_no_interval_wider(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of twelve as of four of them: flanks of modes elsewhere are no noise (the control)."""
+    rng = np.random.default_rng([45, 0])
+    shapes = rng.standard_normal((4, 12))
+    places = [(12.0, 0.012), (17.0, 0.01), (24.0, 0.013), (31.0, 0.01)]
+    modes = [Mode(f, zeta, 1.0, tuple(x)) for (f, zeta), x in zip(places, shapes, strict=True)]
+    values = accelerations(rng, modes, 24_000, 200.0, 0.1)
+    few, all_ = identified_from(values[:4]), identified_from(values)
+    plain, units = cluster_fit.prepare, list[FloatArray]()
+
+    def prepare(*given: Any) -> ClusterData:
+        units.append(plain(*given[:-1]).unit ** 2)
+        return plain(*given[:-1])
+
+    monkeypatch.setattr(cluster_fit, "prepare", prepare)
+    control = identified_from(values)
+    wider, less = (np.log(one.frequency_std / few.frequency_std) for one in (control, all_))
+    assert less.mean() < np.log(1.05)
+    assert less.max() < np.log(1.1)
+    assert wider.mean() > np.log(1.05)
+    assert np.median(np.concatenate(units)) > 10 * 0.1
+
+
 @pytest.mark.slow
 def test_a_mode_that_only_later_channels_show_is_found() -> None:
     """One of three in twenty-four that is strong in three others, which are weak in the first."""
@@ -225,21 +252,25 @@ def test_harmonics_of_one_shaft_are_recognised_by_their_phases(wander: float) ->
     assert not fifth.follows(replace(second, frequency=8.8))  # no ratio of small numbers
 
 
+def shaken(rng: np.random.Generator, base_moves: bool, noise: float, shapes: np.ndarray) -> Log:
+    """Record two modes, 60 and 95 Hz, under white forces or over a base that moves."""
+    rate, n = 500.0, 60_000
+    f = np.fft.rfftfreq(n, 1 / rate)
+    x = noise * rng.standard_normal((4, n))
+    for frequency, zeta, shape in zip((60.0, 95.0), (0.012, 0.01), shapes, strict=True):
+        moved = response(np.array(frequency), np.array(zeta), f.clip(f[1])) - base_moves
+        moved *= np.fft.rfft(rng.standard_normal(n))
+        x += shape[:, None] * np.fft.irfft(moved, n)
+    return make_log({f"acc_{c}": row for c, row in enumerate(x)}, rate)
+
+
 @pytest.mark.parametrize("base_moves", [True, False])
 def test_the_static_response_is_that_of_what_moves(
     base_moves: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of absolute acceleration over a moving base it is -1, of a force 0; else poles take it."""
-    rng = np.random.default_rng(3)
-    rate, n = 500.0, 60_000
-    f = np.fft.rfftfreq(n, 1 / rate)
     shapes = np.array([[1.0, 0.7, -0.4, 0.9], [0.6, -1.0, 0.8, 0.5]])
-    x = 0.02 * rng.standard_normal((4, n))
-    for frequency, zeta, shape in zip((60.0, 95.0), (0.012, 0.01), shapes, strict=True):
-        moved = response(np.array(frequency), np.array(zeta), f.clip(f[1])) - base_moves
-        moved *= np.fft.rfft(rng.standard_normal(n))
-        x += shape[:, None] * np.fft.irfft(moved, n)
-    log = make_log({f"acc_{c}": row for c, row in enumerate(x)}, rate)
+    log = shaken(np.random.default_rng(3), base_moves, 0.02, shapes)
     (found,) = read_ambient(log, band=(40.0, 130.0)).sought
     assert found.model.static == -float(base_moves)
     assert found.model.f.size == 2
@@ -249,3 +280,30 @@ def test_the_static_response_is_that_of_what_moves(
     (control,) = read_ambient(log, band=(40.0, 130.0)).sought
     assert control.model.static == other
     assert control.model.misfit > found.model.misfit + 20 or control.model.f.size > 2
+
+
+@pytest.mark.parametrize("base_moves", [True, False])
+@pytest.mark.parametrize("seed", [4, 8])
+def test_noise_does_not_change_which_static_response_is_found(
+    seed: int, base_moves: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Starts of a moving base are likelier with 0, and a refinement may end anywhere (controls)."""
+    starts: list[JointModel] = []
+    plain = search._start
+
+    def start(*given: Any) -> JointModel:
+        starts.append(plain(*given))
+        return starts[-1]
+
+    monkeypatch.setattr(search, "_start", start)
+    rng = np.random.default_rng(seed)
+    shapes = rng.choice([-1, 1], (2, 4)) * 10 ** rng.uniform(-1, 0, (2, 4))
+    log = shaken(rng, base_moves, 0.3, shapes)
+    (found,) = read_ambient(log, band=(40.0, 130.0)).sought
+    assert found.model.static == -float(base_moves)
+    force, base = (replace(starts[0], static=c) for c in (0.0, -1.0))
+    assert force.misfit < base.misfit
+    # Of a force the base is likelier after the same sweeps, though both can express the same.
+    assert base.refined(6).misfit < force.refined(6).misfit
+    same = found.model.with_static(-1.0 - found.model.static)
+    np.testing.assert_allclose(same.expected, found.model.expected)
