@@ -157,7 +157,7 @@ def identify(
     ...     modes.frequency, modes.frequency_std, modes.damping_ratio, modes.damping_ratio_std
     ... ):
     ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
-    126.3 ± 0.1 Hz, 1.5% ± 0.1%
+    126.3 ± 0.2 Hz, 1.6% ± 0.1%
     """
     return read_modes(log, stage, channels=channels, band=band).modes
 
