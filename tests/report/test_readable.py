@@ -117,10 +117,17 @@ def seen_in_a_log(name: str = "log-9.h5", seed: int = 2) -> LogEstimates:
 
 
 def pages(make: Maker, folder: Path) -> list[Path]:
-    """Write pages of a worn, a partly determined and an unknown machine, and of the fleet."""
+    """Write pages of machines, and of the fleet.
+
+    Worn, partly determined, unknown, with a mode that moved alone, and with a last log left out.
+    """
     latest, before = seen_in_a_log("log-9.h5"), seen_in_a_log("log-1.h5", seed=3)
     worn = replace(make(), latest=latest, at_baseline=before)
-    machines = [worn, blind(make("M8-Y")), nothing(make("M9-Y"))]
+    alone, off = make("M5-Y"), make("M6-Y", wear_km=400000, floor=0.98)
+    alone = replace(alone, judgement=replace(alone.judgement, verdict="outside-map"))
+    assert off.track is not None
+    off = replace(off, track=replace(off.track, outliers=((len(off.track.logs) - 1, "roll"),)))
+    machines = [worn, blind(make("M8-Y")), nothing(make("M9-Y")), alone, off]
     found = write_report(folder / "out", machines, ())
     assert found[0].with_name("index.html").is_file()
     return sorted(found[0].parent.glob("*.html"))
