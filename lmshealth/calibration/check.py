@@ -160,7 +160,7 @@ class CalibrationCheck(Result):
 
         Found is what Holm's rule rejects even if all else is as stated.
         """
-        strictest = constants.FALSE_VERDICT / len(self.p_values)
+        strictest = constants.FALSE_VERDICT / max(len(self.p_values), 1)
         return tuple(
             name
             for name, row in self.controls.items()

@@ -143,6 +143,8 @@ def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
         found = (f"{_spelled(name)} (p = {check.p_values[name]:.2g})" for name in check.wrong)
         why = f"By {drawn}, not so: {'; '.join(found)}."
         return "bad", "The stated uncertainty is wrong", [why, family]
+    if not check.ranks:
+        return "open", "No life has a result", [f"None of {drawn} has a posterior."]
     if check.blind:
         faults = "; ".join(map(_spelled, check.blind))
         why = f"By {drawn} these faults would not be found: {faults}."

@@ -10,8 +10,6 @@ from lmshealth.stage.priors import Lognormal, Normal
 # What a life needs.
 MIN_LOGS = 3
 """Logs with an informative mode: with fewer, a slope is not separated from the intercept."""
-MAX_STEPS = 3
-"""Steps since the baseline; with more, every piece of the life is too short for a law."""
 MAX_LOGS = 200
 """Longer histories are condensed: the cost of Σ grows with the third power of the logs. Medians and
 widths of health change by less than a quarter of a 90 % interval when 240 logs become 40 (test)."""

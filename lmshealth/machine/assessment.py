@@ -124,11 +124,15 @@ class Assessment:
     @property
     def left_out(self) -> dict[str, int]:
         """Modes whose last logs are outliers of the track, and how many of these."""
-        track, left = self.track, dict[str, int]()
-        for epoch, mode in sorted(track.outliers, reverse=True) if track else ():
-            if epoch == len(self.history.logs) - 1 - left.get(mode, 0):
-                left[mode] = left.get(mode, 0) + 1
-        return left
+        history, outliers = self.history, set(self.track.outliers if self.track else ())
+        left: dict[str, int] = {}
+        for mode in {mode for _, mode in outliers}:
+            own = history.ln_frequency[:, list(history.columns(mode))]
+            seen = np.flatnonzero(np.isfinite(own).any(axis=1)).tolist()
+            last = (n for n, k in enumerate(seen[::-1]) if (k, mode) not in outliers)
+            if n := next(last, len(seen)):
+                left[mode] = n
+        return dict(sorted(left.items()))
 
     @property
     def compared(self) -> LogEstimates | None:

@@ -83,6 +83,15 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
         severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
         yield Notice("last-logs-left-out", severity, mode, more if n > 1 else one, to_do)
+    if track is not None and track.suspected is not None:
+        day = track.recorded_at[track.suspected.first].date().isoformat()
+        what = fact(
+            "The logs since {day} agree with each other, and not with those before: a jump that is "
+            "not certain yet.",
+            day=day,
+        )
+        to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
+        yield Notice("step-suspected", "caution", "", what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
         widened = track.widening[-1]
@@ -194,9 +203,9 @@ CHANGES: dict[str, tuple[Severity, str]] = {
     "inspection-overdue": ("caution", "`inspect_by` has passed"),
     "silent": ("caution", "no log for long"),
     "no-log-since-maintenance": ("note", "no log after the last work"),
-    "unconfirmed-jump": ("note", "the last log is far from those before it, and left out"),
+    "unconfirmed-jump": ("note", "the last logs are far from those before them"),
     "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
-    "recovered": ("note", "a verdict, a silence, an alarm or a late log has ended"),
+    "recovered": ("note", "a verdict, a silence, an alarm, a late log or a jump has ended"),
 }
 """Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
 kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
@@ -205,6 +214,9 @@ kind that is a code of `conditions` begins with that; ``recovered`` has what end
 # begin anew after they have ended, which is a change too.
 _ONCE = ("limit-reached", "large-drift", "unreliable", "service-due")
 _ENDING = ("inspection-overdue", "no-log-since-maintenance", "unconfirmed-jump")
+
+# Notices of a jump that later logs must confirm.
+_UNCONFIRMED = {"last-logs-left-out", "step-suspected"}
 
 UNKNOWN = "unknown"
 """Verdict on a machine that was sound at its last log, which is too old to rely on."""
@@ -284,7 +296,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
         ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
         ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
-        ("CHECK_FUNCTION", "unconfirmed-jump", "last-logs-left-out" in status.warnings),
+        ("CHECK_FUNCTION", "unconfirmed-jump", _UNCONFIRMED & status.warnings.keys()),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
         ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
         ("CHECK_FUNCTION", "silent", status.silent or today > _last_day(status)),

@@ -29,7 +29,7 @@ service date by further logs, plan the service of a sound or of a worn machine, 
 the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside``, ``drift`` (large, without a verdict, or a last log that is left out), ``open``
+# step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``open``
 # (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
 # where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
@@ -104,7 +104,7 @@ def _class_of(assessment: Assessment) -> str:
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
         return "alarm"
-    if assessment.drifted or (assessment.left_out and verdict != OUTSIDE_MAP):
+    if assessment.drifted or (assessment.left_out and verdict in ("healthy", *NO_HEALTH)):
         return "drift"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     return known.get(verdict, "loss")

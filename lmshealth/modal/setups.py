@@ -12,7 +12,7 @@ from itertools import chain
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.modal import constants
 from lmshealth.modal.log_estimates import LogEstimates
@@ -67,7 +67,15 @@ def merge_setups(setups: Sequence[LogEstimates]) -> LogEstimates:
 
 
 def _expect_connected(setups: Sequence[LogEstimates]) -> None:
-    """Require at least two set-ups, connected by common channels."""
+    """Require different logs of one machine, connected by common channels."""
+    machines = sorted({one.metadata.stage or "" for one in setups})
+    if len(machines) > 1:
+        raise NotEnoughData(
+            f"set-ups are of {len(machines)} machines: {', '.join(machines)}; needed is one"
+        )
+    if len({one.digest for one in setups}) < len(setups):
+        names = ", ".join(one.log for one in setups)
+        raise NotEnoughData(f"of the set-ups {names} two are the same log: name each once")
     groups: list[tuple[set[str], list[str]]] = []
     for one in setups:
         own, logs = set(one.modes.shape_channels), [one.log]
@@ -90,20 +98,12 @@ def _same_modes(setups: Sequence[Modes]) -> list[_Group]:
 
     groups: list[_Group] = []
     for s, one in enumerate(setups):
-        firsts = [group[0] for group in groups]
-        distance = np.full((len(one.names), len(firsts)), np.inf)
-        for j, (t, i) in enumerate(firsts):
-            other = setups[t]
-            common = [name for name in one.shape_channels if name in other.shape_channels]
-            own, before = (
-                part.shapes[:, [part.shape_channels.index(name) for name in common]]
-                for part in (one, other)
-            )
-            alike = ~(assurance(own, before[[i]])[:, 0] < constants.SETUP_MAC)
-            off = np.abs(one.ln_frequency - other.ln_frequency[i])
-            names = [_may_be(name, other.names[i]) for name in one.names]
-            near = alike & names & (off < constants.SETUP_LN_F)
-            distance[near, j] = off[near]
+        distance = np.zeros((len(one.names), len(groups)))
+        for j, group in enumerate(groups):
+            off = [np.abs(one.ln_frequency - setups[t].ln_frequency[i]) for t, i in group]
+            same = [_may_be_same(one, setups[t], i) for t, i in group]
+            near = np.logical_and.reduce(same) & (off[0] < constants.SETUP_LN_F)
+            distance[:, j] = np.where(near, off[0], np.inf)
         far = 2 * len(groups) * constants.SETUP_LN_F + 1
         rows, columns = linear_sum_assignment(np.minimum(distance, far))
         matched = {
@@ -117,9 +117,20 @@ def _same_modes(setups: Sequence[Modes]) -> list[_Group]:
     return sorted(groups, key=lambda group: float(setups[group[0][0]].ln_frequency[group[0][1]]))
 
 
-def _may_be(name: str, other: str) -> bool:
-    """Return whether two names may be of one mode: numbers are no names."""
-    return name == other or not _described(name) or not _described(other)
+def _may_be_same(one: Modes, other: Modes, i: int) -> BoolArray:
+    """Return which modes may be mode i of another set-up, by names and shapes: ``(n_modes,)``."""
+    common = [name for name in one.shape_channels if name in other.shape_channels]
+    own, before = (
+        part.shapes[:, [part.shape_channels.index(name) for name in common]]
+        for part in (one, other)
+    )
+    alike = ~(assurance(own, before[[i]])[:, 0] < constants.SETUP_MAC)
+    # Numbers are no names.
+    named = [
+        not (_described(name) and _described(other.names[i])) or name == other.names[i]
+        for name in one.names
+    ]
+    return np.asarray(alike & np.array(named, dtype=bool))
 
 
 def _described(name: str) -> bool:
@@ -129,10 +140,12 @@ def _described(name: str) -> bool:
 def _joined(setups: Sequence[Modes], groups: list[_Group], channels: tuple[str, ...]) -> Modes:
     """Return one estimate per group; what is not averaged is of its clearest set-up."""
     clearest = [max(group, key=lambda at: setups[at[0]].snr[at[1]]) for group in groups]
-    parts = []
+    parts: list[Modes] = []
     for k, (group, (s, i)) in enumerate(zip(groups, clearest, strict=True)):
         names = [setups[t].names[j] for t, j in group]
         name = next((own for own in names if _described(own)), f"mode_{k + 1}")
+        # Of two resonances with one name the higher one is numbered: which is right is open.
+        name = f"mode_{k + 1}" if any(part.names == (name,) for part in parts) else name
         parts.append(replace(setups[s].select([i]), names=(name,)))
     refused = [row for one in setups for row in one.refused]
     order = np.argsort([float(part.ln_frequency[0]) for part in parts], kind="stable").tolist()
@@ -204,15 +217,17 @@ def _merged_shapes(
     found = np.full((len(groups), len(channels)), np.nan, dtype=parts[0][1].dtype)
     for own, group in zip(found, groups, strict=True):
         total = np.zeros((len(channels), len(channels)), dtype=found.dtype)
+        shown = np.zeros(len(channels), dtype=bool)
         for s, i in group:
             names, shapes = parts[s]
             seen = np.flatnonzero(np.isfinite(shapes[i]))
             at = [channels.index(names[c]) for c in seen]
+            shown[at] = True
             part = shapes[i, seen] / np.linalg.norm(shapes[i, seen])
             total[np.ix_(at, at)] += np.eye(len(at)) - np.outer(part, part.conj())
-        known = np.flatnonzero(total.diagonal().real > 0)
-        if not known.size:  # one channel: its shape is 1
-            known = np.array(at)
+        known = np.flatnonzero(shown)
+        if not known.size:
+            continue
         values, vectors = np.linalg.eigh(total[np.ix_(known, known)])
         if known.size == 1 or values[1] - values[0] > constants.SETUP_EIGENVALUE:
             own[known] = vectors[:, 0]

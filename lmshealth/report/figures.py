@@ -609,7 +609,8 @@ def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     names = {
         kind: tr(words) for kind, words in _WORDS.items()
     }  # each kind has one entry in the legend
-    for kind, first in dict.fromkeys((step.kind, step.first) for step in track.steps):
+    own = (step for step in track.steps if step.mode in ("", mode))
+    for kind, first in dict.fromkeys((step.kind, step.first) for step in own):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
         ax.axvline(x[first], lw=1.0, label=names.pop(kind, None), zorder=1, **style)
     ax.set_ylabel(tr("natural frequency in Hz"))

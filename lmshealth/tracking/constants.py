@@ -32,6 +32,9 @@ LOOP_CHANGE_VARIANCE = 100.0
 # errors in a row that mark a possible retuning.
 LOOP_LOGS, LOOP_FEWEST, LOOP_P_VALUE = 12, 3, 0.01
 
+# Most steps since the baseline: with more, every piece of a life is too short for a law.
+MAX_STEPS = 3
+
 # --- Outliers and consistency -------------------------------------------------------------------
 # Prior probability that the estimates of a mode, or of a whole log, are outliers. They scatter by
 # this factor more than stated, or as widely as the priors below. Modes whose standardised

@@ -270,7 +270,7 @@ def _published(state: TrackState) -> Track:
     undetected = _undetected(history)
     mean[undetected], std[undetected] = np.nan, np.nan
     innovations = np.array([epoch.innovations for epoch in epochs])
-    outliers, suspected = _outliers(history, epochs)
+    outliers, suspected = _outliers(history, epochs, space.steps)
     events = sorted([*state.alarms, *_step_events(state)], key=lambda event: event.epoch)
     return Track(
         stage=history.stage,
@@ -300,32 +300,35 @@ def _published(state: TrackState) -> Track:
 
 
 def _outliers(
-    history: History, epochs: Sequence[Epoch]
+    history: History, epochs: Sequence[Epoch], steps: Sequence[Step]
 ) -> tuple[list[tuple[int, str]], Step | None]:
     """List the logs and modes that are outliers, and return the step that the last ones may be.
 
     Two or more last logs in which a mode deviates to the same side have something in common, even
-    if it cannot be told yet what: they are no outliers.
+    if it cannot be told yet what: they are no outliers, unless a life has as many steps as it may.
     """
-    n_series = len(history.series)
+    n_series, baseline = len(history.series), history.baselines[-1]
+    n_steps = sum(one.kind == "step" and one.first > baseline for one in steps)
     found: list[tuple[int, str]] = []
     begun: list[int] = []  # first logs of what has changed
     for mode in history.modes:
         own = [*history.columns(mode), *(n_series + i for i in history.columns(mode))]
-        sides: list[tuple[int, int, float]] = []  # log, and the row and side that deviates most
+        # Log, and the quantity that deviates most (0 ln f, 1 ln ζ, -1 none) with its side.
+        sides: list[tuple[int, int, float]] = []
         for k, epoch in enumerate(epochs):
             away = epoch.standardised[own]
             if epoch.outlying[own].any():
                 worst = int(np.nanargmax(np.abs(away)))
-                sides.append((k, worst, float(np.sign(away[worst]))))
+                quantity = worst // len(history.columns(mode))
+                sides.append((k, quantity, float(np.sign(away[worst]))))
             elif np.isfinite(away).any():
                 sides.append((k, -1, 0.0))
         runs = [list(run) for _, run in groupby(sides, key=itemgetter(1, 2))]
-        if runs and len(runs[-1]) > 1:
-            first, worst, _ = runs.pop()[0]
-            if worst >= 0:
+        if n_steps < constants.MAX_STEPS and runs and len(runs[-1]) > 1:
+            first, quantity, _ = runs.pop()[0]
+            if quantity >= 0:
                 begun.append(first)
-        found += [(k, mode) for run in runs for k, worst, _ in run if worst >= 0]
+        found += [(k, mode) for run in runs for k, quantity, _ in run if quantity >= 0]
     return found, Step.found("step", min(begun), len(epochs)) if begun else None
 
 

@@ -19,6 +19,7 @@ from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables
 from lmshealth.report.text import headline
+from lmshealth.tracking.history import Step
 from tests.assessments import Assessment, Maker, make, nothing
 from tests.lives import FREQUENCY, MODES, make_reading, make_stage
 
@@ -38,7 +39,7 @@ def test_a_machine_that_its_model_fits_has_no_notices(make: Maker) -> None:
 
 @pytest.mark.parametrize("code", [
     "names-in-doubt", "filter-inconsistent", "unexplained-drifts", "end-of-map",
-    "limit-not-included", "laws-do-not-fit", "last-logs-left-out",
+    "limit-not-included", "laws-do-not-fit", "last-logs-left-out", "step-suspected",
 ])  # fmt: skip
 def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     """What is wrong is noticed by its code, in words, and with the place."""
@@ -55,6 +56,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
             "prognosis": replace(prognosis, unidentifiable=("mount_stiffness",))
         },
         "laws-do-not-fit": {"prognosis": replace(prognosis, chi_square=1e4)},
+        "step-suspected": {"track": replace(track, suspected=Step.found("step", 4, 9))},
         "last-logs-left-out": {"track": replace(track, outliers=((len(track.logs) - 1, "roll"),))},
     }
     bad = replace(good, **wrong[code])
@@ -161,6 +163,7 @@ def test_last_logs_that_are_left_out_are_counted(
 ) -> None:
     """One outlier may be chance; of several the page would state a health of long ago."""
     good = make()
+    good = replace(good, judgement=replace(good.judgement, verdict="healthy"))
     assert good.track is not None
     n = len(good.track.logs)
     outliers = ((n - 4, "roll"), *((n + epoch, "roll") for epoch in epochs))
@@ -173,3 +176,8 @@ def test_last_logs_that_are_left_out_are_counted(
     assert before.step.kind != after.step.kind == "check-drift"
     assert headline(after) == f"{headline(before)} before the last log, which deviates"
     assert "unconfirmed-jump" in make_status(bad, after).conditions
+    # A second log alike leaves the jump unconfirmed; one bad log does not hide a service.
+    later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))
+    assert "unconfirmed-jump" in make_status(later, summarise(later, later.service())).conditions
+    lost = replace(bad, judgement=replace(bad.judgement, verdict="preload"))
+    assert summarise(lost, lost.service()).step.kind in ("plan", "service-now")

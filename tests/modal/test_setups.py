@@ -88,7 +88,8 @@ def by_hand(
     unit = np.array([shape]) / np.linalg.norm(shape)
     modes = replace(modes, names=(name,), shape_channels=channels, shapes=unit)
     shapes = ModeShapes((name,), channels, unit + 0j)
-    return LogEstimates(f"{'-'.join(channels)}.h5", "0", METADATA, modes, shapes=shapes)
+    log = f"{'-'.join(channels)}.h5"
+    return LogEstimates(log, log, METADATA, modes, shapes=shapes)
 
 
 def test_frequencies_that_scatter_widen_and_those_that_agree_do_not() -> None:
@@ -119,6 +120,45 @@ def test_different_modes_are_not_merged(other: str) -> None:
     assert np.isnan(merged.shapes).sum() == 2
 
 
+def test_a_set_up_between_others_decides_whether_these_show_one_mode() -> None:
+    """The first and the last have no channel in common; the last is unlike the second."""
+    parts = [
+        by_hand("mode_1", ("a", "b"), 3.0, (1, 0.5)),
+        by_hand("mode_1", ("a", "b", "c", "d"), 3.0, (1, 0.5, 1, 1)),
+        by_hand("mode_1", ("c", "d"), 3.0, (1, -1)),
+    ]
+    assert len(lmshealth.merge_setups(parts).modes.names) == 2
+    assert len(lmshealth.merge_setups(parts[:2]).modes.names) == 1
+
+
+def test_two_resonances_of_one_name_stay_two() -> None:
+    """A description names 20.1 and 20.9 Hz alike: the second is numbered, nothing is lost."""
+    parts = [by_hand("roll", ("a", "b"), 3.0, (1, 1)), by_hand("roll", ("a", "c"), 3.04, (1, 1))]
+    assert lmshealth.merge_setups(parts).modes.names == ("roll", "mode_2")
+
+
+@pytest.mark.parametrize("empty", [0, 1])
+def test_a_set_up_without_modes_changes_nothing(empty: int) -> None:
+    """Its channels are there, and show nothing."""
+    parts = [by_hand("roll", ("a", "b"), 3.0, (1, 0.5)), by_hand("roll", ("a", "c"), 3.0, (1, 1))]
+    none = parts[empty].modes.select([])
+    parts[empty] = replace(parts[empty], modes=none, shapes=None)
+    merged = lmshealth.merge_setups(parts).modes
+    assert merged.names == ("roll",)
+    assert merged.cov[0, 0] == pytest.approx(1e-6)
+
+
+@pytest.mark.parametrize("shape", [(1.0, 0.0), (1.0, 0.0, 0.0), (np.nan, np.nan)])
+def test_nodes_and_unknown_shapes_stay_what_they_are(shape: tuple[float, ...]) -> None:
+    """A channel that does not move is 0, one that was not identified is unknown."""
+    names = ("a", "b", "c")[: len(shape)]
+    parts = [by_hand("roll", names, 3.0, shape), by_hand("pitch", ("a", "d"), 4.0, (1, 1))]
+    merged = lmshealth.merge_setups(parts).modes
+    found = merged.shapes[0, : len(shape)]
+    np.testing.assert_allclose(found, shape, atol=1e-12)
+    assert ("loose-shape" in merged.flags[0]) == np.isnan(shape).all()
+
+
 def test_a_reference_that_hardly_moves_gives_no_shape() -> None:
     """The scales of the parts are not determined: a flag, no shape; the frequency is merged."""
     pair = [
@@ -138,3 +178,8 @@ def test_set_ups_without_a_common_channel_are_refused() -> None:
         lmshealth.merge_setups(apart)
     with pytest.raises(NotEnoughData, match="two or more"):
         lmshealth.merge_setups(apart[:1])
+    with pytest.raises(NotEnoughData, match="same log"):
+        lmshealth.merge_setups([apart[0], apart[0]])
+    other = replace(apart[1], metadata=replace(METADATA, stage="N"))
+    with pytest.raises(NotEnoughData, match="2 machines: M, N"):
+        lmshealth.merge_setups([apart[0], other])

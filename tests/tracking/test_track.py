@@ -483,6 +483,30 @@ def test_last_logs_that_deviate_alike_are_no_outliers(stage: Stage) -> None:
     assert back.suspected is None
 
 
+def test_sources_that_deviate_in_turn_deviate_alike(stage: Stage) -> None:
+    """Which source of a mode deviates most is chance: both are off to one side."""
+    rng, n = np.random.default_rng(21), 16
+    ln_f, ln_zeta = (np.tile(np.log(one[:2]), (n, 1)) for one in (FREQUENCY, DAMPING))
+    history = seen_by(rng, ln_f, ln_zeta, sources=("acc", "delta_e"))
+    values, own = np.array(history.ln_frequency), list(history.columns("roll"))
+    values[14, own] -= (0.022, 0.018)
+    values[15, own] -= (0.018, 0.022)
+    found = track(replace(history, ln_frequency=values), stage)
+    assert found.outliers == ()
+    assert found.suspected is not None or "step" in {event.kind for event in found.events}
+
+
+def test_a_life_of_most_steps_has_no_suspected_one(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Health after as many steps as a life may have is not lost to two logs that deviate."""
+    history = jumping({14: -0.02, 15: -0.02})
+    monkeypatch.setattr(constants, "MAX_STEPS", 0)
+    found = track(history, stage)
+    assert found.outliers == ((14, "roll"), (15, "roll"))
+    assert found.suspected is None
+
+
 def test_a_jump_of_one_mode_is_an_event_of_it_alone(stage: Stage) -> None:
     """It is found at its third log, and moves no other mode; a jump of all modes is one of all."""
     for modes, names in (((0,), {"roll"}), ((0, 1, 2), {"roll", "pitch", "yaw"})):

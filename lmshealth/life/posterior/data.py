@@ -12,6 +12,7 @@ from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import Stage
+from lmshealth.tracking.constants import MAX_STEPS
 from lmshealth.tracking.history import History
 
 SECONDS_PER_DAY, KM = 86_400.0, 1000.0
@@ -215,7 +216,7 @@ def clock_and_steps(history: History) -> tuple[FloatArray, tuple[float, ...]]:
     for k in reversed(first):  # at least 1 m is between the logs before and after a step
         before = clock[:k]
         before[before >= clock[k]] = clock[k] - 1.0
-    if len(first) > constants.MAX_STEPS:
+    if len(first) > MAX_STEPS:
         raise NotEnoughData(
             fact(
                 "{stage}: the modes jumped {n} times since the baseline; no law of a life holds "

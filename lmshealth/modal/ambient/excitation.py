@@ -49,7 +49,8 @@ class Unsteadiness(NamedTuple):
             return 1.0
         x = np.linspace(0.0, 1 + np.log(self.n), _STEPS)  # at least one is independent
         std = np.sqrt(np.exp(x) / self.n)
-        log = -0.5 * ((np.log(self.ratio) - x) / std) ** 2 - np.log(std)
+        # A ratio below 1 is chance: a large one, known to little, must not explain it.
+        log = -0.5 * ((np.log(max(self.ratio, 1.0)) - x) / std) ** 2 - np.log(std)
         prior = np.exp(-x / constants.MEAN_LN_UNSTEADY)
         weight = np.exp(log - log.max()) * prior / prior.sum()
         weight[0] += np.exp(log[0] - log.max())
@@ -129,7 +130,7 @@ def average_colours(
         one = marginalise(coloured, moved)
         if one.decrement < constants.WORST_DECREMENT:
             q = moved
-            found.append(_of_same_modes(one, white))
+            found.append(_of_same_modes(one, flat))
             if one.log_evidence - flat.log_evidence < _UNLIKELY:
                 break
     if len(found) == 1:
