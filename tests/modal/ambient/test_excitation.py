@@ -75,8 +75,8 @@ def test_the_ratio_is_as_sure_as_its_ordinates_are_many(n: int) -> None:
     chance = Unsteadiness(1 + 1 / np.sqrt(n), n).expected
     assert 1 < chance < 1 + 0.7 / np.sqrt(n)
     assert Unsteadiness(1 - 2 / np.sqrt(n), n).expected == pytest.approx(1, abs=0.03)
-    for ratio, n in ((0.5, 160), (0.7, 1000), (1e-9, 40)):  # by chance, or of a force of one size
-        assert Unsteadiness(ratio, n).expected < 1.1
+    for ratio, size in ((0.5, 160), (0.7, 1000), (1e-9, 40)):  # chance
+        assert Unsteadiness(ratio, size).expected < 1.1
     assert Unsteadiness(3.0, n).expected == pytest.approx(3, rel=0.05)
     assert Unsteadiness(1.0, 0).expected == 1
 
