@@ -15,7 +15,7 @@ import lmshealth
 
 # `save` and `load` came with the types of results, which need no example of their own;
 # `check_calibration` is a question that each description raises.
-MOST_NAMES = 23
+MOST_NAMES = 24
 FUNCTIONS = sorted(set(lmshealth.__all__) - set(lmshealth._RESULTS))
 # Of these nothing is needed to import the package or to show help, and all take their time.
 HEAVY = (
@@ -53,6 +53,7 @@ def assessed(folder: Path) -> str:
         response = lmshealth.read_frf(log, "current_excitation", "acc_pitch", band=(95.0, 175.0))
         for one in (modes, rung, response.modes):
             readings.append(lmshealth.LogEstimates(log.name, log.digest, log.metadata, one))
+    readings.append(lmshealth.merge_setups(readings[:2]))
     history, refused = lmshealth.build_history(readings, stage)
     track = lmshealth.track(history, stage)
     health = lmshealth.infer(history, stage, seed=0)

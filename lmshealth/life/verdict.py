@@ -109,7 +109,7 @@ def judge(
     >>> print(f"{judgement.verdict}, {judgement.probability:.0%}")
     both, 99%
     >>> judgement.why.split(".")[0]
-    'Guide preload is at 72 % of its baseline value (90 %: 69 to 76 %)'
+    'Guide preload is at 72 % of its baseline value (90 %: 69 to 75 %)'
     >>> lmshealth.judge(stage, history, None).why
     'The logs do not contain enough information for the health parameters.'
     """

@@ -480,10 +480,13 @@ def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str,
     elif before and before.silent and not now.silent:
         yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
     earlier = before.conditions if before else {}
+    confirmed = {"unconfirmed-jump"} if now.alarms or _is_loss(verdict) else set()
     for code in _ENDING:
         if code in now.conditions and code not in earlier:
             yield code, "", _detail(code, now)
-        elif code in earlier and code not in now.conditions and not (before and before.silent):
+        elif code in earlier.keys() - now.conditions.keys() - confirmed and not (
+            before and before.silent
+        ):
             yield "recovered", code, f"log of {now.recorded_at.date().isoformat()}"
 
 

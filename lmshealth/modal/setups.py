@@ -27,7 +27,7 @@ _Shapes = tuple[tuple[str, ...], np.ndarray]
 
 
 def merge_setups(setups: Sequence[LogEstimates]) -> LogEstimates:
-    """Merge the modes of several set-ups of one machine.
+    r"""Merge the modes of several set-ups of one machine.
 
     Estimates are of one mode if their frequencies differ by less than 2 % and their shapes agree
     over the common channels (MAC of 0.8); estimates with different names of a description are of
@@ -50,7 +50,30 @@ def merge_setups(setups: Sequence[LogEstimates]) -> LogEstimates:
     Raises
     ------
     NotEnoughData
-        If there is one set-up only, or no channel connects two groups of them.
+        If there is one set-up only, or no channel connects two groups of them; if two are the same
+        log, or they are of several machines.
+
+    Examples
+    --------
+    A sensor stays on the base, another one moves from the left to the right:
+
+    >>> import numpy as np
+    >>> import lmshealth
+    >>> from scipy.signal import lfilter
+    >>> rng, pole = np.random.default_rng(1), 0.99 * np.exp(0.4j)
+    >>> setups = []
+    >>> for place, size in (("left", 2.0), ("right", -1.0)):
+    ...     motion = lfilter([1], np.poly([pole, pole.conj()]).real, rng.standard_normal(60_000))
+    ...     both = np.outer(motion, [1.0, size]) + rng.standard_normal((60_000, 2))
+    ...     columns = f"acc_base_m_s2,acc_{place}_m_s2"
+    ...     head = f"# sample_rate_hz: 1000\n# stage: M\n# travel_km: 1\n{columns}"
+    ...     np.savetxt(f"{place}.csv", both, header=head, comments="", delimiter=",")
+    ...     log = lmshealth.read_log(f"{place}.csv")
+    ...     modes = lmshealth.identify(log, band=(40.0, 90.0))
+    ...     setups.append(lmshealth.LogEstimates(log.name, log.digest, log.metadata, modes))
+    >>> merged = lmshealth.merge_setups(setups).modes
+    >>> merged.shape_channels, (merged.shapes / merged.shapes[:, :1]).round(1).tolist()
+    (('acc_base', 'acc_left', 'acc_right'), [[1.0, 2.0, -1.0]])
     """
     modes = [one.modes for one in setups]
     channels = tuple(dict.fromkeys(chain.from_iterable(one.shape_channels for one in modes)))

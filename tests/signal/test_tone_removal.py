@@ -248,7 +248,8 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
         if frequency == 150.0:  # on an ordinate nothing leaks
             continue
         with monkeypatch.context() as patch:
-            # Negative control: with the sinusoid left in, the mode moves or is lost.
+            # Negative control: with the sinusoid left in, the mode moves, is lost, or its force
+            # counts as unsteady, which more than doubles its uncertainty.
             patch.setattr(
                 spectra,
                 "remove_sinusoids",
@@ -256,7 +257,8 @@ def test_a_strong_line_beside_a_mode_moves_it_less_than_its_uncertainty(
             )
             patch.setattr(identification, "find_lines", lambda *_: np.empty((0, 2)))
             left_in = find(values + line)
-        assert not left_in.names or moved(left_in, clean) > 1
+        wider = left_in.frequency_std > 2 * clean.frequency_std if left_in.names else [True]
+        assert all(wider) or moved(left_in, clean) > 1
 
 
 @pytest.mark.parametrize("line", [104.0, 104.908, 105.0, 106.2])
