@@ -45,11 +45,6 @@ NOT_MET = {
     "none missing or wrong: pair 1 % apart": "the description is off by 0.4 % for each mode, with "
     "which the order of two that are 1 % apart is not always that of the description; where the "
     "data do not separate them both are refused",
-    f"none missing or wrong: {_FLOORS}": "one mode of 48 is refused",
-    f"bounded time: {_FLOORS}": "one record of 16, that of the mode that is refused",
-    "near the bound: 8 channels, 6 modes, two harmonics": "probably modes in the band of the "
-    "harmonic that wanders, which the bound does not have, and flanks that are known from the "
-    "search only",
 }
 
 
