@@ -32,13 +32,13 @@ _SEVERITIES = "serious", "caution", "note"
 
 def notices(assessment: Assessment) -> tuple[Notice, ...]:
     """Return the notices about a machine, the serious ones first: rows of ``warnings.csv``."""
-    found = [*assessment.notices, *_of_track(assessment), *_of_health(assessment)]
-    found += [*_of_laws(assessment), *_of_channels(assessment)]
+    found = [*assessment.notices, *_of_names(assessment), *_of_track(assessment)]
+    found += [*_of_health(assessment), *_of_laws(assessment), *_of_channels(assessment)]
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
-def _of_track(assessment: Assessment) -> Iterator[Notice]:
-    """Yield notices about names of modes, flags of their estimates, and the filter."""
+def _of_names(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about names of modes and flags of their last estimates."""
     if assessment.doubt:
         yield Notice("names-in-doubt", "serious", "", assessment.doubt)
     latest = assessment.latest
@@ -52,6 +52,10 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         what = fact("The last log has the flag {flag} at {names}.", flag=flag, names=names)
         to_do = fact("Its meaning is in the column flags of modes.csv.")
         yield Notice(flag, "caution", names, what, to_do)
+
+
+def _of_track(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about drifts, jumps and the consistency of the filter."""
     track = assessment.track
     for mode, (size, n_std) in assessment.drifted.items():
         n_logs = len(assessment.history.logs) - assessment.history.baseline

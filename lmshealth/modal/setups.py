@@ -91,6 +91,8 @@ def merge_setups(setups: Sequence[LogEstimates]) -> LogEstimates:
 
 def _expect_connected(setups: Sequence[LogEstimates]) -> None:
     """Require different logs of one machine, connected by common channels."""
+    from scipy.sparse.csgraph import connected_components  # late: reading a result needs none of it
+
     machines = sorted({one.metadata.stage or "" for one in setups})
     if len(machines) > 1:
         raise NotEnoughData(
@@ -99,15 +101,11 @@ def _expect_connected(setups: Sequence[LogEstimates]) -> None:
     if len({one.digest for one in setups}) < len(setups):
         names = ", ".join(one.log for one in setups)
         raise NotEnoughData(f"of the set-ups {names} two are the same log: name each once")
-    groups: list[tuple[set[str], list[str]]] = []
-    for one in setups:
-        own, logs = set(one.modes.shape_channels), [one.log]
-        for group in [group for group in groups if group[0] & own]:
-            groups.remove(group)
-            own, logs = own | group[0], [*group[1], *logs]
-        groups.append((own, logs))
-    if len(setups) < 2 or len(groups) > 1:
-        parts = "; ".join(f"{', '.join(logs)}: {', '.join(sorted(own))}" for own, logs in groups)
+    channels = [set(one.modes.shape_channels) for one in setups]
+    shared = np.array([[bool(one & other) for other in channels] for one in channels])
+    n_groups = connected_components(shared, directed=False)[0] if setups else 0
+    if len(setups) < 2 or n_groups > 1:
+        parts = "; ".join(f"{one.log}: {', '.join(one.modes.shape_channels)}" for one in setups)
         raise NotEnoughData(
             "set-ups with mode shapes are merged by the channels that they share; found are "
             f"{parts}: needed are two or more, each with a channel of another one; keep a sensor "
@@ -116,7 +114,7 @@ def _expect_connected(setups: Sequence[LogEstimates]) -> None:
 
 
 def _same_modes(setups: Sequence[Modes]) -> list[_Group]:
-    """Return the estimates of each mode, ascending in frequency."""
+    """Return the estimates of each mode, ascending in frequency, of a mode the clearest first."""
     from scipy.optimize import linear_sum_assignment  # late: reading a result needs none of it
 
     groups: list[_Group] = []
@@ -137,7 +135,9 @@ def _same_modes(setups: Sequence[Modes]) -> list[_Group]:
                 groups[matched[row]].append((s, row))
             else:
                 groups.append([(s, row)])
-    return sorted(groups, key=lambda group: float(setups[group[0][0]].ln_frequency[group[0][1]]))
+    # The clearest estimate comes first, and the lowest mode.
+    clear = [sorted(group, key=lambda at: -setups[at[0]].snr[at[1]]) for group in groups]
+    return sorted(clear, key=lambda group: float(setups[group[0][0]].ln_frequency[group[0][1]]))
 
 
 def _may_be_same(one: Modes, other: Modes, i: int) -> BoolArray:
@@ -162,17 +162,16 @@ def _described(name: str) -> bool:
 
 def _joined(setups: Sequence[Modes], groups: list[_Group], channels: tuple[str, ...]) -> Modes:
     """Return one estimate per group; what is not averaged is of its clearest set-up."""
-    clearest = [max(group, key=lambda at: setups[at[0]].snr[at[1]]) for group in groups]
     parts: list[Modes] = []
-    for k, (group, (s, i)) in enumerate(zip(groups, clearest, strict=True)):
+    for k, group in enumerate(groups):
         names = [setups[t].names[j] for t, j in group]
         name = next((own for own in names if _described(own)), f"mode_{k + 1}")
         # Of two resonances with one name the higher one is numbered: which is right is open.
         name = f"mode_{k + 1}" if any(part.names == (name,) for part in parts) else name
+        s, i = group[0]
         parts.append(replace(setups[s].select([i]), names=(name,)))
     refused = [row for one in setups for row in one.refused]
-    order = np.argsort([float(part.ln_frequency[0]) for part in parts], kind="stable").tolist()
-    joined, groups = merge(parts, (), refused, channels), [groups[k] for k in order]
+    joined = merge(parts, (), refused, channels)
     estimate, cov, factor = _averaged(setups, groups)
     n = len(groups)
     shapes = _merged_shapes([(one.shape_channels, one.shapes) for one in setups], groups, channels)

@@ -9,8 +9,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from functools import reduce
-from itertools import groupby
-from operator import itemgetter
 from typing import Any, Literal
 
 import numpy as np
@@ -305,30 +303,28 @@ def _outliers(
     """List the logs and modes that are outliers, and return the step that the last ones may be.
 
     Two or more last logs in which a mode deviates to the same side have something in common, even
-    if it cannot be told yet what: they are no outliers, unless a life has as many steps as it may.
+    if it is not clear yet what: they are no outliers, unless there are already `MAX_STEPS` steps.
     """
     n_series, baseline = len(history.series), history.baselines[-1]
     n_steps = sum(one.kind == "step" and one.first > baseline for one in steps)
+    standardised = np.array([epoch.standardised for epoch in epochs])
+    outlying = np.array([epoch.outlying for epoch in epochs])
     found: list[tuple[int, str]] = []
     begun: list[int] = []  # first logs of what has changed
     for mode in history.modes:
-        own = [*history.columns(mode), *(n_series + i for i in history.columns(mode))]
-        # Log, and the quantity that deviates most (0 ln f, 1 ln ζ, -1 none) with its side.
-        sides: list[tuple[int, int, float]] = []
-        for k, epoch in enumerate(epochs):
-            away = epoch.standardised[own]
-            if epoch.outlying[own].any():
-                worst = int(np.nanargmax(np.abs(away)))
-                quantity = worst // len(history.columns(mode))
-                sides.append((k, quantity, float(np.sign(away[worst]))))
-            elif np.isfinite(away).any():
-                sides.append((k, -1, 0.0))
-        runs = [list(run) for _, run in groupby(sides, key=itemgetter(1, 2))]
-        if n_steps < constants.MAX_STEPS and runs and len(runs[-1]) > 1:
-            first, quantity, _ = runs.pop()[0]
-            if quantity >= 0:
-                begun.append(first)
-        found += [(k, mode) for run in runs for k, quantity, _ in run if quantity >= 0]
+        columns = history.columns(mode)
+        own = [*columns, *(n_series + i for i in columns)]
+        away = np.nan_to_num(standardised[:, own])
+        worst = np.abs(away).argmax(axis=1)
+        side = np.sign(np.take_along_axis(away, worst[:, None], axis=1)[:, 0])
+        # ±1 where ln f deviates most, ±2 where ln ζ does, 0 of no outlier.
+        side = np.where(outlying[:, own].any(axis=1), side * (1 + worst // len(columns)), 0)
+        logs = np.flatnonzero(np.isfinite(standardised[:, own]).any(axis=1))
+        last = logs[np.logical_and.accumulate(side[logs][::-1] == side[logs][-1:])[::-1]]
+        if len(last) > 1 and side[last[0]] and n_steps < constants.MAX_STEPS:
+            begun.append(int(last[0]))
+            logs = logs[: -len(last)]
+        found += [(k, mode) for k in logs[side[logs] != 0].tolist()]
     return found, Step.found("step", min(begun), len(epochs)) if begun else None
 
 

@@ -13,7 +13,11 @@ from numpy.random import MT19937, RandomState
 from lmshealth._private.serialize import stream
 from lmshealth.calibration.lives import START
 from lmshealth.life.posterior.ensemble_sampling import sample
-from lmshealth.life.posterior.importance_sampling import WeightedDraws, importance_sample_to_ess
+from lmshealth.life.posterior.importance_sampling import (
+    WeightedDraws,
+    draw_to_ess,
+    importance_sample,
+)
 from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -48,7 +52,8 @@ def target(history: History, stage: Stage) -> Target:
     scenario = likelihood.data.scenarios[0]
     density = LifeDensity(likelihood, scenario, likelihood.grid)
     start = scenario.draw(rng, 600)
-    draws = importance_sample_to_ess(density.log_probability, start, rng, 2000, 100.0)
+    rough = importance_sample(density.log_probability, start, rng, 2000)
+    draws = draw_to_ess(density.log_probability, rough, rng, 100.0)
     density = density.narrowed(draws.resampled(rng, 100))
     return Target(density, draws)
 

@@ -10,7 +10,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from lmshealth.calibration.lives import make_history
-from lmshealth.life.posterior.importance_sampling import importance_sample_to_ess
+from lmshealth.life.posterior.importance_sampling import draw_to_ess, importance_sample
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, ln_health
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -86,7 +86,8 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     density = LifeDensity(likelihood, scenario, likelihood.grid)
     rng = np.random.default_rng(0)
     start = scenario.draw(rng, 600)
-    draws = importance_sample_to_ess(density.log_probability, start, rng, 2000, 100.0)
+    rough = importance_sample(density.log_probability, start, rng, 2000)
+    draws = draw_to_ess(density.log_probability, rough, rng, 100.0)
     y, grid = draws.resampled(rng, walkers), density.grid
     # A filter with health as given knows of no deviation from it, and of no mode that moves alone.
     known = (grid.deviation == 0) & (grid.lone == NO_MODE)

@@ -116,23 +116,11 @@ def _drawn_near(
     return _weighted(points, log_probability(points) - proposal)
 
 
-def importance_sample_to_ess(
-    log_probability: LogProbability,
-    start: FloatArray,
-    rng: np.random.Generator,
-    n: int,
-    min_ess: float = constants.MIN_ESS,
-) -> WeightedDraws:
-    """Return `importance_sample`, followed by `draw_to_ess`."""
-    found = importance_sample(log_probability, start, rng, n)
-    return draw_to_ess(log_probability, found, rng, min_ess)
-
-
 def draw_to_ess(
     log_probability: LogProbability,
     draws: WeightedDraws,
     rng: np.random.Generator,
-    min_ess: float,
+    min_ess: float = constants.MIN_ESS,
 ) -> WeightedDraws:
     """Draw again from a density, more often, unless enough of the draws are effective.
 

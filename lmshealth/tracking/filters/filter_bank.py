@@ -92,14 +92,14 @@ class Innovation:
     outlying: FloatArray  # probability that they are outliers, ``(n_rows,)``
 
     @property
-    def kept(self) -> np.ndarray:
-        """Indices of those that are more probably no outliers."""
-        return np.flatnonzero(self.outlying <= 0.5)
+    def is_outlier(self) -> BoolArray:
+        """Whether each is more probably an outlier than not, ``(n_rows,)``."""
+        return np.asarray(self.outlying > 0.5)
 
     @property
     def nis(self) -> float:
         """Normalised innovation squared of those that are more probably no outliers."""
-        mean, cov, kept = self.mean, self.cov, self.kept
+        mean, cov, kept = self.mean, self.cov, np.flatnonzero(~self.is_outlier)
         if kept.size < mean.size:
             mean, cov = mean[kept], cov[kept[:, None], kept]
         return float(mean @ np.linalg.solve(cov, mean))

@@ -164,7 +164,7 @@ def _filter(state: TrackState, k: int) -> TrackState:
     state, nuisances, credit = _with_nuisances(state, select_nuisances(space, bank, found, k), k)
     before = state.published.padded(space.size)
     standardised, outlying = np.full(space.mode_of.size, np.nan), np.zeros(space.mode_of.size, bool)
-    standardised[found.rows], outlying[found.rows] = found.standardised, found.outlying > 0.5
+    standardised[found.rows], outlying[found.rows] = found.standardised, found.is_outlier
     epoch = Epoch(nuisances, found.nis, standardised, outlying)
     most, last = constants.MOST_INNOVATION, state.checkpoints[-1:]
     sums = last[0].sums if last else np.zeros((2, standardised.size + 2))

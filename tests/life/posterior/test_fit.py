@@ -18,7 +18,7 @@ from lmshealth.life import constants
 from lmshealth.life.posterior import exploration, fit
 from lmshealth.life.posterior.ensemble_sampling import Sample
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
-from lmshealth.life.posterior.importance_sampling import importance_sample_to_ess
+from lmshealth.life.posterior.importance_sampling import draw_to_ess, importance_sample
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood
 from lmshealth.life.prognosis import prognose
 from lmshealth.stage.description import Stage
@@ -147,9 +147,8 @@ def test_laws_and_health_are_those_of_importance_sampling(
     (scenario,) = likelihood.data.scenarios
     density = LifeDensity(likelihood, scenario, likelihood.grid)
     rng = np.random.default_rng(5)
-    drawn = importance_sample_to_ess(
-        density.log_probability, density.scenario.draw(rng, 600), rng, 12000
-    )
+    rough = importance_sample(density.log_probability, density.scenario.draw(rng, 600), rng, 12000)
+    drawn = draw_to_ess(density.log_probability, rough, rng)
     y = drawn.resampled(rng, 12000)
     now = np.array([likelihood.data.now])
     theta = scenario.natural(y)

@@ -15,8 +15,8 @@ from lmshealth.life import constants
 from lmshealth.life.posterior.importance_sampling import (
     Proposal,
     WeightedDraws,
+    draw_to_ess,
     importance_sample,
-    importance_sample_to_ess,
 )
 
 Density = Callable[[FloatArray], FloatArray]
@@ -56,6 +56,13 @@ def banana(x: FloatArray) -> FloatArray:
     return LN_SCALE + stats.norm.logpdf(x[:, 0]) + y.logpdf(x[:, 1])
 
 
+def sample_to_ess(
+    density: Density, points: FloatArray, rng: np.random.Generator, n: int
+) -> WeightedDraws:
+    """Draw from a density until enough of the draws are effective."""
+    return draw_to_ess(density, importance_sample(density, points, rng, n), rng)
+
+
 def agrees(found: WeightedDraws, known: float) -> bool:
     """Whether an evidence is the known one within 4.5 of its stated standard deviations."""
     return bool(abs(found.log_evidence - known) < 4.5 / np.sqrt(found.ess))
@@ -73,7 +80,7 @@ IDS = ["1", "2", "4", "6", "two-peaks", "half", "banana"]
 @pytest.mark.parametrize(("density", "n_dim", "known"), CASES, ids=IDS)
 def test_evidences_are_right_within_their_error(density: Density, n_dim: int, known: float) -> None:
     """Integrals of known densities are found, and a fifth more or less would be noticed."""
-    found = importance_sample_to_ess(density, start(n_dim), np.random.default_rng(2), 4000)
+    found = sample_to_ess(density, start(n_dim), np.random.default_rng(2), 4000)
     assert found.ess > 900
     assert agrees(found, known)
     assert not agrees(found, known + np.log(1.2))
@@ -101,7 +108,7 @@ def test_the_stated_error_is_that_of_many_evidences() -> None:
 def test_peaks_far_apart_have_their_share() -> None:
     """Draws are on both peaks by their integrals, weighted and resampled."""
     rng = np.random.default_rng(3)
-    found = importance_sample_to_ess(two_peaks, start(2), rng, 4000)
+    found = sample_to_ess(two_peaks, start(2), rng, 4000)
     right = found.points[:, 0] > 0
     error = np.sqrt(0.3 * 0.7 / found.ess)
     assert abs(found.weight[right].sum() - 0.7) < 4.5 * error
@@ -116,7 +123,7 @@ def test_peaks_far_apart_have_their_share() -> None:
 def test_draws_of_equal_weight_have_the_moments() -> None:
     """Of a banana: means of x, y and x² are 0, 0.3 and 1, within the error of the draws."""
     rng = np.random.default_rng(4)
-    found = importance_sample_to_ess(banana, start(2), rng, 4000)
+    found = sample_to_ess(banana, start(2), rng, 4000)
     drawn = found.resampled(rng, 4000)
     ess = 1 / (1 / found.ess + 1 / 4000)
     for values, known in ((drawn[:, 0], 0.0), (drawn[:, 1], 0.3), (drawn[:, 0] ** 2, 1.0)):
@@ -158,7 +165,7 @@ def test_points_outside_of_the_support_are_left_out_but_count() -> None:
 
 def test_too_few_draws_are_repeated() -> None:
     """Draws worth less than 400 are drawn again, twice to three times as many."""
-    found = importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(9), 300)
+    found = sample_to_ess(gaussian(2), start(2), np.random.default_rng(9), 300)
     assert found.points.shape[0] == 600
     assert found.ess >= constants.MIN_ESS
 
@@ -166,7 +173,7 @@ def test_too_few_draws_are_repeated() -> None:
 def test_what_stays_too_little_is_refused_with_its_points() -> None:
     """After four more times less than 400 effective draws are an error with their number."""
     with pytest.raises(NotConverged, match=r"of 324 by importance.*needed are 400") as caught:
-        importance_sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 4)
+        sample_to_ess(gaussian(2), start(2), np.random.default_rng(10), 4)
     assert np.asarray(caught.value.chains).shape == (324, 2)
 
 
@@ -189,7 +196,7 @@ def test_a_start_that_spans_fewer_dimensions_than_the_density(inside: int) -> No
         value = LN_SCALE + np.reshape(known.logpdf(x), x.shape[0])
         return np.where(reached, value, -np.inf) if x is points else value
 
-    found = importance_sample_to_ess(density, points, np.random.default_rng(2), 2000)
+    found = sample_to_ess(density, points, np.random.default_rng(2), 2000)
     assert agrees(found, LN_SCALE)
 
 
