@@ -1,9 +1,9 @@
-"""Is every sentence true that the pages and alerts of a fleet say in a year of monthly runs?
+"""Is every sentence true on the pages and in the alerts of a fleet in a year of monthly runs?
 
 Method
     Twelve simulated stages Y, two logs a month: three wear, one wears and is repaired (entered 25
     days later), one falls silent, yaw of one moves alone, six are sound. Monthly `run --today`,
-    lives by importance sampling. What pages and alerts say is judged by rules on the truth of the
+    lives by importance sampling. Pages and alerts are judged by rules on the truth of the
     day; odds (intervals, days of a risk) apart. Control: another machine's truth.
 Run time
     A quarter of an hour on one processor.
@@ -97,7 +97,7 @@ def at(day: str) -> int:
 
 
 def played(letters: str, months: int, seconds: float) -> list[Row]:
-    """Run the program after each month, and return all that it says of each machine."""
+    """Run the program after each month, and return every sentence about each machine."""
     rows: list[Row] = []
     fleet = [one for one in FLEET if one.name[0] in letters]
     with TemporaryDirectory() as folder, quick_posteriors(), no_pictures():
@@ -108,8 +108,8 @@ def played(letters: str, months: int, seconds: float) -> list[Row]:
             today = BEGIN + timedelta(days=run_day(month))
             words = f"--stage lms-y --workers 1 --silent-days {SILENT_AFTER} --today {today}"
             call_here("lmshealth", ["run", str(logs), "--out", str(out), *words.split()])
-            rows += ({"month": month, "machine": one.name, "source": source, "said": said}
-                     for one in fleet for source, said in _said(out, one.name))  # fmt: skip
+            rows += ({"month": month, "machine": one.name, "source": source, "sentence": text}
+                     for one in fleet for source, text in _sentences_of(out, one.name))  # fmt: skip
     return rows
 
 
@@ -150,8 +150,8 @@ def _moment(day: float) -> str:
     return f"{datetime.combine(BEGIN, time()) + timedelta(days=day):%Y-%m-%dT%H:%M:%S}+00:00"
 
 
-def _said(out: Path, name: str) -> Iterator[tuple[str, str]]:
-    """Yield source and sentence of what a run says of a machine: page, fleet page, alerts."""
+def _sentences_of(out: Path, name: str) -> Iterator[tuple[str, str]]:
+    """Yield source and sentence of a run about a machine: page, fleet page, alerts."""
     page = (out / f"{name}.html").read_text(encoding="utf-8")
     page = page[page.index("<h1>") : page.index('<section id="modes"')]
     page = re.sub(r'</h3>\s*<p class="reading">', ": ", page)
@@ -206,14 +206,14 @@ class Truth:
     def verdict(self, text: str) -> bool | None:
         """Judge a verdict in words, or that of a table."""
         if re.search("oss of|preload$|mount$|both$", text):
-            told = [x for x in LIMITS if x.split()[x[0] == "g"] in text or "both" in text]
-            return all(self.lost[x] is not (x not in told) for x in LIMITS)
+            named = [x for x in LIMITS if x.split()[x[0] == "g"] in text or "both" in text]
+            return all(self.lost[x] is not (x not in named) for x in LIMITS)
         alone, step = re.search("alone|outside", text), re.search("udden|step", text)
         known = self.lone if alone else self.unexplained if step else None
         return self.sound if "ealthy" in text else known
 
 
-# What a sentence says (regular expression), whether it states odds, and its test.
+# Meaning of a sentence (regular expression), whether it states odds, and its test.
 RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
     (f"Written on {_DAY}, last log {_DAY}", False,
      lambda m, t: (at(m[1]), at(m[2])) == (t.today, int(t.last))),
@@ -261,9 +261,9 @@ def main() -> None:
     sentences, odds, control = (total([own for own in found if own["odds"] is kind])
                                 for found, kind in kinds)  # fmt: skip
     events = [announced(rows, *event) for event in EVENTS if rows[-1]["month"] == MONTHS]
-    told = [row["said"] for row in rows if row["source"] == "alert"
+    alerts = [row["sentence"] for row in rows if row["source"] == "alert"
             and NAMES[row["machine"]].role == "healthy"]  # fmt: skip
-    alarms = Counter(said.split(":")[1].strip() for said in told if not said.startswith("note"))
+    alarms = Counter(one.split(":")[1].strip() for one in alerts if not one.startswith("note"))
     passed = {
         "no sentence is false": not sentences["false"],
         "odds hold": odds["false"] <= 0.1 * (odds["true"] + odds["false"]),
@@ -277,30 +277,30 @@ def main() -> None:
 
 
 def tabled(rows: list[Row], shift: int = 0) -> tuple[list[Row], list[str]]:
-    """Return how often each sentence was said, and was true, false or not judged; false ones."""
+    """Return how often each sentence was printed, and was true, false or not judged; false ones."""
     found: dict[tuple[str, bool], Counter[str]] = defaultdict(Counter)
     wrong, names, truths = [], list(NAMES), {}
     for row in rows:
-        said, key = row["said"], (row["machine"], row["month"])
+        sentence, key = row["sentence"], (row["machine"], row["month"])
         if key not in truths:
             truths[key] = Truth(FLEET[(names.index(key[0]) + shift) % len(FLEET)], key[1])
         rules = ((odds, rule(m, truths[key])) for pattern, odds, rule in RULES
-                 if (m := re.match(pattern, said)))  # fmt: skip
+                 if (m := re.match(pattern, sentence)))  # fmt: skip
         odds, true = next(rules, (False, None))
         word = {True: "true", False: "false", None: "not judged"}[true]
-        found[pattern_of(said), odds].update(["said", word])
-        wrong += [f"{row['machine']} {row['month']} {row['source']}: {said}"] * (true is False)
+        found[pattern_of(sentence), odds].update(["printed", word])
+        wrong += [f"{row['machine']} {row['month']} {row['source']}: {sentence}"] * (true is False)
     table = [{"sentence": text, "odds": odds, **own} for (text, odds), own in found.items()]
-    return sorted(table, key=lambda own: -own["said"]), wrong
+    return sorted(table, key=lambda own: -own["printed"]), wrong
 
 
-def pattern_of(said: str) -> str:
+def pattern_of(sentence: str) -> str:
     """Return a sentence without its days, numbers, modes and parts."""
     for pattern, word in ((_DAY + r"( \d\d:\d\d UTC)?", "DAY"), ("(?i:roll|pitch|yaw)", "MODE"),
                           ("(?i:guide preload|mount stiffness)", "PART"), ("[A-L]-Y", "NAME"),
                           ("PART and PART", "PART"), (r"[-+]?\d([\d. ]*\d)?", "N")):  # fmt: skip
-        said = re.sub(pattern, word, said)
-    return said
+        sentence = re.sub(pattern, word, sentence)
+    return sentence
 
 
 def total(table: list[Row]) -> dict[str, int]:
@@ -314,10 +314,10 @@ def announced(rows: list[Row], letter: str, what: str, when: Any, pattern: str) 
     if isinstance(when, dict):
         when = next(day for day in range(400) if any(
             NAMES[name].health(part, day, 0) <= when[part] for part in when))  # fmt: skip
-    told = [run_day(row["month"]) for row in rows if row["machine"] == name
-            and row["source"] == "alert" and re.match(pattern, row["said"])]  # fmt: skip
-    late = {"late_days": told[0] - when} if told else {}
-    return {"machine": name, "event": what, "day": when, "alerts": len(told), **late}
+    alerts = [run_day(row["month"]) for row in rows if row["machine"] == name
+            and row["source"] == "alert" and re.match(pattern, row["sentence"])]  # fmt: skip
+    late = {"late_days": alerts[0] - when} if alerts else {}
+    return {"machine": name, "event": what, "day": when, "alerts": len(alerts), **late}
 
 
 def claims(record: Row) -> Iterator[Claim]:
