@@ -20,22 +20,25 @@ from lmshealth.machine.service import ProbabilityBounds, Service, day_after, rem
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[
-    "inspect", "find-cause", "check-drift", "log-now", "none", "record",
+    "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
     "service-now", "overdue", "confirm", "schedule", "plan", "later",
 ]  # fmt: skip
-"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, record
-a log that is late, nothing, record logs, service it now, service it after its date, confirm a
+"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, or that
+a worn machine was repaired, record a log that is late, nothing, record logs, service it now, service it after its date, confirm a
 service date by further logs, plan the service of a sound or of a worn machine, or nothing within
 the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``open``
-# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
+# step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``repair``
+# (perhaps: a loss before a last log that is left out), ``open`` (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
 # where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),
     ("check-drift", "drift", "", "", ""),
+    ("check-loss", "repair", "now", "", ""),
+    ("check-loss", "repair", "by", "", ""),
+    ("check-drift", "repair", "", "", ""),
     ("log-now", "", "unknown", "", "late"),
     ("none", "healthy", "unknown", "", ""),
     ("record", "", "unknown", "", ""),
@@ -104,10 +107,11 @@ def _class_of(assessment: Assessment) -> str:
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
         return "alarm"
-    if assessment.drifted or (assessment.left_out and verdict in ("healthy", *NO_HEALTH)):
-        return "drift"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
-    return known.get(verdict, "loss")
+    found = known.get(verdict, "loss")
+    if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):
+        return "drift"
+    return "repair" if assessment.left_out and found == "loss" else found
 
 
 def first_limit(prognosis: Prognosis | None) -> tuple[str, float] | None:
@@ -220,6 +224,7 @@ class Summary:
     life: Life | None
     service: Service
     step: NextStep
+    deviates: bool = False  # whether the last log is left out: the verdict is that before it
     # Day that it is of; `status.on_day` sets it, and what depends on it: urgency, state and step.
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
@@ -264,6 +269,7 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
         step=next_step(assessment, service),
+        deviates=bool(assessment.left_out) and judgement.probability >= 0,
     )
 
 

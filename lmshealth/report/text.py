@@ -345,9 +345,11 @@ def verdict_text(summary: Summary) -> str:
         "step": tr("sudden change without a known cause"),
         OUTSIDE_MAP: tr("a mode moved alone, by a cause outside the map"),
     }
-    return texts.get(summary.verdict) or tr(
+    words = texts.get(summary.verdict) or tr(
         "loss of {names}", names=joined(map(spell, summary.lost))
     )
+    before_last = tr("{verdict} before the last log, which deviates", verdict=words)
+    return before_last if summary.deviates else words
 
 
 def headline(summary: Summary) -> str:
@@ -364,8 +366,6 @@ def headline(summary: Summary) -> str:
     if summary.alarmed:
         return tr("Alarm: unexplained change of {names}", names=joined(map(spell, summary.alarmed)))
     words = verdict_text(summary)
-    if summary.step.kind == "check-drift" and summary.probability >= 0:
-        words = tr("{verdict} before the last log, which deviates", verdict=words)
     return words[0].upper() + words[1:]
 
 
@@ -373,12 +373,16 @@ def service_on_day(summary: Summary) -> str:
     """Return when to service a machine, as of the day of its summary, in a few words."""
     by = summary.service.by
     if summary.service.kind == "by" and by and summary.today and by < summary.today:
-        return tr("overdue since {day}", day=day(by))
+        words = tr("overdue since {day}", day=day(by))
+    else:
+        words = service_text(summary.service)
+    if summary.step.kind == "check-loss":
+        return tr("{service}, unless it was repaired", service=words)
     if summary.service.kind == "later" and summary.unknown:
         return tr("unknown without a log")
     if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
         return tr("open until the cause is found")
-    return service_text(summary.service)
+    return words
 
 
 # Work that restores a parameter; of any other: work on it.
@@ -396,6 +400,10 @@ _STEPS = {
     "check-drift": mark(
         "Record a log at once: a mode has moved by more than logs scatter. If it stays, look for "
         "work, payload, sensor or tuning as the cause."
+    ),
+    "check-loss": mark(
+        "Record a log at once: the last one deviates from those before. If the machine was repaired "
+        "in between, enter that in maintenance.csv; if not, {work} is due by {by}."
     ),
     "log-now": mark(
         "Record a log now: it is overdue, and the state since the last one is unknown."

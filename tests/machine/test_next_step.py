@@ -31,6 +31,8 @@ __all__ = ["make"]
         ("loss", "by", "young", "late", "plan"),
         ("loss", "by", "young", "overdue", "overdue"),
         ("loss", "now", "old", "late", "service-now"),
+        ("repair", "by", "old", "overdue", "check-loss"),
+        ("repair", "unknown", "old", "", "check-drift"),
         ("alarm", "by", "old", "overdue", "inspect"),
         ("healthy", "later", "old", "late", "log-now"),
         ("alarm", "by", "old", "", "inspect"),
@@ -59,7 +61,7 @@ def test_the_step_follows_from_verdict_service_and_age(
 
 def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
     """No combination is without a case, and no step without words."""
-    verdicts = ("alarm", "outside", "drift", "open", "healthy", "loss")
+    verdicts = ("alarm", "outside", "drift", "repair", "open", "healthy", "loss")
     services, ages, days = (
         ("now", "by", "later", "unknown"),
         ("young", "old"),

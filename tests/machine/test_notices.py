@@ -18,7 +18,7 @@ from lmshealth.machine.status import make_status, notices
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables
-from lmshealth.report.text import headline
+from lmshealth.report.text import changes, headline, service_on_day
 from lmshealth.tracking.history import Step
 from tests.assessments import Assessment, Maker, make, nothing
 from tests.lives import FREQUENCY, MODES, make_reading, make_stage
@@ -180,4 +180,7 @@ def test_last_logs_that_are_left_out_are_counted(
     later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))
     assert "unconfirmed-jump" in make_status(later, summarise(later, later.service())).conditions
     lost = replace(bad, judgement=replace(bad.judgement, verdict="preload"))
-    assert summarise(lost, lost.service()).step.kind in ("plan", "service-now")
+    summary = summarise(lost, lost.service())
+    assert summary.step.kind == "check-loss" and service_on_day(summary).endswith("was repaired")
+    assert headline(summary) == "Loss of guide preload before the last log, which deviates"
+    assert "before the last log, which deviates (" in [*changes(summary, summary)][0]

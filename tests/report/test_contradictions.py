@@ -38,7 +38,7 @@ def contradictions(text: str) -> Iterator[str]:
 
     The verdict at the last log is stated as such: it contradicts nothing.
     """
-    now = re.sub(r"(At the last log: \w[^.]*\.|\w+ at the last log|\d healthy)", "", text)
+    now = re.sub(r"(At the last log: \w[^.]*\.|Last verdict: \w[^%]*%|\d healthy)", "", text)
     late = "verdue since" in now or "was due by" in now or "has passed" in now
     is_healthy = "Healthy" in now and "the service is due" not in now
     idle = "No work is needed yet" in now or "No service is needed" in now
@@ -51,17 +51,26 @@ def contradictions(text: str) -> Iterator[str]:
         "normal, and not healthy": "107 on" in now
         and re.search(r"107 on [\d‑]+: normal", now)
         and re.search("Unknown since|Loss of|Alarm|verdue|Do [^.]* now", now),
+        "perhaps repaired, and order": "repaired" in now
+        and re.search("Order and plan|Do [^.]* now", now),
         "several ages": len(set(re.findall(r"[Nn]o log for (\d+) day", now))) > 1,
     }
     yield from (name for name, found in pairs.items() if found)
 
 
-def aged(made: Assessment, verdict: str, service: str, days: int, young: bool) -> Assessment:
-    """Give a machine another verdict and another service, its last log some days ago."""
+def aged(made: Assessment, verdict: str, service: str, days: int, kind: str) -> Assessment:
+    """Give a machine another verdict and another service, its last log some days ago.
+
+    It is ``young``, or its last log ``deviates``.
+    """
+    assert made.track is not None
+    if kind == "deviates":
+        last = len(made.track.logs) - 1, made.track.modes[0]
+        made = replace(made, track=replace(made.track, outliers=(last,)))
     judgement = replace(made.judgement, verdict=verdict)
     if verdict == "not-enough-data":
         judgement = replace(judgement, probability=float("nan"))
-    history = replace(made.history, baselines=(35,)) if young else made.history
+    history = replace(made.history, baselines=(35,)) if kind == "young" else made.history
     prognosis = None if service == "unknown" else made.prognosis
     today = made.judgement.recorded_at.date() + timedelta(days=days)
     return replace(made, judgement=judgement, history=history, prognosis=prognosis, today=today)
@@ -96,11 +105,11 @@ def pages_of(found: Assessment, service: Service, folder: Path) -> tuple[str, st
 def test_no_page_contradicts_itself(make: Maker, tmp_path: Path, verdict: str) -> None:
     """For each verdict, service, age and number of logs: first screen and row of the fleet page."""
     made = make("M7-Y", 30000 if verdict == "healthy" else 8000)
-    for service, days, young in product(SERVICES, AGES, (False, True)):
-        found = aged(made, verdict, service, days, young)
+    for service, days, kind in product(SERVICES, AGES, ("", "young", "deviates")):
+        found = aged(made, verdict, service, days, kind)
         for wait in (20.0, 300.0) if service == "by" else (0.0,):
             first, _, row = pages_of(found, served(found, service, wait), tmp_path)
-            case = f"{verdict}, service {service} in {wait:.0f} days, {days} days old, {young=}"
+            case = f"{verdict}, service {service} in {wait:.0f} days, {days} days old, {kind=}"
             assert list(contradictions(first)) == [], f"{case}: {first}"
             assert list(contradictions(row)) == [], f"{case}: {row}"
             ages = re.findall(r"[Nn]o log for (\d+) day", first + row)
@@ -120,6 +129,7 @@ def test_no_page_contradicts_itself(make: Maker, tmp_path: Path, verdict: str) -
     [
         ("Healthy Order and plan a preload adjustment before 2027-01-01", "healthy, and order"),
         ("Healthy Loss of guide preload", "healthy, and loss"),
+        ("If it was repaired, enter it. Order and plan a log", "perhaps repaired, and order"),
         ("Unknown since 2026-01-01 No service needed yet", "unknown, and healthy"),
         ("Overdue since 2026-01-01 No service is needed", "overdue, and nothing"),
         ("Loss of guide preload State by NAMUR NE 107 on 2026‑01‑01: normal", "normal, and not"),
