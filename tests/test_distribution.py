@@ -16,6 +16,7 @@ from packaging.requirements import Requirement
 ROOT = Path(__file__).parents[1]
 # Extras that people install to use the package; `peers` and `dev` stay with who develops it.
 EXTRAS = ("models", "formats", "pdf", "postgres", "notify", "distributed")
+CORE = ("numpy", "scipy", "pandas", "emcee", "filterpy")
 PERMISSIVE = re.compile(
     r"0BSD|Apache|BSD|CC0|HPND|ISC|MIT|PSF|Python[- ](2|Software)|Unlicense|Zlib|MPL|Mozilla"
 )
@@ -86,6 +87,23 @@ def test_core_has_no_copyleft() -> None:
     found: dict[str, Distribution] = {}
     needed("lmshealth", frozenset(), found)
     assert not WEAK_COPYLEFT & set(found)
+
+
+def size(found: dict[str, Distribution]) -> int:
+    """Return the bytes of the files of distributions, without compiled byte code."""
+    files = [Path(one.locate_file(file)) for one in found.values() for file in one.files or ()]
+    return sum(file.stat().st_size for file in files if file.suffix != ".pyc" and file.exists())
+
+
+def test_a_plain_installation_is_little_beyond_the_libraries_that_it_builds_on() -> None:
+    """NumPy, SciPy, pandas, emcee, filterpy with what these need are most of it."""
+    found: dict[str, Distribution] = {}
+    needed("lmshealth", frozenset(), found)
+    core = {normal(name): distribution(name) for name in CORE}
+    for name in CORE:
+        needed(name, frozenset(), core)
+    assert core.keys() < found.keys()
+    assert 0 < size(core) < size(found) < 1.4 * size(core)
 
 
 def wrong_versions(version: str, changelog: str, tags: list[str]) -> list[str]:

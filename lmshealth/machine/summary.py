@@ -23,15 +23,15 @@ Step = Literal[
     "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
     "service-now", "overdue", "confirm", "schedule", "plan", "later",
 ]  # fmt: skip
-"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, or that
-a worn machine was repaired, record a log that is late, nothing, record logs, service it now, service it after its date, confirm a
-service date by further logs, plan the service of a sound or of a worn machine, or nothing within
-the horizon."""
+"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, or a
+loss after which the machine was perhaps repaired, record a log that is late, nothing, record logs,
+service it now, service it after its date, confirm a service date by further logs, plan the service
+of a sound or of a worn machine, or nothing within the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
 # step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``repair``
-# (perhaps: a loss before a last log that is left out), ``open`` (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
-# where a log is. "" is any.
+# (perhaps: a loss, and a last log that is left out), ``open`` (none), ``healthy`` or ``loss``. A
+# day is ``overdue`` after that of the service, else ``late`` where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),

@@ -402,8 +402,8 @@ _STEPS = {
         "work, payload, sensor or tuning as the cause."
     ),
     "check-loss": mark(
-        "Record a log at once: the last one deviates from those before. If the machine was repaired "
-        "in between, enter that in maintenance.csv; if not, {work} is due by {by}."
+        "Record a log at once: the last one deviates from those before. If the machine was "
+        "repaired in between, enter that in maintenance.csv; if not, {work} is due by {by}."
     ),
     "log-now": mark(
         "Record a log now: it is overdue, and the state since the last one is unknown."

@@ -341,7 +341,7 @@ def claims(record: Row) -> Iterator[Claim]:
     beside = f"{min(late)} to {max(late)} days after their begin, runs a month apart"
     once = sum(event["alerts"] == 1 for event in events)
     yield counted("events announced once", once, len(events), beside, met=passed[check])
-    beside = f"{record['late']} alerts, judged above, that a log is later than its page had asked for"
+    beside = f"{record['late']} alerts, judged above, that a log is later than asked for"
     yield Claim("alarms of the six healthy machines", str(sum(record["alarms"].values())), "",
                 beside, passed["no alarm of a healthy machine"])  # fmt: skip
 

@@ -183,4 +183,4 @@ def test_last_logs_that_are_left_out_are_counted(
     summary = summarise(lost, lost.service())
     assert summary.step.kind == "check-loss" and service_on_day(summary).endswith("was repaired")
     assert headline(summary) == "Loss of guide preload before the last log, which deviates"
-    assert "before the last log, which deviates (" in [*changes(summary, summary)][0]
+    assert "before the last log, which deviates (" in next(iter(changes(summary, summary)))
