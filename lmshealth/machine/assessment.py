@@ -228,42 +228,18 @@ def assess_from(
 
     Also returned is the state from which the next assessment begins.
     """
-    history, refused = build_history(readings, stage, work.actions)
-    notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
-    notices += missing_mode_notices(history, refused) + rate_notices(refused)
-    not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
-    by_log = {reading.log: reading for reading in readings}
-    used = [by_log[log] for log in history.logs]
-    made = Assessment(
-        stage=stage,
-        history=history,
-        digests=tuple(reading.digest for reading in used),
-        track=None,
-        health=None,
-        prognosis=None,
-        judgement=judge(stage, history, None),
-        refused=(*not_excited, *refused),
-        notices=tuple(notices),
-        seed=seed,
-        waterfall=Waterfall.stack([(reading.spectra, reading.modes.lines) for reading in used]),
-        latest=used[-1] if used else None,
-        at_baseline=used[history.baseline] if used else None,
-    )
+    made = _before_tracking(readings, stage, work, seed)
+    history = made.history
     try:
         tracked = track(history, stage)
     except LmshealthError as error:
         notice = Notice("no-result", "serious", "", str(error))
         return replace(made, notices=(*made.notices, notice)), None
-    doubt = doubt_of_names(stage, history, tracked, used)
-    refused += outlier_refusals(history, tracked)
+    by_log = {reading.log: reading for reading in readings}
+    doubt = doubt_of_names(stage, history, tracked, [by_log[log] for log in history.logs])
+    refused = (*made.refused, *outlier_refusals(history, tracked))
     judgement = judge(stage, history, None, tracked, doubt=doubt)
-    made = replace(
-        made,
-        track=tracked,
-        doubt=doubt,
-        refused=(*not_excited, *refused),
-        judgement=judgement,
-    )
+    made = replace(made, track=tracked, doubt=doubt, refused=refused, judgement=judgement)
     if doubt or not stage.parameters:
         return made, None
     try:
@@ -280,6 +256,33 @@ def assess_from(
         )
     notice = Notice("no-result", "serious", "", why)
     return replace(made, notices=(*made.notices, notice)), None
+
+
+def _before_tracking(
+    readings: Sequence[LogEstimates], stage: Stage, work: Maintenance, seed: int
+) -> Assessment:
+    """Return what is known of a machine before its modes are tracked."""
+    history, refused = build_history(readings, stage, work.actions)
+    notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
+    notices += missing_mode_notices(history, refused) + rate_notices(refused)
+    not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
+    by_log = {reading.log: reading for reading in readings}
+    used = [by_log[log] for log in history.logs]
+    return Assessment(
+        stage=stage,
+        history=history,
+        digests=tuple(reading.digest for reading in used),
+        track=None,
+        health=None,
+        prognosis=None,
+        judgement=judge(stage, history, None),
+        refused=(*not_excited, *refused),
+        notices=tuple(notices),
+        seed=seed,
+        waterfall=Waterfall.stack([(reading.spectra, reading.modes.lines) for reading in used]),
+        latest=used[-1] if used else None,
+        at_baseline=used[history.baseline] if used else None,
+    )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
