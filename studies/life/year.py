@@ -216,7 +216,7 @@ RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
     (f"Written on {_DAY}, last log {_DAY}", False,
      lambda m, t: (at(m[1]), at(m[2])) == (t.today, int(t.last))),
     (r".*no log for (\d+) days", False, lambda m, t: int(m[1]) == t.today - int(t.last)),
-    (r"(?:Verdict: )?(?:. )?(.*) before the last log, which deviates", False,
+    (r"(?:.*→ |Verdict: )?(?:. )?(.*) before the last log, which deviates(?!.*→)", False,
      lambda m, t: Truth(t.machine, t.month, 1).verdict(m[1])),
     (r"Record a log at once|.*unless it was repaired", False, lambda m, t: t.unexplained),
     (f"caution: inspection-overdue:.* by {_DAY}", False,
@@ -264,7 +264,7 @@ def main() -> None:
     alerts = [row["sentence"] for row in rows if row["source"] == "alert"
             and NAMES[row["machine"]].role == "healthy"]  # fmt: skip
     # That a log is late is true of a healthy machine as well: the rules judge it.
-    late = [one for one in alerts if "inspection-overdue" in one]
+    late = [one for one in alerts if one.startswith("caution: inspection-overdue")]
     alarms = Counter(one.split(":")[1].strip() for one in alerts
                      if one not in late and not one.startswith("note"))  # fmt: skip
     passed = {

@@ -73,6 +73,26 @@ def pyoma2(world: World) -> Found:
     return found
 
 
+def koma(world: World) -> Found:
+    """Search with SSI of koma, in clusters of ten stable poles: order 40 has no more than twenty."""
+    from koma.clustering import PoleClusterer, group_clusters
+    from koma.oma import covssi, find_stable_poles
+
+    start = time.process_time()
+    samples, rate = _prepare(world)
+    orders = np.arange(2, 42 if samples.shape[1] <= 4 else 62, 2)
+
+    def search() -> Array:
+        poles = covssi(samples, rate, _rows(rate), orders, showinfo=False)
+        range_ = {"freq": [0, np.inf], "damping": [0, _LARGEST_DAMPING], "mpc": [0, 1]}
+        *stable, _ = find_stable_poles(*poles, s=2, valid_range=range_)
+        clusters = PoleClusterer(*stable, min_samples=10, min_cluster_size=10).postprocess()
+        return np.array([np.median(omega) for omega in group_clusters(*clusters)[1]]) / (2 * np.pi)
+
+    f = _found(search, world.band)
+    return {"koma SSI": (f, time.process_time() - start)}
+
+
 def toolbox(world: World, *, method: str) -> Found:
     """Search with a method of pyoma-toolbox, and its automatic clearing and selection."""
     from pyOMA.core.PreProcessingTools import PreProcessSignals
