@@ -74,7 +74,7 @@ def pyoma2(world: World) -> Found:
 
 
 def koma(world: World) -> Found:
-    """Search with SSI of koma, in clusters of ten stable poles: order 40 has no more than twenty."""
+    """Search with SSI of koma, in clusters of ten stable poles: order 40 has at most 20."""
     from koma.clustering import PoleClusterer, group_clusters
     from koma.oma import covssi, find_stable_poles
 
