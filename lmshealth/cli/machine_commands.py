@@ -25,6 +25,11 @@ from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.report import tables
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision
+from lmshealth.tracking.contradictions import (
+    LEFT_OUT,
+    contradiction_notices,
+    doubt_of_clock,
+)
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
@@ -32,6 +37,7 @@ from lmshealth.tracking.track import accepted_estimates, outlier_refusals
 from lmshealth.tracking.track import track as track_modes
 
 Progress = Callable[[str, int, int], None]
+Machine = tuple[History, list[Refusal]]
 _TABLES = ("track", "track_cov", "effects", "events", "refused")
 
 
@@ -56,7 +62,8 @@ _TABLES = ("track", "track_cov", "effects", "events", "refused")
 @click.option(
     "--smooth", "smoothed", is_flag=True, help="Add smoothed columns, which also use later logs."
 )
-def track(table: Path, **given: Any) -> None:
+@click.pass_context
+def track(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """Track modes through a table of estimates of lmshealth or another program.
 
     Required columns: recorded_at, frequency_hz and frequency_std_hz. The clock is travel_km when
@@ -86,6 +93,12 @@ def track(table: Path, **given: Any) -> None:
     for name in _TABLES:
         if targets[name]:
             write_text(targets[name], tables.csv_text(name, rows[name]))
+    ctx.exit(options.SOME_REFUSED if _some_left_out(machines) else 0)
+
+
+def _some_left_out(machines: Sequence[Machine]) -> bool:
+    """Return whether a log as a whole was refused."""
+    return any(one.reason in LEFT_OUT for _, refused in machines for one in refused)
 
 
 def _reading(given: dict[str, Any]) -> dict[str, Any]:
@@ -96,6 +109,7 @@ def _reading(given: dict[str, Any]) -> dict[str, Any]:
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Return what the reader of a track must take into account."""
     notes = [notice.what for notice in missing_mode_notices(history, refused)]
+    notes += map(str, contradiction_notices(len(history.logs), refused))
     if not history.has_odometer:
         notes.append("not every log has travel_km: the clock is the time")
     if len(history.logs) == 1:
@@ -130,18 +144,21 @@ def infer(ctx: click.Context, /, table: Path, **given: Any) -> None:
     the same folder.
     """
     with progress_bars(PATIENCE) as progress:
+        machines: list[Machine] = []
         if has_drifts(table):
             found, lost = _infer_drifts(table, given, progress)
         else:
-            machines, lost = _lives(_machines(table, given), given, progress)
+            machines = _machines(table, given)
+            lives, lost = _lives(machines, given, progress)
             found = []
-            for history, life in machines:
+            for history, life in lives:
                 epochs = epochs_to_publish(history, given["stage"], given["epochs"])
                 found.append(health_of(life, history, given["stage"], epochs))
     for health in found:
         views.print_health(health)
     rows = [row for health in found for row in tables.to_rows(health.to_columns())]
-    _finish(ctx, "health", rows, {health.stage: health for health in found}, lost)
+    some = bool(lost) or _some_left_out(machines)
+    _finish(ctx, "health", rows, {health.stage: health for health in found}, lost, some)
 
 
 def _infer_drifts(
@@ -172,14 +189,15 @@ def _infer_drifts(
     return found, lost
 
 
-def _machines(table: Path, given: dict[str, Any]) -> list[History]:
+def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     """Read the machines of a table of estimates, and print what it lacks."""
     machines, notes = read_machines(table, given["stage"], **_reading(given))
     print_notes(notes)
     for history, refused in machines:
-        missing = missing_mode_notices(history, refused)
-        print_notes(f"{history.stage}: {notice.what}" for notice in missing)
-    return [history for history, _ in machines]
+        found = missing_mode_notices(history, refused)
+        found += contradiction_notices(len(history.logs), refused)
+        print_notes(f"{history.stage}: {notice}" for notice in found)
+    return machines
 
 
 @options.command(
@@ -220,9 +238,10 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     stage, by = given["stage"], given["by"]
     decision = _decision(stage.description.decision, given["max_risk"], given["cost_ratio"])
     with progress_bars(PATIENCE) as progress:
-        machines, lost = _lives(_machines(table, given), given, progress)
+        machines = _machines(table, given)
+        lives, lost = _lives(machines, given, progress)
     found, rows = [], []
-    for history, posterior in machines:
+    for history, posterior in lives:
         try:
             found.append((prognosis_of(posterior, history, stage), posterior))
         except NotEnoughData as why:
@@ -237,7 +256,8 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             print_notes([f"{note} is given for that day"])
         views.print_life(life, service, before)
         rows += prognosis_rows(life, service, before)
-    _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost)
+    some = bool(lost) or _some_left_out(machines)
+    _finish(ctx, "prognosis", rows, {one.stage: posterior for one, posterior in found}, lost, some)
 
 
 def _decision(described: Decision, risk: float | None, ratio: float | None) -> Decision:
@@ -250,15 +270,17 @@ def _decision(described: Decision, risk: float | None, ratio: float | None) -> D
 
 
 def _lives(
-    histories: list[History], given: dict[str, Any], progress: Progress
+    machines: list[Machine], given: dict[str, Any], progress: Progress
 ) -> tuple[list[tuple[History, LifePosterior]], list[str]]:
     """Fit the lives of all machines; return them with accepted logs, and reasons of the others."""
     found, lost, stage = [], [], given["stage"]
-    for k, history in enumerate(histories):
-        progress("sampling", k, len(histories))
+    for k, (history, refused) in enumerate(machines):
+        progress("sampling", k, len(machines))
+        contradictions = contradiction_notices(len(history.logs), refused)
         try:
             tracked = track_modes(history, stage)
-            if doubt := doubt_of_names(stage, history, tracked):
+            doubt = doubt_of_clock(contradictions) or doubt_of_names(stage, history, tracked)
+            if doubt:
                 raise NotEnoughData(f"{history.stage}: {doubt}")
             accepted = accepted_estimates(history, tracked)
             seed = seed_of(given["seed"], history.stage, stage.digest)
@@ -267,12 +289,17 @@ def _lives(
             lost.append(str(why))
         except (NotConverged, LinAlgError) as why:
             lost.append(f"{history.stage}: {why}; check the units of odometer and frequencies")
-    progress("sampling", len(histories), len(histories))
+    progress("sampling", len(machines), len(machines))
     return found, lost
 
 
 def _finish(
-    ctx: click.Context, name: str, rows: list[Row], draws: Mapping[str, Any], lost: Sequence[str]
+    ctx: click.Context,
+    name: str,
+    rows: list[Row],
+    draws: Mapping[str, Any],
+    lost: Sequence[str],
+    some_refused: bool,
 ) -> None:
     """Write the table and the draws of each machine, print why others have none, and exit."""
     print_errors(lost)
@@ -282,4 +309,4 @@ def _finish(
     if ctx.params["posterior"]:
         trees = [posterior.to_arviz() for posterior in draws.values()]
         write_draws(ctx.params["posterior"], list(draws), trees)
-    ctx.exit(options.SOME_REFUSED if lost else 0)
+    ctx.exit(options.SOME_REFUSED if some_refused else 0)

@@ -17,7 +17,6 @@ from lmshealth._private.tables import TABLES
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import clock_and_steps, with_clock
-from lmshealth.life.posterior.ensemble_sampling import rank_r_hat
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.likelihood import default_scatter
 from lmshealth.stage.constants import INFORMED
@@ -58,7 +57,8 @@ class Health(Result):
     # What drew the probable scenarios: ``emcee``, or ``importance`` in an update, ``(n_epochs,)``.
     sampler: tuple[str, ...]
     # Smallest effective sample size of the chains, for the middle and for the 5 and 95 % quantiles
-    # (of importance sampling by the weights, for both), and rank-normalised split R-hat.
+    # (of importance sampling by the weights, for both), and largest rank-normalised split R-hat:
+    # of the chains of each scenario, as draws of their mixture are in the order of scenarios.
     ess_bulk: FloatArray
     ess_tail: FloatArray
     r_hat: FloatArray
@@ -287,7 +287,7 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
         sampler=(life.sampler,) * n,
         ess_bulk=np.full((n, p), min(life.ess, constants.N_DRAWS)),
         ess_tail=np.full((n, p), min(life.ess, constants.N_DRAWS)),
-        r_hat=np.full((n, p), np.maximum(rank_r_hat(x[-1]), life.worst_r_hat)),
+        r_hat=np.full((n, p), life.worst_r_hat),
         judge_shift=np.tile(life.judge_shift, (n, 1)),
         judge_ratio=np.tile(life.judge_ratio, (n, 1)),
         informed=np.where(variance > 0, informed, 0.0),

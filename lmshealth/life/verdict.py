@@ -87,7 +87,7 @@ def judge(
     health, track : Health or None, Track, optional
         Posterior of the parameters, None if they could not be inferred; steps and alarms.
     doubt : str
-        Why the names of the modes are in doubt, from `doubt_of_names`; then there is no health.
+        Why there must be no health, from `doubt_of_names` or `doubt_of_clock`.
 
     Returns
     -------
@@ -273,21 +273,25 @@ def _alarm_sentences(track: Track | None, baseline: int) -> Iterator[str]:
 def _judge_step(
     stage: Stage, history: History, health: Health | None, jumps: list[Event]
 ) -> Verdict:
-    last = max(event.epoch for event in jumps)
-    latest = (event for event in jumps if event.epoch == last)
-    sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in latest)
-    when, moved = history.recorded_at[last].date().isoformat(), sizes.replace("-", "−")
-    why = fact(
-        "The frequencies jumped before the log of {day} ({sizes}), and no declared maintenance "
-        "explains it.",
-        day=when,
-        sizes=moved,
-    )
+    sentences = []
+    for epoch in sorted({event.epoch for event in jumps}):
+        own = (event for event in jumps if event.epoch == epoch)
+        sizes = ", ".join(f"{one.mode} {100 * np.expm1(one.size):+.1f} %" for one in own)
+        when, moved = history.recorded_at[epoch].date().isoformat(), sizes.replace("-", "−")
+        sentences.append(
+            fact(
+                "The frequencies jumped before the log of {day} ({sizes}), and no declared "
+                "maintenance explains it.",
+                day=when,
+                sizes=moved,
+            )
+        )
     if health is not None and health.publishable_parameters().any():
-        why += " " + _parameter_sentences(stage, health)
+        sentences.append(_parameter_sentences(stage, health))
     # The evidence is against all that is harmless: wander, outliers, running-in.
     evidence = max(event.evidence for event in jumps) + logit(constants.STEP_PROBABILITY)
-    return Verdict(history.stage, history.recorded_at[-1], "step", float(expit(evidence)), why)
+    probability, why = float(expit(evidence)), " ".join(sentences)
+    return Verdict(history.stage, history.recorded_at[-1], "step", probability, why)
 
 
 def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:

@@ -43,7 +43,8 @@ from lmshealth.machine.service import Service, decide
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.history import History, build_history, missing_mode_notices, rate_notices
+from lmshealth.tracking.contradictions import contradiction_notices, doubt_of_clock
+from lmshealth.tracking.history import History, build_history, missing_mode_notices
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
@@ -74,7 +75,7 @@ class Assessment:
     # Lives before the present baseline, and what those of the fleet support; None with too few.
     ended: tuple[EndedLife, ...] = ()
     calibration: Calibration | None = None
-    doubt: str = ""  # why the names of the modes are in doubt; then there is no health
+    doubt: str = ""  # why names of modes, odometer or dates are in doubt; then there is no health
     today: date | None = None  # day of its status; None for that of the last log
 
     def __repr__(self) -> str:
@@ -236,7 +237,8 @@ def assess_from(
         notice = Notice("no-result", "serious", "", str(error))
         return replace(made, notices=(*made.notices, notice)), None
     by_log = {reading.log: reading for reading in readings}
-    doubt = doubt_of_names(stage, history, tracked, [by_log[log] for log in history.logs])
+    used = [by_log[log] for log in history.logs]
+    doubt = doubt_of_clock(made.notices) or doubt_of_names(stage, history, tracked, used)
     refused = (*made.refused, *outlier_refusals(history, tracked))
     judgement = judge(stage, history, None, tracked, doubt=doubt)
     made = replace(made, track=tracked, doubt=doubt, refused=refused, judgement=judgement)
@@ -264,7 +266,8 @@ def _before_tracking(
     """Return what is known of a machine before its modes are tracked."""
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
-    notices += missing_mode_notices(history, refused) + rate_notices(refused)
+    notices += missing_mode_notices(history, refused)
+    notices += contradiction_notices(len(history.logs), refused)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]

@@ -34,6 +34,8 @@ DRIFT_SIGMA = 6.0
 """Drift in standard deviations that is reported where no verdict is possible yet: three times what
 is expected where the reported errors are too small by a factor of two, as of a first log that
 shares a cause with no other."""
+RISEN = 1.05
+"""Share of its baseline that no wear reaches: a parameter above it with 95 % is reported."""
 
 JSON_SCHEMA = 2
 """Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,

@@ -10,12 +10,12 @@ from typing import Any, Literal
 
 import msgspec
 import numpy as np
-from scipy.special import gammaincinv
+from scipy.special import chdtrc, gammaincinv
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.tables import fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
-from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, SURPRISE
+from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, MIN_FIT, SURPRISE
 from lmshealth.life.verdict import (
     NO_HEALTH,
     OUTSIDE_MAP,
@@ -26,6 +26,7 @@ from lmshealth.life.verdict import (
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.summary import Summary, days_between, prognosis_rows
+from lmshealth.tracking.contradictions import doubt_of_clock
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -39,7 +40,7 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
 
 def _of_names(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about names of modes and flags of their last estimates."""
-    if assessment.doubt:
+    if assessment.doubt not in ("", doubt_of_clock(assessment.notices)):
         yield Notice("names-in-doubt", "serious", "", assessment.doubt)
     latest = assessment.latest
     flags = () if latest is None else zip(latest.modes.names, latest.modes.flags, strict=True)
@@ -120,6 +121,17 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
         what = fact("No life of the parameters explains the modes (p = {p:.1g}).", p=health.fit[-1])
         to_do = fact("Check what else moved the modes, and the map.")
         yield Notice("unexplained-drifts", "serious", "", what, to_do)
+    least = health.latest(np.array(0.05))
+    for name, low, known in zip(
+        health.parameters, least, health.publishable_parameters(), strict=True
+    ):
+        if known and low > constants.RISEN:
+            what = fact(
+                "{name} is above its baseline value, which no wear does.",
+                name=spell(name).capitalize(),
+            )
+            to_do = fact("Enter work since the baseline in maintenance.csv, or check the map.")
+            yield Notice("above-baseline", "caution", name, what, to_do)
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
             what = fact(
@@ -161,13 +173,15 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             yield Notice("mode-off-map", "caution", lone.mode, what)
     dof = prognosis.degrees_of_freedom
     if dof > 0 and prognosis.chi_square > chi_square_band(np.array(dof))[1]:
+        # One of forty machines is above the band by chance.
+        by_chance = chdtrc(dof, prognosis.chi_square) >= MIN_FIT
         what = fact(
             "No law of degradation fits the logs (χ² {value:.0f} of {dof:.0f}).",
             value=prognosis.chi_square,
             dof=dof,
         )
         to_do = fact("Do not rely on the remaining life, and record further logs soon.")
-        yield Notice("laws-do-not-fit", "serious", "", what, to_do)
+        yield Notice("laws-do-not-fit", "caution" if by_chance else "serious", "", what, to_do)
     fleet = assessment.calibration
     if fleet is not None and fleet.p_value < SURPRISE:
         what = fact(

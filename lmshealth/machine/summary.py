@@ -42,13 +42,15 @@ CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("log-now", "", "unknown", "", "late"),
     ("none", "healthy", "unknown", "", ""),
     ("record", "", "unknown", "", ""),
+    ("log-now", "open", "", "", "overdue"),
+    ("log-now", "open", "", "", "late"),
+    ("confirm", "open", "by", "young", ""),
+    ("record", "open", "", "", ""),
     ("service-now", "", "now", "", ""),
     ("log-now", "healthy", "by", "young", "overdue"),
-    ("log-now", "open", "by", "young", "overdue"),
     ("overdue", "", "by", "", "overdue"),
     ("log-now", "healthy", "", "", "late"),
     ("confirm", "healthy", "by", "young", ""),
-    ("confirm", "open", "by", "young", ""),
     ("schedule", "healthy", "by", "", ""),
     ("plan", "", "by", "", ""),
     ("log-now", "", "later", "", "late"),
@@ -68,6 +70,7 @@ class NextStep:
     by: date | None = None  # day of the service
     log_every: float = np.inf  # days from one log to the next
     horizon: float = np.nan  # travel in m beyond which nothing is claimed
+    partial: bool = False  # whether a limit is left out, because the modes do not show it
     case: tuple[str, str, str] = ("open", "unknown", "young")  # verdict, service and age
 
     def on(self, day: str) -> NextStep:
@@ -89,7 +92,16 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     name = first[0] if first else prognosis.parameters[0]
     words = {spec.name: spec.word for spec in assessment.stage.parameters}
     every = service.inspect_every / float(np.median(prognosis.usage))
-    return NextStep(step, name, words.get(name, ""), service.by, every, prognosis.horizon, case)
+    return NextStep(
+        kind=step,
+        parameter=name,
+        word=words.get(name, ""),
+        by=service.by,
+        log_every=every,
+        horizon=prognosis.horizon,
+        partial=bool(prognosis.unidentifiable),
+        case=case,
+    )
 
 
 def step_of(verdict: str, service: str, age: str, day: str = "") -> Step:

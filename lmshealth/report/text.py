@@ -345,6 +345,9 @@ def verdict_text(summary: Summary) -> str:
         "step": tr("sudden change without a known cause"),
         OUTSIDE_MAP: tr("a mode moved alone, by a cause outside the map"),
     }
+    if summary.step.partial and summary.life:
+        names = joined(map(spell, summary.life.undetermined))
+        texts["healthy"] = tr("healthy as far as the modes show, {names} not known", names=names)
     words = texts.get(summary.verdict) or tr(
         "loss of {names}", names=joined(map(spell, summary.lost))
     )
@@ -380,6 +383,8 @@ def service_on_day(summary: Summary) -> str:
         return tr("{service}, unless it was repaired", service=words)
     if summary.service.kind == "later" and summary.unknown:
         return tr("unknown without a log")
+    if summary.service.kind == "later" and summary.step.partial:
+        return tr("none by what the modes show")
     if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
         return tr("open until the cause is found")
     return words
@@ -425,6 +430,10 @@ _STEPS = {
     "later": mark("No service is needed within {horizon}; record {often}."),
 }
 
+_LATER_IN_PART = mark(
+    "No service is needed within {horizon} for what the modes show; record {often}."
+)
+
 
 def next_step(step: NextStep) -> str:
     """Return what to do next in a sentence."""
@@ -432,7 +441,8 @@ def next_step(step: NextStep) -> str:
     work = tr(known) if known else tr("work on {name}", name=spell(step.parameter))
     by = "" if step.by is None else day(step.by)
     often, horizon = _often(step.log_every), km(step.horizon)
-    return tr(_STEPS[step.kind], work=work, by=by, often=often, horizon=horizon)
+    words = _LATER_IN_PART if step.partial and step.kind == "later" else _STEPS[step.kind]
+    return tr(words, work=work, by=by, often=often, horizon=horizon)
 
 
 def _often(days: float) -> str:

@@ -45,6 +45,9 @@ WIDENING_P_VALUE = 5e-4
 # Below these p-values a filter is not consistent: overconfident, or too cautious. The second is
 # lower, because averaging over process noise is somewhat cautious for quiet machines.
 OVERCONFIDENT_P_VALUE, CAUTIOUS_P_VALUE = 1e-3, 1e-6
+# Of thousands of logs any deviation is significant: one between these ratios of squared innovations
+# to their expectation, or an autocorrelation up to this, hardly changes an interval.
+NEGLIGIBLE_NIS, NEGLIGIBLE_CORRELATION = (0.8, 1.1), 0.1
 # Two-sided p-value outside of which NIS counts as "above" or "below" its 95 % band.
 NIS_P_VALUE = 0.05
 
@@ -189,6 +192,9 @@ LEAST_LOGS_NEW, LEAST_LOGS_NAMED = 3, 2
 # machine in use, a third or more. One that was idle so long loses one log, until a second one
 # confirms its date. Rates need so many logs.
 IDLE_S, LONGEST_IDLE_S, IDLE_SHARE, DATED_LOGS = 365.25 * 86400, 10 * 365.25 * 86400, 0.02, 5
+# Of more logs than these that contradict the others, and more than this share of all, it is not
+# known which are right: a clock or an odometer was reset.
+FEW_CONTRADICTIONS, CONTRADICTING_SHARE = 2, 0.1
 # So many logs in a row without an assigned estimate of a mode are reported.
 MISSING_LOGS = 3
 # Smallest relative standard deviation of a frequency in a foreign table, and smallest and largest

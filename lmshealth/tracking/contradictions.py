@@ -7,8 +7,9 @@ from datetime import UTC, datetime
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray
+from lmshealth._private.tables import fact
 from lmshealth.io.constants import AGREEMENT
-from lmshealth.io.log import Refusal
+from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.tracking import constants
@@ -33,6 +34,49 @@ def without_contradictions(
         ordered, found = check(ordered)
         refused += found
     return ordered, refused
+
+
+def contradiction_notices(n_used: int, refused: Sequence[Refusal]) -> list[Notice]:
+    """Return notices about logs that contradict the others of a machine, ``n_used`` of them.
+
+    One of the code ``logs-contradict`` is serious: too many contradict by odometer or date to know
+    which are right, so that no health must be inferred from the others.
+    """
+    rates = [one.log for one in refused if one.reason == "odd-rate"]
+    notices = []
+    if rates:
+        what = fact(
+            "{n} logs have another sample rate, which their frequencies follow: they are left out.",
+            n=len(rates),
+        )
+        to_do = fact(
+            "Find out which rate is right (refused.csv has both), and correct manifest.csv."
+        )
+        notices.append(Notice("odd-rate", "caution", rates[0], what, to_do))
+    times = [one.log for one in refused if one.reason in ("odometer", "date")]
+    n, total = len(times), len(times) + n_used
+    if not n:
+        return notices
+    to_do = fact("Correct odometer or date of the logs of refused.csv in manifest.csv.")
+    if n > max(constants.FEW_CONTRADICTIONS, constants.CONTRADICTING_SHARE * total):
+        what = fact(
+            "{n} of {total} logs contradict the others by odometer or date, as after a reset: "
+            "which of them are right is not known, so that no health is published.",
+            n=n,
+            total=total,
+        )
+        return [*notices, Notice("logs-contradict", "serious", times[-1], what, to_do)]
+    what = fact(
+        "{n} of {total} logs contradict the others by odometer or date, and are left out.",
+        n=n,
+        total=total,
+    )
+    return [*notices, Notice("logs-left-out", "caution", times[-1], what, to_do)]
+
+
+def doubt_of_clock(notices: Sequence[Notice]) -> str:
+    """Return why odometer and dates do not allow any health; empty where they do."""
+    return next((one.what for one in notices if one.code == "logs-contradict"), "")
 
 
 def _without_odometer_errors(

@@ -439,19 +439,6 @@ def _line_up(
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 
-def rate_notices(refused: Sequence[Refusal]) -> list[Notice]:
-    """List the logs of another sample rate that were left out."""
-    logs = [one.log for one in refused if one.reason == "odd-rate"]
-    if not logs:
-        return []
-    what = fact(
-        "{n} logs have another sample rate, which their frequencies follow: they are left out.",
-        n=len(logs),
-    )
-    to_do = fact("Find out which rate is right (refused.csv has both), and correct manifest.csv.")
-    return [Notice("odd-rate", "caution", logs[0], what, to_do)]
-
-
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:
     """List modes that the last logs do not detect, or whose estimates are ambiguous there."""
     least = constants.MISSING_LOGS

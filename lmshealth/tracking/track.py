@@ -67,10 +67,13 @@ class Consistency:
 
     @property
     def holds(self) -> bool:
-        """Whether neither test rejects the filter."""
+        """Whether no test rejects the filter, or only by deviations too small to matter."""
         bounds = (constants.CAUTIOUS_P_VALUE, constants.OVERCONFIDENT_P_VALUE)
+        low, high = constants.NEGLIGIBLE_NIS
+        right = low <= self.nis <= high or self.p_value >= bounds[self.nis > 1]
         least = bounds[self.autocorrelation > 0]
-        return self.p_value >= bounds[self.nis > 1] and self.autocorrelation_p_value >= least
+        small = abs(self.autocorrelation) <= constants.NEGLIGIBLE_CORRELATION
+        return right and (small or self.autocorrelation_p_value >= least)
 
     @property
     def side(self) -> Literal["below", "inside", "above"]:

@@ -140,6 +140,22 @@ def test_two_choices_of_the_day_are_wrong_usage(table: Path, toml: Path, tmp_pat
 
 
 @pytest.mark.usefixtures("quick")
+@pytest.mark.parametrize(("first", "lost"), [(6, True), (11, False)])
+def test_an_odometer_that_was_reset_gives_no_date(
+    table: Path, toml: Path, tmp_path: Path, first: int, lost: bool
+) -> None:
+    """Status 3 and a reason where logs contradict each other; a single one is only left out."""
+    rows, out = pd.read_csv(table), tmp_path / "p.csv"
+    later = (rows["stage"] == "AX-2") & (rows["log"] >= f"AX-2-{first:02d}")
+    rows.loc[later, "travel_km"] -= 100.0 * first - 50
+    rows.to_csv(table, index=False)
+    result = call(table, "--stage", toml, "--out", out)
+    assert result.exit_code == 3
+    assert "of 12 logs contradict the others by odometer" in " ".join(result.stderr.split())
+    assert ("AX-2" in set(pd.read_csv(out)["stage"])) == (not lost)
+
+
+@pytest.mark.usefixtures("quick")
 def test_a_machine_without_odometer_is_left_out(table: Path, toml: Path, tmp_path: Path) -> None:
     """Status 3 where one of two machines has no odometer, 1 and no file where none has."""
     rows, out = pd.read_csv(table), tmp_path / "p.csv"

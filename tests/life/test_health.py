@@ -127,6 +127,8 @@ def test_the_last_epoch_is_the_posterior_of_the_life(
     np.testing.assert_array_equal(health.lone, life.lone)
     assert health.lone_modes == life.lone_modes == prognosis.modes_off
     assert health.fit[-1] == life.fit
+    # Of the chains of scenarios: draws of the mixture are in their order.
+    assert (health.r_hat == life.worst_r_hat).all()
     assert health.modes == life.modes == ("roll", "pitch", "yaw")
     assert health.sampler == ("importance",) * 11
 

@@ -185,6 +185,12 @@ def test_an_undeclared_step_is_the_verdict(stage: Stage) -> None:
     assert "Mount stiffness is at 60 %" in found.why
     # Also where the logs do not carry health.
     assert judge(stage, logs(8), None, stepped()).verdict == "step"
+    # Each jump since the baseline is named.
+    first, second = stepped(epoch=3), stepped()
+    both = replace(second, events=(*first.events, *second.events))
+    days = [logs(8).recorded_at[epoch].date().isoformat() for epoch in (3, 5)]
+    why = judge(stage, logs(8), health, both).why
+    assert [f"before the log of {day} (roll" in why for day in days] == [True, True]
 
 
 def test_a_declared_or_past_step_is_not_the_verdict(stage: Stage) -> None:

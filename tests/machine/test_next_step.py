@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from lmshealth.machine import constants
-from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of
+from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
 from lmshealth.report import text
 from tests.assessments import Maker, make
 
@@ -45,7 +45,9 @@ __all__ = ["make"]
         ("healthy", "by", "young", "", "confirm"),
         ("open", "by", "young", "", "confirm"),
         ("open", "by", "young", "overdue", "log-now"),
-        ("open", "by", "old", "", "plan"),
+        ("open", "by", "old", "", "record"),
+        ("open", "now", "old", "", "record"),
+        ("open", "now", "old", "late", "log-now"),
         ("healthy", "by", "old", "", "schedule"),
         ("loss", "by", "young", "", "plan"),
         ("healthy", "later", "old", "", "later"),
@@ -73,6 +75,20 @@ def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
     for kind in get_args(Step):
         sentence = text.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
         assert (sentence == "") == (kind == "none")
+
+
+def test_a_limit_that_no_mode_shows_is_not_called_healthy(make: Maker) -> None:
+    """Headline, service and next step are of what the modes show."""
+    found = make(wear_km=30000)
+    assert found.prognosis is not None
+    for names in ((), ("mount_stiffness",)):
+        prognosis = replace(found.prognosis, unidentifiable=names)
+        one = replace(found, prognosis=prognosis)
+        service = replace(one.service(), kind="later", by=None)
+        summary = summarise(one, service)
+        shown = text.headline(summary), text.service_on_day(summary), text.next_step(summary.step)
+        assert ["modes show" in words for words in shown] == [bool(names)] * 3
+        assert ("mount stiffness not known" in shown[0]) == bool(names)
 
 
 def test_a_healthy_young_machine_orders_no_service(

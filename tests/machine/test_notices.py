@@ -40,6 +40,7 @@ def test_a_machine_that_its_model_fits_has_no_notices(make: Maker) -> None:
 @pytest.mark.parametrize("code", [
     "names-in-doubt", "filter-inconsistent", "unexplained-drifts", "end-of-map",
     "limit-not-included", "laws-do-not-fit", "last-logs-left-out", "step-suspected",
+    "above-baseline",
 ])  # fmt: skip
 def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     """What is wrong is noticed by its code, in words, and with the place."""
@@ -51,6 +52,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
         "names-in-doubt": {"doubt": "The names of the modes are in doubt."},
         "filter-inconsistent": {"track": replace(track, nis=track.nis * 9)},
         "unexplained-drifts": {"health": replace(health, fit=np.where(last, 1e-9, health.fit))},
+        "above-baseline": {"health": replace(health, chains=1.6 * health.chains)},
         "end-of-map": {"health": replace(health, at_edge=np.ones_like(health.at_edge))},
         "limit-not-included": {
             "prognosis": replace(prognosis, unidentifiable=("mount_stiffness",))
@@ -148,6 +150,21 @@ def test_a_drift_that_no_scatter_explains_is_stated_at_once(tmp_path: Path, n: i
     assert (status.device_health, [*status.conditions]) == ("OFF_SPEC", ["large-drift"])
     # With enough logs the filter has learned how they scatter: alarms decide.
     assert assess(few_logs(5, 0.014, 1), stage).drifted == {}
+
+
+def test_after_a_reset_of_the_odometer_no_health_is_stated(tmp_path: Path) -> None:
+    """Half of the logs contradict the others: one serious notice, and no verdict."""
+    stage, logs = make_stage(tmp_path), few_logs(12, 0.0, 1)
+    reset = [
+        replace(log, metadata=replace(log.metadata, travel=1e5 * (k - 5.5)))
+        for k, log in enumerate(logs)
+        if k > 5
+    ]
+    found = assess([*logs[:6], *reset], stage)
+    assert found.health is None and found.judgement.verdict == "not-enough-data"
+    (notice,) = (one for one in notices(found) if one.severity == "serious")
+    assert notice.code == "logs-contradict" and notice.what == found.doubt == found.judgement.why
+    assert "no-verdict" in make_status(found, summarise(found, found.service())).conditions
 
 
 def test_scatter_is_no_large_drift(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_health_of_a_machine_that_is_not_the_described_one_is_withheld(tmp_path:
     text = words(one(tmp_path, found))
     assert "Warning: The names of the modes are in doubt" in text
     assert f"roll {moved.frequency_hz:.5g} Hz and 126." in text
-    assert "Withheld, because the names of the modes are in doubt" in text
+    assert "Withheld: The names of the modes are in doubt" in text
     assert f"roll {moved.frequency_hz:.2f} Hz 126." in text
 
 

@@ -20,7 +20,7 @@ from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filters import state_space
 from lmshealth.tracking.filters.change_detection import Event, loop_evidence
 from lmshealth.tracking.history import History, StepKind
-from lmshealth.tracking.track import Track, accepted_estimates, consistency, track
+from lmshealth.tracking.track import Consistency, Track, accepted_estimates, consistency, track
 from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
@@ -537,6 +537,19 @@ def test_a_filter_that_is_inconsistent_widens(stage: Stage) -> None:
     assert found.widening[0] == 1
     assert not found.consistency().holds
     assert track(history, stage).consistency().holds
+
+
+@pytest.mark.parametrize(
+    ("nis", "autocorrelation", "holds"),
+    [(1.0, 0.0, True), (0.87, -0.08, True), (1.05, 0.05, True), (0.7, 0.0, False),
+     (1.2, 0.0, False), (1.0, 0.2, False), (1.0, -0.2, False)],
+)  # fmt: skip
+def test_a_deviation_of_thousands_of_logs_must_be_large(
+    nis: float, autocorrelation: float, holds: bool
+) -> None:
+    """Any is significant there, and those that hardly change an interval are no fault."""
+    assert Consistency(nis, 1e-9, autocorrelation, 1e-9).holds == holds
+    assert Consistency(nis, 0.5, autocorrelation, 0.5).holds
 
 
 def test_two_sources_are_told_apart_by_their_bias(stage: Stage) -> None:
