@@ -82,7 +82,7 @@ def compare(
         where that happens too often to cut the record.
     """
     size = measured[0].size
-    copies = _repeats(measured)
+    copies = _union(_repeats(measured), _held(measured))
     n_lost = int(np.sum(copies[:, 1] - copies[:, 0]))
     notes: list[tuple[str, str, str]] = []
     if n_lost:
@@ -327,6 +327,41 @@ def _rounding(velocity: Samples, expected: FloatArray) -> float:
     levels = np.abs(np.concatenate([velocity[k : k + 2 * _LENGTH] for k in ramps]))
     levels = levels[np.isfinite(levels)]
     return float(resolution(levels) / 2 / np.quantile(levels, 0.9)) if levels.any() else 0.0
+
+
+def _held(measured: Sequence[Samples]) -> IntArray:
+    """Find stretches in which all of several channels hold one value, ``(n, 2)``, ascending.
+
+    A driver that loses its data may write zeros, or the last sample. The noise of two channels is
+    never constant in both for so long, unless they are so coarse that samples are often equal; a
+    record that is held for most of its time has another clock.
+    """
+    size, least = measured[0].size, constants.SHORTEST_REPEAT - 1
+    if len(measured) < 2:
+        return NO_RANGES
+    same = np.zeros(size, dtype=bool)
+    for at, block in blocks(measured[0], overlap=1):
+        if (equal := block[1:] == block[:-1]).any():
+            stop = at + block.size
+            same[at + 1 : stop] = equal & _equal(measured[1:], at + 1, stop, 1)
+    held = runs(same)
+    long = np.diff(held, axis=1)[:, 0] >= least
+    n_held, n_same = int(np.diff(held[long]).sum()), int(same.sum())
+    chance = max(n_same - n_held, 1) / max(size - n_held, 1)
+    if n_held > size / 2 or -np.log(chance) * least < constants.CHANCE:
+        return NO_RANGES
+    return np.asarray(held[long])
+
+
+def _union(*found: IntArray) -> IntArray:
+    """Join half-open ranges, ``(n, 2)`` each, to ascending ones that do not touch."""
+    ranges = np.concatenate(found)
+    ranges = ranges[np.argsort(ranges[:, 0])]
+    if len(ranges) < 2:
+        return ranges
+    ends = np.maximum.accumulate(ranges[:, 1])
+    first = np.flatnonzero(np.append(True, ranges[1:, 0] > ends[:-1]))
+    return np.stack([ranges[first, 0], ends[np.append(first[1:] - 1, len(ranges) - 1)]], axis=1)
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:

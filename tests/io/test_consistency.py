@@ -226,6 +226,24 @@ def test_a_repeated_buffer_is_left_out(kind, instead):
     assert [note[0] for note in seen.notes] == ["repeated"]
 
 
+@pytest.mark.parametrize("value", [0.0, None])
+def test_samples_that_all_channels_hold_are_left_out(value):
+    """Zeros, or the last sample, in place of lost ones are found exactly, beside a repeat."""
+    signals = np.stack([noise(20_000, 1), rounded(noise(20_000, 2), 0.02)])
+    for start in (0, 7000, 12_000):
+        signals[:, start : start + 300] = signals[:, start, None] if value is None else value
+    signals[:, 15_000:15_512] = signals[:, 14_000:14_512]
+    seen = compare(None, None, None, list(signals), RATE, NO_BREAKS)
+    assert [note[0] for note in seen.notes] == ["repeated"]
+    want = [(0, 300), (7000, 7300), (12_000, 12_300), (15_000, 15_512)]
+    np.testing.assert_allclose(seen.repeated, want, atol=3)
+    # One channel may be constant for a while, or all have a slower clock.
+    alone = compare(None, None, None, [signals[0]], RATE, NO_BREAKS)
+    assert alone.repeated[:, 0].tolist() == [15_000]
+    slow = list(np.repeat(np.stack([noise(1000, 1), noise(1000, 2)]), 20, axis=1))
+    assert compare(None, None, None, slow, RATE, NO_BREAKS).notes == ()
+
+
 def test_one_channel_that_repeats_is_no_repeated_buffer():
     """All channels must repeat."""
     one, other = noise(20_000, 1), noise(20_000, 2)
