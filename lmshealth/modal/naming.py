@@ -33,7 +33,8 @@ def assign(
     """Assign resonances to targets by their `pairing_probability`.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
-    and the targets that are not assigned but may be one of the resonances.
+    and the targets that are not assigned but may be one of the resonances, each at the likeliest
+    one without a name.
     """
     names = clear_names(probability, targets, constants.CLEAR_NAME)
     # With complete assignments a named resonance cannot be another target as well.
@@ -44,7 +45,9 @@ def assign(
         if target.name not in names and rivals:
             odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
-            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
+            free = [(probability[i, j], frequency[i]) for i in rivals if not names[i]]
+            place = max(free)[1] if free else None
+            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}", place)
     return names, ambiguous
 
 
@@ -243,8 +246,8 @@ class Named:
         if (own := rejected.get(given.get(target.name, ""))) is not None:
             return replace(own, mode=target.name)
         if target.name in self.ambiguous:
-            reason, detail, _ = self.ambiguous[target.name]
-            return Refusal(self.log, reason, detail, mode=target.name)
+            reason, detail, place = self.ambiguous[target.name]
+            return Refusal(self.log, reason, detail, mode=target.name, frequency=place)
         near = [
             (abs(np.log(row.frequency / target.frequency)), row)
             for row in rejected.values()
