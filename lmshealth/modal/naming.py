@@ -73,7 +73,7 @@ def pairing_probability(
     """Return the probability that each resonance is each target, ``(n_resonances, n_targets)``.
 
     It is that of all assignments that keep the order of frequencies, of which the shifts of ln f
-    are normal about a common one, and every pair gains. Pairs outside the search, or with another
+    are normal about a common one, or those of a state of wear on the map, and every pair gains. Pairs outside the search, or with another
     damping where it is given, are excluded. Resonances, in Hz, and targets ascend; ``shapes`` holds
     the modal assurance criterion of each pair, NaN where it is unknown. ``complete`` states that
     every resonance is a target, ``standing`` that the machine is as likely at its description as
@@ -98,8 +98,16 @@ def pairing_probability(
     common = np.linspace(-reach, reach, _COMMON_SHIFTS)
     scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
     # Normal densities up to a factor, which cancels.
-    prior = np.exp(-0.5 * (common[:, None] / scales) ** 2) / scales @ [1.0, float(standing)]
-    apart = (shift - common[:, None, None]) / (search * constants.OWN_SHIFT)
+    moved, still = (np.exp(-0.5 * (common[:, None] / scales) ** 2) / scales).T
+    expected = np.repeat(common[:, None], m, axis=1)
+    if all(target.wear.size for target in targets):
+        # Wear has one half of its probability by the map.
+        states = np.array([target.wear for target in targets]).T
+        expected = np.concatenate([expected, states])
+        moved = np.append(moved / 2, np.full(len(states), moved.sum() / 2 / len(states)))
+        still = np.append(still, np.zeros(len(states)))
+    prior = moved + still * standing
+    apart = (shift - expected[:, None]) / (search * constants.OWN_SHIFT)
     weight = np.where(admissible, np.exp(gain - 0.5 * apart**2), 0.0)
     before = _sums_before(weight, complete=complete)
     after = _sums_before(weight[:, ::-1, ::-1], complete=complete)[:, ::-1, ::-1]
