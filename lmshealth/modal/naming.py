@@ -73,11 +73,11 @@ def pairing_probability(
     """Return the probability that each resonance is each target, ``(n_resonances, n_targets)``.
 
     It is that of all assignments that keep the order of frequencies, of which the shifts of ln f
-    are normal about a common one, or those of a state of wear on the map, and every pair gains. Pairs outside the search, or with another
-    damping where it is given, are excluded. Resonances, in Hz, and targets ascend; ``shapes`` holds
-    the modal assurance criterion of each pair, NaN where it is unknown. ``complete`` states that
-    every resonance is a target, ``standing`` that the machine is as likely at its description as
-    worn: then dampings count, too.
+    are normal about a common one, or those of a state of wear on the map, and every pair gains.
+    Pairs outside the search, or with another damping where it is given, are excluded. Resonances,
+    in Hz, and targets ascend; ``shapes`` holds the modal assurance criterion of each pair, NaN
+    where it is unknown. ``complete`` states that every resonance is a target, ``standing`` that the
+    machine is as likely at its description as worn: then dampings count, too.
     """
     n, m = len(frequency), len(targets)
     if not n or not m:
