@@ -91,7 +91,7 @@ def test_core_has_no_copyleft() -> None:
 
 def size(found: dict[str, Distribution]) -> int:
     """Return the bytes of the files of distributions, without compiled byte code."""
-    files = [Path(one.locate_file(file)) for one in found.values() for file in one.files or ()]
+    files = [Path(str(one.locate_file(file))) for one in found.values() for file in one.files or ()]
     return sum(file.stat().st_size for file in files if file.suffix != ".pyc" and file.exists())
 
 

@@ -39,6 +39,8 @@ DAMPING_SPAN = 10.0
 # Standard deviations of the prior of shifts of ln f, as shares of the search: common to all modes
 # (wear of a guide moves them together), and of each mode alone.
 COMMON_SHIFT, OWN_SHIFT = 1 / 2, 1 / 6
+# States of wear on the modal map, which moves modes apart by more: half of the prior of wear.
+WEAR_STATES = 512
 
 # Ambient identification
 

@@ -33,7 +33,8 @@ def assign(
     """Assign resonances to targets by their `pairing_probability`.
 
     Returns the name of each resonance, empty where it is no target or the assignment is not clear,
-    and the targets that are not assigned but may be one of the resonances.
+    and the targets that are not assigned but may be one of the resonances, each at the likeliest
+    one without a name.
     """
     names = clear_names(probability, targets, constants.CLEAR_NAME)
     # With complete assignments a named resonance cannot be another target as well.
@@ -44,7 +45,9 @@ def assign(
         if target.name not in names and rivals:
             odds = "; ".join(_odds(frequency[i], probability[i], targets) for i in rivals)
             remedy = "the assignment is not clear; excite the other modes, or narrow searches"
-            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}")
+            free = [(probability[i, j], frequency[i]) for i in rivals if not names[i]]
+            place = max(free)[1] if free else None
+            ambiguous[target.name] = Rejection("ambiguous", f"{odds}: {remedy}", place)
     return names, ambiguous
 
 
@@ -70,11 +73,11 @@ def pairing_probability(
     """Return the probability that each resonance is each target, ``(n_resonances, n_targets)``.
 
     It is that of all assignments that keep the order of frequencies, of which the shifts of ln f
-    are normal about a common one, and every pair gains. Pairs outside the search, or with another
-    damping where it is given, are excluded. Resonances, in Hz, and targets ascend; ``shapes`` holds
-    the modal assurance criterion of each pair, NaN where it is unknown. ``complete`` states that
-    every resonance is a target, ``standing`` that the machine is as likely at its description as
-    worn: then dampings count, too.
+    are normal about a common one, or those of a state of wear on the map, and every pair gains.
+    Pairs outside the search, or with another damping where it is given, are excluded. Resonances,
+    in Hz, and targets ascend; ``shapes`` holds the modal assurance criterion of each pair, NaN
+    where it is unknown. ``complete`` states that every resonance is a target, ``standing`` that the
+    machine is as likely at its description as worn: then dampings count, too.
     """
     n, m = len(frequency), len(targets)
     if not n or not m:
@@ -95,8 +98,16 @@ def pairing_probability(
     common = np.linspace(-reach, reach, _COMMON_SHIFTS)
     scales = search.mean() * np.array([constants.COMMON_SHIFT, constants.NO_SHIFT])
     # Normal densities up to a factor, which cancels.
-    prior = np.exp(-0.5 * (common[:, None] / scales) ** 2) / scales @ [1.0, float(standing)]
-    apart = (shift - common[:, None, None]) / (search * constants.OWN_SHIFT)
+    moved, still = (np.exp(-0.5 * (common[:, None] / scales) ** 2) / scales).T
+    expected = np.repeat(common[:, None], m, axis=1)
+    if all(target.wear.size for target in targets):
+        # Wear has one half of its probability by the map.
+        states = np.array([target.wear for target in targets]).T
+        expected = np.concatenate([expected, states])
+        moved = np.append(moved / 2, np.full(len(states), moved.sum() / 2 / len(states)))
+        still = np.append(still, np.zeros(len(states)))
+    prior = moved + still * standing
+    apart = (shift - expected[:, None]) / (search * constants.OWN_SHIFT)
     weight = np.where(admissible, np.exp(gain - 0.5 * apart**2), 0.0)
     before = _sums_before(weight, complete=complete)
     after = _sums_before(weight[:, ::-1, ::-1], complete=complete)[:, ::-1, ::-1]
@@ -243,8 +254,8 @@ class Named:
         if (own := rejected.get(given.get(target.name, ""))) is not None:
             return replace(own, mode=target.name)
         if target.name in self.ambiguous:
-            reason, detail, _ = self.ambiguous[target.name]
-            return Refusal(self.log, reason, detail, mode=target.name)
+            reason, detail, place = self.ambiguous[target.name]
+            return Refusal(self.log, reason, detail, mode=target.name, frequency=place)
         near = [
             (abs(np.log(row.frequency / target.frequency)), row)
             for row in rejected.values()

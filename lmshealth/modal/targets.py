@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from lmshealth._private.arrays import ComplexArray
+from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.channel_checks import independent
 from lmshealth.io.log import Channel, Log, Refusal
@@ -27,6 +27,9 @@ class Target:
     shape: Mapping[str, float] = field(default_factory=dict, compare=False)
     # Root of the PSD of the modal force in each channel of the log, with the signs of the shape.
     amplitude: ComplexArray | None = field(default=None, compare=False)
+    # Shifts of ln f over the states of wear on the modal map, ``(n_states,)``; equally many of all
+    # targets of a description, none where the map does not have the mode.
+    wear: FloatArray = field(default_factory=lambda: np.empty(0), compare=False)
 
     @property
     def bandwidth(self) -> float:
@@ -87,14 +90,32 @@ def check_band(log: Log, band: tuple[float, float] | None) -> None:
 def choose_targets(stage: Stage, band: tuple[float, float] | None = None) -> tuple[Target, ...]:
     """Return the modes of a description in a band in Hz, ascending; `BadStage` if none is left."""
     low, high = band or (0.0, np.inf)
+    wear = _wear(stage)
     targets = tuple(
-        Target(mode.name, mode.frequency_hz, mode.damping_ratio, mode.search, shape=mode.shape)
+        Target(
+            mode.name, mode.frequency_hz, mode.damping_ratio, mode.search,
+            shape=mode.shape, wear=wear.get(mode.name, np.empty(0)),
+        )
         for mode in sorted(stage.modes, key=lambda mode: mode.frequency_hz)
         if low <= mode.frequency_hz <= high
-    )
+    )  # fmt: skip
     if not targets:
         raise BadStage(f"{stage.name}: no [[mode]] lies between {low:g} and {high:g} Hz")
     return targets
+
+
+def _wear(stage: Stage) -> dict[str, FloatArray]:
+    """Return the shifts of ln f of each mode on the map, over states that searches hold."""
+    if stage.modal_map is None or not (names := stage.informative):
+        return {}
+    from scipy.stats import qmc  # late: reading a result needs none of it
+
+    low, high = stage.modal_map.low, stage.modal_map.high
+    points = low + (high - low) * qmc.Halton(low.size, scramble=False).random(constants.WEAR_STATES)
+    search = {mode.name: mode.search for mode in stage.modes}
+    drift = stage.drift(points, names)
+    held = (np.abs(drift) <= np.log1p([search[name] for name in names])).all(axis=1)
+    return dict(zip(names, drift[held].T, strict=True))
 
 
 def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:

@@ -168,8 +168,10 @@ RATE_STD, LEVEL_WALK, RATE_WALK, LN_ZETA_WALK = 0.3, 3e-3, 0.1, 0.3
 DECLARED_STEP_STD = 0.05
 # Probability of a stray innovation, and its standard deviations.
 STRAY_PROBABILITY, STRAY_LN_F_STD, STRAY_LN_ZETA_STD = 0.05, 0.01, 0.7
-# No life is assumed shorter than so many logs: early logs do not show its length.
-LEAST_LIFE_LOGS = 50
+# No life is assumed shorter than so many logs: early logs do not show its length. Nor is it shorter
+# than so many of the gap before a log: many logs in a short time do not show it either, and a mode
+# that may move by a life's drift in one gap may take the place of any other.
+LEAST_LIFE_LOGS, LEAST_LIFE_GAPS = 50, 10
 # A mode's shape is the mean of its first ones. Later shapes do not move it, so that a mode that
 # takes another's shape is detected.
 N_MEAN_SHAPES = 10

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
-from itertools import pairwise
+from itertools import pairwise, takewhile
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -442,21 +442,21 @@ def _line_up(
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:
     """List modes that the last logs do not detect, or whose estimates are ambiguous there."""
     least = constants.MISSING_LOGS
-    last = history.logs[-least:]
-    ambiguous = [
-        name
-        for name in history.modes
-        if len({r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)} & set(last))
-        == least
-    ]
+    # Logs at the end in a row that are ambiguous, by mode.
+    ambiguous: dict[str, int] = {}
+    for name in history.modes:
+        doubtful = {r.log for r in refused if (r.reason, r.mode) == ("ambiguous", name)}
+        n = sum(1 for _ in takewhile(doubtful.__contains__, reversed(history.logs)))
+        if n >= least:
+            ambiguous[name] = n
     notices = []
-    if ambiguous:
-        names = " and ".join(ambiguous)
+    for n in sorted(set(ambiguous.values()), reverse=True):
+        names = " and ".join(name for name, own in ambiguous.items() if own == n)
         what = fact(
             "{names}: the estimates of the last {n} logs are ambiguous, so that nothing new is "
             "known; logs with more channels would distinguish modes by their shapes.",
             names=names,
-            n=least,
+            n=n,
         )
         notices.append(Notice("ambiguous-modes", "caution", names, what))
     for name in history.modes:

@@ -19,8 +19,8 @@ from lmshealth.modal.naming import (
     pairing_probability,
     why_unnamed,
 )
-from lmshealth.modal.targets import Target
-from lmshealth.stage.description import Description, ModeSpec, Stage
+from lmshealth.modal.targets import Target, choose_targets
+from lmshealth.stage.description import Description, ModeSpec, Stage, load_stage
 from tests.signals import make_stage
 
 TARGETS = (
@@ -62,8 +62,9 @@ def test_one_of_two_equal_candidates_is_not_guessed() -> None:
     """Of two resonances as far from one target neither gets its name, and both are quoted."""
     names, ambiguous = named(98.0, 112.5, targets=TARGETS[:1])
     assert names == ("", "")
-    reason, detail, _ = ambiguous["roll"]
+    reason, detail, place = ambiguous["roll"]
     assert reason == "ambiguous"
+    assert place in (98.0, 112.5)
     assert "98 Hz may be roll" in detail
     assert "112.5 Hz may be roll" in detail
 
@@ -75,6 +76,25 @@ def test_a_single_resonance_known_to_be_a_target_is_ambiguous_between_neighbours
     assert set(ambiguous) == {"roll", "pitch"}
     assert "112 Hz may be roll" in ambiguous["roll"].detail
     assert "pitch" in ambiguous["roll"].detail
+
+
+def test_a_refused_mode_is_where_the_likeliest_resonance_without_a_name_is() -> None:
+    """Roll may be at 95 Hz, or, less likely, at 121 Hz, which has the name of pitch."""
+    names, ambiguous = named(95.0, 121.0, 151.0)
+    assert names == ("", "pitch", "yaw")
+    assert ambiguous["roll"].frequency == 95.0
+
+
+def test_modes_that_a_loose_mount_moves_apart_are_named_by_the_map() -> None:
+    """At 62 % of mount stiffness roll is 11 % low, yaw 5 %; control: without the map."""
+    targets = choose_targets(load_stage("lms-y"))
+    found, damping = [111.97, 128.95, 147.55], [0.0147, 0.0153, 0.0175]
+    given = {"damping": damping, "standing": True}
+    assert assigned(found, targets, **given) == (("roll", "pitch", "yaw"), {})
+    without = tuple(replace(one, wear=np.empty(0)) for one in targets)
+    names, ambiguous = assigned(found, without, **given)
+    assert names == ("", "pitch", "yaw")
+    assert ambiguous["roll"].frequency == found[0]
 
 
 def test_nothing_found_names_nothing() -> None:

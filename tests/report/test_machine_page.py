@@ -658,3 +658,4 @@ def test_the_spectrum_of_the_last_log_is_explained_and_names_what_is_missing(
     caption = text[text.index("Spectrum of the last log") :]
     assert "log-9.h5" in caption and "natural frequency of the machine" in caption
     assert "Dashed: not used in this log. Yaw, not-excited: no resonance near 15" in caption
+    assert "A peak with neither a blue nor a dashed line is a disturbance" in caption

@@ -164,8 +164,9 @@ def associate(
     start = state = State.start(prior_std, epochs[0].shapes.shape[1])
     declared, places = frozenset(jumps), clock.tolist()
     # Length of a life as known at each log.
-    count = np.maximum(np.arange(clock.size), 1)
-    lives = ((clock - clock[0]) * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)).tolist()
+    count, gaps = np.maximum(np.arange(clock.size), 1), np.diff(clock, prepend=clock[0])
+    by_count = (clock - clock[0]) * np.maximum(1.0, constants.LEAST_LIFE_LOGS / count)
+    lives = np.maximum(by_count, constants.LEAST_LIFE_GAPS * gaps).tolist()
     stated, sources = measurements_of(epochs), [own.sources for own in epochs]
     scales = learn_scales(stated, sources, offsets, prior_std)
     labels: list[tuple[Label, ...]] = []

@@ -182,6 +182,33 @@ def test_sensors_that_are_moved_cost_no_label(rng: np.random.Generator) -> None:
 
 
 @pytest.mark.slow
+def test_sparse_logs_after_a_burst_keep_their_modes(
+    rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Modes 7 % apart keep their labels over gaps longer than the whole history before them."""
+    clock = np.r_[0.3 * np.arange(50), 15 + 400.0 * np.arange(1, 13)]
+    drift = np.array([-0.015, -0.03]) * clock[:, None] / clock[-1]
+    rows = [say(f, "ab") for f in steady(rng, clock.size, (126.4, 136.6)) + drift]
+
+    def found() -> Association:
+        return associate(rows, clock, offsets=np.zeros((clock.size, 0)), prior_std=np.zeros(0))
+
+    assert set(found().assigned) == {("a", "b")}
+    # With the mean distance of the logs alone, a gap is a whole life.
+    monkeypatch.setattr(constants, "LEAST_LIFE_GAPS", 0)
+    assert found().assigned[50] == (None, None)
+
+
+def test_modes_that_cross_after_a_burst_are_not_swapped(rng: np.random.Generator) -> None:
+    """They are named by order: after the crossing no label is that of the name."""
+    clock = np.r_[1e-3 * np.arange(30), 1.0 + np.arange(30)]
+    apart = np.array([0.08, -0.08]) * (clock[:, None] / clock[-1] - 0.51)
+    rows = [say(np.sort(f), "ab") for f in apart + steady(rng, clock.size, (120.0, 120.0))]
+    found = associate(rows, clock, offsets=np.zeros((clock.size, 0)), prior_std=np.zeros(0))
+    assert set(found.assigned[:40]) == {("a", "b")}
+    assert set(found.assigned[-10:]) <= {("b", "a"), (None, None)}
+
+
 def test_labels_use_no_later_log(rng: np.random.Generator) -> None:
     """The labels of a truncated life equal those of the whole life."""
     rows = crossing(rng)
