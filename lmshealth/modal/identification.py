@@ -21,7 +21,7 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_modes, needed_ordinates
+from lmshealth.modal.ambient.cluster_fit import fit_modes, needed_ordinates
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     FittedSpectrum,
@@ -601,9 +601,9 @@ def _fit_group(
     ]
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
-    binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    around, noise = found.around(near, low, high), found.noise(max(low, binned.frequency[0]), high)
-    fit = fit_modes(around, binned, near, (low, high), found.model.static, noise)
+    noise = found.noise((near[0].frequency * near[-1].frequency) ** 0.5)
+    around = found.around(near, low, high)
+    fit = fit_modes(around, near, (low, high), noise, found.model.static)
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]
