@@ -40,7 +40,7 @@ from lmshealth.modal.ambient.search import (
 from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.deterministic.free_decays import identify_decays
 from lmshealth.modal.deterministic.frequency_response import read_frf
-from lmshealth.modal.modes import Modes, Rejection, clearest, merge, numbered
+from lmshealth.modal.modes import Modes, Rejection, merge, numbered
 from lmshealth.modal.naming import name_resonances
 from lmshealth.modal.targets import (
     Target,
@@ -84,6 +84,8 @@ _TOP = 0.49
 # Channels of a current whose names begin so hold an excitation: any other is that of the servo,
 # which responds to the modes itself.
 _EXCITATIONS = ("current_force", "current_excitation")
+# Standard deviations within which modes that two channels show are one.
+_SAME_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -262,7 +264,7 @@ def _read_response(
     rows = dict.fromkeys(chain(log.refused, *(modes.refused for modes in found)))
     refused = [row for row in rows if row.frequency is None]
     lines = dict.fromkeys(chain.from_iterable(modes.lines for modes in found))
-    both = numbered(merge(clearest(found), [*lines], refused))
+    both = numbered(merge(_clearest(found), [*lines], refused))
     poles = {f"pole_{k}": row for k, row in enumerate(rows) if row.frequency is not None}
     modes = both
     if stage is not None:
@@ -275,6 +277,30 @@ def _read_response(
     top = min(band[1] if band else np.inf, _TOP * log.sample_rate)
     spectra = _plain_spectra(used, segments, log.sample_rate, top)
     return ModalReading(modes, spectra, rejected=tuple(poles.values()))
+
+
+def _clearest(found: Sequence[Modes]) -> list[Modes]:
+    """Keep each mode in the channel that shows it with the least standard deviation.
+
+    ``found`` are the modes of one channel each, from the same blows or periods: as the excitation
+    that was not measured is common to all, estimates of one mode are no independent ones.
+    """
+    order = [
+        (std / f, c, i)
+        for c, modes in enumerate(found)
+        for i, (std, f) in enumerate(zip(modes.frequency_std, modes.frequency, strict=True))
+    ]
+    kept: list[list[int]] = [[] for _ in found]
+    for std, c, i in sorted(order):
+        others = [
+            abs(float(modes.ln_frequency[k] - found[c].ln_frequency[i]))
+            for other, modes in enumerate(found)
+            for k in kept[other]
+            if other != c
+        ]
+        if min(others, default=np.inf) > max(_SAME_SIGMAS * std, found[c].damping_ratio[i]):
+            kept[c].append(i)
+    return [modes.select(sorted(own)) for modes, own in zip(found, kept, strict=True)]
 
 
 def read_ambient(

@@ -22,8 +22,6 @@ _TUPLES = ("names", "sources", "channels", "flags", "credibility")
 # Beginnings of names of measured channels; other channels are times and set points.
 _MEASURED = ("delta_e", "acc", "current")
 _ARRAYS = ("ln_frequency", "ln_damping", "snr", "dispersion", "excitation")
-# Standard deviations within which modes that two channels show are one.
-_SAME_SIGMAS = 3.0
 
 
 class Rejection(NamedTuple):
@@ -241,30 +239,6 @@ def _flagged(modes: Modes, i: int) -> str:
         if flag and (of_log or row.channel in {*shown, modes.channels[i]}):
             own[flag] = None
     return " ".join(own)
-
-
-def clearest(found: Sequence[Modes]) -> list[Modes]:
-    """Keep each mode in the part that shows it with the least standard deviation.
-
-    ``found`` are the modes of channels or bands of the same blows, periods or stops: as forces that
-    were not measured are common to all, estimates of one mode are no independent ones.
-    """
-    order = [
-        (std / f, c, i)
-        for c, modes in enumerate(found)
-        for i, (std, f) in enumerate(zip(modes.frequency_std, modes.frequency, strict=True))
-    ]
-    kept: list[list[int]] = [[] for _ in found]
-    for std, c, i in sorted(order):
-        others = [
-            abs(float(modes.ln_frequency[k] - found[c].ln_frequency[i]))
-            for other, modes in enumerate(found)
-            for k in kept[other]
-            if other != c
-        ]
-        if min(others, default=np.inf) > max(_SAME_SIGMAS * std, found[c].damping_ratio[i]):
-            kept[c].append(i)
-    return [modes.select(sorted(own)) for modes, own in zip(found, kept, strict=True)]
 
 
 def numbered(modes: Modes) -> Modes:

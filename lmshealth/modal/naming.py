@@ -1,8 +1,8 @@
 """Names of identified resonances.
 
-`identify` and `identify_decays` compute the posterior probability of every assignment that keeps the
-order of frequencies (`name_resonances`). The command `frf` names only modes that no other mode or
-name competes for (`name_response`): tracking assigns the rest.
+Ambient and free-decay identification compute the posterior probability of every assignment that
+keeps the order of frequencies (`assign`). Frequency responses name only modes that no other mode
+or name competes for (`name_response`): tracking assigns the rest.
 """
 
 from collections.abc import Iterator, Sequence

@@ -25,9 +25,14 @@ from lmshealth.modal.deterministic.decay_fit import (
 )
 from lmshealth.modal.deterministic.likelihood import transform_decays
 from lmshealth.modal.deterministic.poles import PoleFit
-from lmshealth.modal.modes import Modes, Rejection, clearest, estimates_only, merge, numbered
-from lmshealth.modal.naming import is_near, name_resonances
-from lmshealth.modal.targets import Target, check_band, choose_targets, limit_channels
+from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
+from lmshealth.modal.naming import Named, assign, is_near, pairing_probability
+from lmshealth.modal.targets import (
+    Target,
+    check_band,
+    choose_targets,
+    limit_channels,
+)
 from lmshealth.signal.constants import SETTLING_TIME
 from lmshealth.signal.segments import Segment, select_segments
 from lmshealth.stage.description import Stage
@@ -122,12 +127,12 @@ def identify_decays(
         group = tuple(c for c in used if c.kind == kind)
         if group:
             found += _fit_bands(log, group, decays, limits, targets)
-    modes = numbered(merge(clearest([band.modes for band in found]), (), log.refused))
+    modes = numbered(merge(_distinct(found), (), log.refused))
     rejected = sorted((row for band in found for row in band.rejected), key=lambda row: -row[0])
     if targets:
         refused = {f"pole_{k}": Refusal(log.name, *why[:2], frequency=why.frequency)
                    for k, (_, why) in enumerate(rejected)}  # fmt: skip
-        return name_resonances(modes, targets, log.name).publish(modes, targets, refused)
+        return _named(modes, targets, log.name).publish(modes, targets, refused)
     if not modes.names:
         nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
         raise BadLog(log.name, *(rejected[0][1][:2] if rejected else nothing))
@@ -146,6 +151,27 @@ class _BandModes:
         """Why the strongest resonance is no mode; empty where it is one."""
         snr, why = max(self.rejected, key=lambda row: row[0], default=(0.0, Rejection("", "")))
         return why.reason if snr > self.modes.snr.max(initial=0.0) else ""
+
+
+def _named(modes: Modes, targets: tuple[Target, ...], log: str) -> Named:
+    """Name the resonances of decays; the machine may be anywhere within the searches."""
+    f, zeta = modes.frequency.tolist(), modes.damping_ratio.tolist()
+    names, ambiguous = assign(f, targets, pairing_probability(f, targets, damping=zeta))
+    own = {given: name for given, name in zip(modes.names, names, strict=True) if name}
+    return Named(own, frozenset(), ambiguous, frozenset(), targets, log)
+
+
+def _distinct(bands: Sequence[_BandModes]) -> list[Modes]:
+    """Return the modes of all bands; of Δe only those that accelerometers do not show."""
+    found = [band.modes for band in bands]
+    seen = np.concatenate([np.empty(0), *(m.frequency for m in found if "acc" in m.sources)])
+    return [
+        modes if "acc" in modes.sources else modes.select([
+            i for i, (f, zeta) in enumerate(zip(modes.frequency, modes.damping_ratio, strict=True))
+            if (np.abs(f / seen - 1) >= 2 * zeta).all()
+        ])
+        for modes in found
+    ]  # fmt: skip
 
 
 def _limits(
