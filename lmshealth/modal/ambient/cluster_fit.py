@@ -53,14 +53,6 @@ _NARROWER = 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BinnedSpectra:
-    """Spectra of all channels around a cluster, binned by medians, which lines do not move."""
-
-    frequency: FloatArray  # mean in Hz, (n_bins,)
-    level: FloatArray  # density from the median, (n_channels, n_bins)
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ClusterData:
     """Data that a cluster is fitted to: the band of the channels that show any of the modes.
 
@@ -71,7 +63,6 @@ class ClusterData:
     unit: FloatArray  # root of the noise in (m/s²)/Hz^½, (n_channels,)
     basis: FloatArray  # orthonormal directions that are fitted, (n_channels, n_directions)
     spectra: LogSpectra  # of the directions
-    binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
     static: float = 0.0  # static response of modes that is expected
@@ -105,17 +96,6 @@ class _Optimum:
         return np.asarray(np.exp(self.p[: 2 * m].reshape(2, m)))
 
 
-def bin_spectra(spectra: LogSpectra, width: float) -> BinnedSpectra:
-    """Bin spectra; bins of ``width`` in Hz are widened to hold at least four ordinates."""
-    frequency = np.concatenate([s.frequency for s in spectra.spectra])
-    order = np.argsort(frequency, kind="stable")
-    n_bins = max(3, min(1 + int(np.ptp(frequency) / width), frequency.size // 4))
-    parts = np.array_split(order, n_bins)
-    ordinates = np.concatenate([s.powers() / median_ordinate(s.count) for s in spectra.spectra])
-    level = np.stack([np.median(ordinates[part], axis=0) for part in parts], axis=1)
-    return BinnedSpectra(np.array([frequency[part].mean() for part in parts]), level.clip(1e-300))
-
-
 def needed_ordinates(n_modes: int) -> int:
     """Return the least number of Fourier frequencies of a fit."""
     return 10 + 6 * n_modes
@@ -139,7 +119,6 @@ def fit_modes(
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
         short = {t.name: Rejection("too-short", detail, t.frequency) for t in targets}
         return ClusterFit(None, short)
-    data = mask_prominent_lines(data)
     collapsed: dict[str, Rejection] = {}
     for _ in range(_MOST_LINE_ROUNDS):
         data, optimum, lines = _fit_beside_lines(data, targets)
@@ -259,9 +238,8 @@ def prepare(
         chosen = replace(chosen, channels=names, sources=(cut.source,) * len(names))
     else:
         basis = np.eye(unit.size)
-    binned = bin_spectra(chosen, 0.5 * min(t.damping_ratio * t.frequency for t in targets))
     masks = tuple(s.free for s in chosen.spectra)
-    return ClusterData(cut, unit, basis, chosen, binned, masks, tuple(index))
+    return ClusterData(cut, unit, basis, chosen, masks, tuple(index))
 
 
 def _motions(targets: Sequence[Target]) -> ComplexArray:
@@ -335,27 +313,17 @@ def _seen(basis: FloatArray, phi: FloatArray, g: ComplexArray) -> FloatArray:
     return np.asarray(np.sum(phi * (phi - g @ _share(g, phi)), axis=1).real)
 
 
-def mask_prominent_lines(data: ClusterData) -> ClusterData:
-    """Mask lines far above the binned level, before a mode can settle on one.
-
-    Twice the threshold leaves room for what the bins do not resolve. A single mode whose damping is
-    below about 1/15 of the described one is as narrow as a line, and may lose its own peak.
-    """
-    f, levels = data.binned.frequency, 2 * data.binned.level
-    spectra = data.spectra.spectra
-    return _mask_above(
-        data, [np.stack([np.interp(s.frequency, f, x) for x in levels], -1) for s in spectra]
-    )
-
-
 def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> ClusterData:
     """Mask ordinates that noise about the expectation does not reach; return ``data`` if none.
 
-    A line on a resonance is seen in the directions in which the mode does not move.
+    Each channel is compared with its level, and the trace of all over their expectation: a line on
+    a resonance is seen in the directions in which the mode does not move.
     """
-    levels, whitened = [], []
-    for spectrum, matrix in zip(data.spectra.spectra, expected, strict=True):
-        level = np.diagonal(matrix, axis1=1, axis2=2).real
+    n, n_free = data.basis.shape[1], sum(int(mask.sum()) for mask in data.masks)
+    false_alarm = constants.LINE_FALSE_ALARM / ((n + 1) * n_free)
+    masks = []
+    for spectrum, mask, matrix in zip(data.spectra.spectra, data.masks, expected, strict=True):
+        level, count = np.diagonal(matrix, axis1=1, axis2=2).real, spectrum.count
         known = np.flatnonzero(np.isfinite(level[:, 0]))
         total = np.zeros(len(level))
         with suppress(np.linalg.LinAlgError):  # channels that copy each other
@@ -363,14 +331,18 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
             total[known] = np.trace(white, axis1=1, axis2=2).real
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
-        if spectrum.count > 1:
-            ratio = spectrum.powers() / level / median_ordinate(spectrum.count)
+        if count > 1:
+            ratio = spectrum.powers() / level / median_ordinate(count)
             level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
-            near = median_filter(total, _LINE_NEIGHBOURS) / level.shape[1]
+            near = median_filter(total, _LINE_NEIGHBOURS) / n
             total = total / near.clip(1.0)
-        levels.append(level)
-        whitened.append(total)
-    return _mask_above(data, levels, whitened)
+        highest = gammainccinv(count, false_alarm) / count
+        above = (spectrum.powers() > highest * level).any(axis=1)
+        above |= total > gammainccinv(count * n, false_alarm) / count
+        masks.append(mask & ~binary_dilation(mask & above, iterations=_LINE_BINS))
+    # A band that would lose more than half of its ordinates holds no lines.
+    n_left = sum(int(mask.sum()) for mask in masks)
+    return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
 def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
@@ -380,30 +352,6 @@ def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
         apart = np.abs(spectrum.frequency[:, None] - lines).min(axis=1) * spectrum.duration
         masks.append(mask & (apart > _LINE_BINS + 0.5))
     return replace(data, masks=tuple(masks))
-
-
-def _mask_above(
-    data: ClusterData, levels: list[FloatArray], whitened: list[FloatArray] | None = None
-) -> ClusterData:
-    """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``.
-
-    Or all of them together: ``whitened`` is the trace of ordinates over their expectation.
-    """
-    n_free = sum(int(mask.sum()) for mask in data.masks)
-    n = data.basis.shape[1]
-    false_alarm = constants.LINE_FALSE_ALARM / ((n + (whitened is not None)) * n_free)
-    masks = []
-    for k, (spectrum, mask) in enumerate(zip(data.spectra.spectra, data.masks, strict=True)):
-        highest = gammainccinv(spectrum.count, false_alarm) / spectrum.count
-        above = (spectrum.powers() > highest * levels[k]).any(axis=1)
-        if whitened is not None:
-            above |= whitened[k] > gammainccinv(spectrum.count * n, false_alarm) / spectrum.count
-        lines = mask & above
-        reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
-        masks.append(mask & ~reached)
-    # A band that would lose more than half of its ordinates holds no lines.
-    n_left = sum(int(mask.sum()) for mask in masks)
-    return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
 def group_lengths(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
@@ -464,9 +412,8 @@ def _solve(
     n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
     own = _in_phase(data.basis.T @ (_motions(targets)[list(data.index)] / data.unit[:, None]))
-    # A strength of zero would leave a mode without a gradient.
-    least = np.sqrt(np.outer(0.01 * data.binned.level.min(axis=1), 4 * zeta**2))
-    amplitude = np.maximum(np.abs(own), least)
+    # A strength of zero would leave a mode without a gradient: a peak has 1 % of the noise or more.
+    amplitude = np.maximum(np.abs(own), 0.1 * 2 * zeta)
     reference = amplitude.argmax(axis=0).tolist()
     sign = np.where(own.real < 0, -1.0, 1.0)
     scale = amplitude.max(axis=0)
