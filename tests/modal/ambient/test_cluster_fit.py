@@ -186,7 +186,7 @@ def test_what_a_fit_leaves_over_is_scattered_about_one() -> None:
     spectra = spectra_of(both())
     wide = fit_spectra(spectra, (Target("wide", 105.0, 0.04, 0.15),))[0]
     assert wide is not None
-    assert residual_of(wide).periodogram.var() > 1.0
+    assert residual_of(wide).periodogram.var() - 0.5 > 4.5 * np.sqrt(1.25 / n)
 
 
 def test_keeping_some_modes_marginalises_the_others() -> None:
@@ -326,7 +326,7 @@ def test_what_a_fit_of_a_sure_mean_lacks_is_no_line() -> None:
     """A mode that is no target remains in the residual, and is not masked as lines."""
     modes = [Mode(105.0, 0.015), Mode(112.0, 0.01, 0.05)]
     values = accelerations(np.random.default_rng(10), modes, 1_200_000, RATE, 0.5)
-    result = fit_mean(mean_of(values, 60), (ROLL,), (90.0, 120.0))
+    result = fit_mean(mean_of(values, 60), (ROLL,))
     assert cut_band(residual_of(result), 111.0, 113.0).periodogram.max() > 1.7
     assert result.lines == ()
 
