@@ -199,11 +199,24 @@ class _State:
         """Number of lines that count as one independent line."""
         return dependence(self.colour)
 
+    @property
+    def penalty(self) -> float:
+        """Gain that modes and background need."""
+        heavy = int(np.count_nonzero(self.modes[1] > constants.FRF_MOST_DAMPING))
+        modes = 2 * evidence_needed(self.poles.likelihood)
+        background = constants.FRF_BACKGROUND_COST * _per_mode(self.ordinates)
+        return float((self.n_modes - heavy) * modes + heavy * background)
+
+
+def _per_mode(ordinates: Ordinates) -> int:
+    """Return the number of real unknowns of a mode."""
+    return 6 if ordinates.transient else 4
+
 
 def _unknowns(ordinates: Ordinates, n_modes: int) -> int:
-    """Return the number of real unknowns."""
-    each, more = (6, len(_TRANSIENT_POWERS)) if ordinates.transient else (4, 0)
-    return n_modes * each + N_POWERS + more
+    """Return the number of all real unknowns."""
+    more = len(_TRANSIENT_POWERS) if ordinates.transient else 0
+    return n_modes * _per_mode(ordinates) + N_POWERS + more
 
 
 def _solve(
@@ -237,9 +250,8 @@ def _solve(
 
 
 def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> float:
-    """Return the gain of the larger of two models, less what its modes need."""
-    needed = 2 * evidence_needed(larger.poles.likelihood) * (larger.n_modes - smaller.n_modes)
-    return (smaller.cost - larger.cost) / dependent_lines - needed
+    """Return the gain of the larger of two models, less its penalty."""
+    return (smaller.cost - larger.cost) / dependent_lines - larger.penalty + smaller.penalty
 
 
 def _settle(
