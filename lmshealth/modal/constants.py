@@ -122,8 +122,8 @@ UNKNOWN_NOISE = 1e-4
 TRANSIENT = 1e-3
 # Probability that noise alone makes an outlier, and the largest share of lines that may be ones.
 OUTLIER_FALSE_ALARM, MOST_OUTLIERS = 1e-3, 0.1
-# Most modes of one response. A heavily damped pole of the background needs this in -2 ln L per
-# unknown (Akaike's criterion): lacking, it would bias the modes.
+# Most modes of one response. A background of powers and heavily damped poles needs this in -2 ln L
+# per unknown (Akaike's criterion): lacking, it would bias the modes.
 FRF_MOST_MODES, FRF_BACKGROUND_COST = 8, 2.0
 # Damping ratio above which a pole belongs to the background.
 FRF_MOST_DAMPING = 0.2

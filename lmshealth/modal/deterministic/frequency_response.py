@@ -14,7 +14,7 @@ from lmshealth.modal.deterministic.likelihood import least_damping
 from lmshealth.modal.deterministic.measured import MeasuredResponse, from_measured
 from lmshealth.modal.deterministic.periods import find_period
 from lmshealth.modal.deterministic.response_fit import (
-    N_POWERS,
+    FEWEST_POWERS,
     NO_DAMPING,
     ResponseFit,
     fit_response,
@@ -306,7 +306,7 @@ def _too_few(frf: Frf, fit: ResponseFit) -> tuple[str, int, float]:
     outside = np.flatnonzero(gain**2 < gain[top] ** 2 / 10)
     low = outside[outside < top].max(initial=-1)
     n = int(outside[outside > top].min(initial=gain.size) - low - 1)
-    needed = 4 * constants.FRF_MOST_MODES + N_POWERS + 1
+    needed = 4 * constants.FRF_MOST_MODES + 2 * FEWEST_POWERS + 2
     spacing = fit.ordinates.spacing
     if n >= constants.LINES_OF_MODE and gain.size >= needed:
         return "", n, float(frequency[top])

@@ -26,9 +26,9 @@ from lmshealth.modal.deterministic.responses import Ordinates, smooth_noise
 from lmshealth.modal.modes import paired
 
 # Powers of s, downwards and upwards. Weak modes outside the band bias those inside by up to one
-# standard deviation with four powers, by half of one with six.
-_MOST_POWER = 6
-N_POWERS = 2 * _MOST_POWER + 1
+# standard deviation with four powers, by half of one with six. Powers enter in pairs: an even one
+# for elasticity, an odd one for loss.
+FEWEST_POWERS, _MOST_POWERS, _POWER_STEP = 6, 8, 2
 # A transient is smooth over a band: powers of s.
 _TRANSIENT_POWERS = (-1, 0, 1)
 # Damping ratios at which modes are searched for, and the largest one.
@@ -90,14 +90,15 @@ def fit_response(ordinates: Ordinates) -> ResponseFit:
     Order, noise, distortion and covariance are those of the section Model in the README of the
     folder [Pintelon2012].
     """
-    state = _restart(_grow(_settle(ordinates, np.empty(0), ordinates.noise)))
+    start = np.empty(0), (-FEWEST_POWERS, FEWEST_POWERS)
+    state = _restart(_grow(_settle(ordinates, *start, ordinates.noise)))
     for _ in range(_ROUNDS):
         keep = _inliers(state)
         if keep.all() or keep.sum() < (1 - constants.MOST_OUTLIERS) * ordinates.frequency.size:
             break
         state = _grow(_without_lines(state, keep))
     state = _shrink(state)
-    state = _settle(state.ordinates, state.theta, state.variance, rounds=_ROUNDS)
+    state = _settle(state.ordinates, state.theta, state.powers, state.variance, rounds=_ROUNDS)
     return _conclude(state, ordinates)
 
 
@@ -121,11 +122,16 @@ def without_window(fit: ResponseFit, time_constant: float) -> ResponseFit:
     )
 
 
+Powers = tuple[int, int]
+"""Lowest and highest power of s."""
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _State:
     """A model at its maximum of likelihood, with the variance of its error."""
 
     ordinates: Ordinates
+    powers: Powers
     poles: PoleFit
     variance: FloatArray  # of the error, (n_lines,)
     distortion: float  # as a share of H
@@ -202,26 +208,23 @@ class _State:
     @property
     def penalty(self) -> float:
         """Gain that modes and background need."""
+        (low, high), each = self.powers, 6 if self.ordinates.transient else 4
         heavy = int(np.count_nonzero(self.modes[1] > constants.FRF_MOST_DAMPING))
         modes = 2 * evidence_needed(self.poles.likelihood)
-        background = constants.FRF_BACKGROUND_COST * _per_mode(self.ordinates)
-        return float((self.n_modes - heavy) * modes + heavy * background)
+        background = constants.FRF_BACKGROUND_COST * (each * heavy + high - low)
+        return float((self.n_modes - heavy) * modes + background)
 
 
-def _per_mode(ordinates: Ordinates) -> int:
-    """Return the number of real unknowns of a mode."""
-    return 6 if ordinates.transient else 4
-
-
-def _unknowns(ordinates: Ordinates, n_modes: int) -> int:
-    """Return the number of all real unknowns."""
-    more = len(_TRANSIENT_POWERS) if ordinates.transient else 0
-    return n_modes * _per_mode(ordinates) + N_POWERS + more
+def _unknowns(ordinates: Ordinates, theta: FloatArray, powers: Powers) -> int:
+    """Count real unknowns."""
+    each, more = (6, len(_TRANSIENT_POWERS)) if ordinates.transient else (4, 0)
+    return each * theta.size // 2 + powers[1] - powers[0] + 1 + more
 
 
 def _solve(
     ordinates: Ordinates,
     theta: FloatArray,
+    powers: Powers,
     variance: FloatArray,
     *,
     refine: bool = False,
@@ -229,7 +232,7 @@ def _solve(
     """Fit the linear unknowns, with ``refine`` the poles, too, at known variances of the lines."""
     frequency, given, n = ordinates.frequency, ordinates.given, theta.size // 2
     s = 1j * frequency / np.sqrt(frequency[0] * frequency[-1])
-    columns = s[:, None] ** np.arange(-_MOST_POWER, _MOST_POWER + 1)
+    columns = s[:, None] ** np.arange(powers[0], powers[1] + 1)
     columns = columns / np.linalg.norm(given[:, None] * columns, axis=0)
     base, size, turn = np.linalg.svd(stack(given[:, None] * columns), full_matrices=False)
     kept = size > _THIN * size[0]
@@ -246,7 +249,7 @@ def _solve(
         poles = maximise(likelihood, p, np.arange(2 * n), tolerance=_TOLERANCE)
     else:
         poles = PoleFit(likelihood, p, likelihood.evaluate(p))
-    return _State(ordinates, poles, variance, 0.0, background)
+    return _State(ordinates, powers, poles, variance, 0.0, background)
 
 
 def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> float:
@@ -257,6 +260,7 @@ def _gain(larger: _State, smaller: _State, dependent_lines: float = 1.0) -> floa
 def _settle(
     ordinates: Ordinates,
     theta: FloatArray,
+    powers: Powers,
     variance: FloatArray,
     *,
     rounds: int = 2,
@@ -264,19 +268,19 @@ def _settle(
     """Maximise the likelihood over poles and variance alternately."""
     distortion = 0.0
     for _ in range(rounds):
-        state = _solve(ordinates, theta, variance, refine=True)
+        state = _solve(ordinates, theta, powers, variance, refine=True)
         theta, before = state.theta, variance
         variance, distortion = _error_variance(state)
         if np.abs(np.log(variance / before)).max() < 0.05:
             break
-    return replace(_solve(ordinates, theta, variance), distortion=distortion)
+    return replace(_solve(ordinates, theta, powers, variance), distortion=distortion)
 
 
 def _error_variance(state: _State) -> tuple[FloatArray, float]:
     """Return the variance of the error of each line, and the distortion as a share of H."""
     ordinates, n = state.ordinates, state.variance.size
     # Corrected for the degrees of freedom of the fit.
-    left = n - _unknowns(ordinates, state.n_modes) / 2
+    left = n - _unknowns(ordinates, state.theta, state.powers) / 2
     power = np.abs(state.error) ** 2 * (n / left)
     if not ordinates.scatter:
         # Lines that were measured before have as many digits as the file.
@@ -297,7 +301,7 @@ def _error_variance(state: _State) -> tuple[FloatArray, float]:
 
 def _without_lines(state: _State, keep: BoolArray) -> _State:
     """Fit without some of the lines."""
-    return _settle(state.ordinates.only(keep), state.theta, state.variance[keep])
+    return _settle(state.ordinates.only(keep), state.theta, state.powers, state.variance[keep])
 
 
 def _inliers(state: _State) -> BoolArray:
@@ -316,28 +320,21 @@ def _inliers(state: _State) -> BoolArray:
 
 
 def _grow(state: _State) -> _State:
-    """Add modes while the criterion improves."""
+    """Add modes and powers while the criterion improves."""
     fewest = (1 - constants.MOST_OUTLIERS) * state.variance.size
-    while (trial := _with_mode(state)) is not None:
-        if _gain(trial, state) <= 0 or not _is_admissible(trial, state):
-            break
-        larger = _without_outliers(trial, state)
+    while True:
+        trials = [
+            _settle(state.ordinates, *order, state.variance)
+            for order in _larger(state)
+            if _unknowns(state.ordinates, *order) < state.variance.size
+        ]
+        gains = [_gain(t, state) if _is_admissible(t, state) else -np.inf for t in trials]
+        if not gains or max(gains) <= 0:
+            return state
+        larger = _without_outliers(trials[int(np.argmax(gains))], state)
         if larger.variance.size < fewest:
-            break
+            return state
         state = larger
-    return state
-
-
-def _with_mode(state: _State) -> _State | None:
-    """Fit a further mode that may be worth it."""
-    ordinates, n = state.ordinates, state.n_modes
-    if n == constants.FRF_MOST_MODES or _unknowns(ordinates, n + 1) >= state.variance.size:
-        return None
-    f, zeta, gain = best_pole(state.poles, *_places(ordinates))
-    if 2 * gain <= _WORTH:
-        return None
-    theta = np.insert(state.theta, [n, 2 * n], np.log([f, zeta]))
-    return _settle(ordinates, theta, state.variance)
 
 
 def _restart(state: _State) -> _State:
@@ -352,9 +349,9 @@ def _restart(state: _State) -> _State:
         (block,) = state.poles.likelihood.blocks
         block = replace(block, noise=ordinates.noise)
         theta = np.log(np.concatenate(vector_fit(block, state.background, n)))
-        if _unknowns(ordinates, theta.size // 2) >= state.variance.size:
+        if _unknowns(ordinates, theta, state.powers) >= state.variance.size:
             break
-        trial = _settle(ordinates, theta, ordinates.noise)
+        trial = _settle(ordinates, theta, state.powers, ordinates.noise)
         less = trial.distortion <= constants.LESS_DISTORTED * best.distortion
         if less and _gain(trial, best) > 0 and _is_admissible(trial, best):
             best = trial
@@ -370,6 +367,26 @@ def _without_outliers(larger: _State, smaller: _State) -> _State:
     if larger.ordinates.periodic and _gain(without, _without_lines(smaller, keep)) > 0:
         return larger
     return without
+
+
+def _larger(state: _State) -> list[tuple[FloatArray, Powers]]:
+    """Return models with a further mode or two further powers that may be worth a fit."""
+    ordinates, theta, (low, high), n = state.ordinates, state.theta, state.powers, state.n_modes
+    larger: list[tuple[FloatArray, Powers]] = []
+    if low > -_MOST_POWERS:
+        larger.append((theta, (low - _POWER_STEP, high)))
+    if high < _MOST_POWERS:
+        larger.append((theta, (low, high + _POWER_STEP)))
+    profile = state.poles.at.profile
+    gains = [
+        2 * (profile - _solve(ordinates, *order, state.variance).poles.at.profile)
+        for order in larger
+    ]
+    if n < constants.FRF_MOST_MODES:
+        f, zeta, gain = best_pole(state.poles, *_places(ordinates))
+        larger.append((np.insert(theta, [n, 2 * n], np.log([f, zeta])), state.powers))
+        gains.append(2 * gain)
+    return [order for order, gain in zip(larger, gains, strict=True) if gain > _WORTH]
 
 
 def _places(ordinates: Ordinates) -> tuple[FloatArray, FloatArray]:
@@ -415,9 +432,10 @@ def _shrink(state: _State) -> _State:
     """Remove modes that the others have made superfluous; correlated errors reduce their gain."""
     while n := state.n_modes:
         trials = [
-            _settle(state.ordinates, np.delete(state.theta, [i, i + n]), state.variance)
+            _settle(state.ordinates, np.delete(state.theta, [i, i + n]), state.powers,
+                    state.variance)
             for i in range(n)
-        ]
+        ]  # fmt: skip
         gains = [_gain(state, trial, state.dependent_lines) for trial in trials]
         if min(gains) > 0:
             break
@@ -440,7 +458,7 @@ def _conclude(state: _State, everything: Ordinates) -> ResponseFit:
     expected = np.interp(everything.frequency, ordinates.frequency, state.response)
     error = (everything.answer - everything.given * expected)[outlying]
     excess = np.sum(np.abs(state.error) ** 2 / ordinates.noise)
-    excess /= state.variance.size - _unknowns(ordinates, m) / 2
+    excess /= state.variance.size - _unknowns(ordinates, state.theta, state.powers) / 2
     if not (ordinates.scatter or ordinates.transient):
         ordinates = replace(ordinates, noise=state.variance)
     return ResponseFit(
