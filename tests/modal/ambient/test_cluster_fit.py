@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from lmshealth._private.arrays import ComplexArray
 from lmshealth.modal import constants
 from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import (
@@ -407,17 +408,18 @@ def spectrum(
 def band_of(*spectra: CrossSpectrum, strength: float = 1.0) -> ClusterData:
     """Prepare the band of roll."""
     log = LogSpectra(("acc_a", "acc_b", "acc_c"), ("acc",) * 3, spectra)
-    roll = replace(ROLL, amplitude=strength * np.array(SHAPE, dtype=complex))
+    roll = replace(ROLL, amplitude=np.asarray(strength * np.array(SHAPE), dtype=np.complex128))
     return prepare(log, (roll,), (LOW, HIGH), np.full(3, 0.5))
 
 
-def expectations(band: ClusterData) -> list[np.ndarray]:
+def expectations(band: ClusterData) -> list[ComplexArray]:
     """Return the true expectations of the spectra of the band of roll."""
     found = []
     for one in band.spectra.spectra:
         modal = np.abs(Mode(105.0, 0.015).response(one.frequency)) ** 2
         expected = np.outer(SHAPE, SHAPE) * modal[:, None, None] + 0.5 * np.eye(3)
-        found.append(expected[:, :2, :2] / np.outer(band.unit, band.unit) + 0j)
+        scaled = expected[:, :2, :2] / np.outer(band.unit, band.unit)
+        found.append(np.asarray(scaled, dtype=np.complex128))
     return found
 
 
@@ -493,7 +495,8 @@ def test_what_a_fit_does_not_expect_is_masked_and_what_it_does_is_not(
     """Lines are judged by the expected matrix; of a mean of several the scatter is smaller."""
     band = band_of(spectrum(4, [(2500, 0, size)], count=count))
     (expected,) = expectations(band)
-    assert mask_residual_lines(band, [expected + 1e3 * np.eye(2)]) is band
+    raised = np.asarray(expected + 1e3 * np.eye(2), dtype=np.complex128)
+    assert mask_residual_lines(band, [raised]) is band
     masked = mask_residual_lines(band, [expected])
     np.testing.assert_array_equal(np.flatnonzero(~masked.masks[0]), np.arange(2498, 2503))
     assert mask_residual_lines(masked, [expected]) is masked
