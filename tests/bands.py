@@ -12,12 +12,7 @@ from itertools import product
 
 import numpy as np
 
-from lmshealth.modal.ambient.cluster_fit import (
-    BinnedSpectra,
-    bin_spectra,
-    fit_modes,
-    fit_strengths,
-)
+from lmshealth.modal.ambient.cluster_fit import fit_modes
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
 from lmshealth.modal.ambient.excitation import Colour
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
@@ -172,39 +167,41 @@ def scatter_free(
     return replace(truth, blocks=(replace(empty, matrix=expected),))
 
 
-def spectra_of(channels: np.ndarray) -> tuple[LogSpectra, BinnedSpectra]:
-    """Transform accelerometers, and bin them around the modes of these tests."""
+def spectra_of(channels: np.ndarray) -> LogSpectra:
+    """Transform accelerometers."""
     rows = np.atleast_2d(channels)
     made = make_log({f"acc_{k}": row for k, row in enumerate(rows)}, RATE).channels
-    spectra = LogSpectra(
+    return LogSpectra(
         tuple(channel.name for channel in made),
         ("acc",) * len(made),
         cross_spectra(made, [Segment(0, rows.shape[1], float("nan"))], RATE, 200.0),
     )
-    return spectra, bin_spectra(spectra, 75.0, 165.0, 0.8)
 
 
 def started(
-    spectra: LogSpectra, binned: BinnedSpectra, targets: Sequence[Target]
+    spectra: LogSpectra, targets: Sequence[Target], noise: np.ndarray
 ) -> tuple[Target, ...]:
     """Start targets with the strengths of the levels, and the signs of the cross spectra."""
-    strengths = np.sqrt(fit_strengths(binned, targets)[0][:, : len(targets)])
     found = []
-    for target, size in zip(targets, strengths.T, strict=True):
-        low, high = target.band(1.5)
-        near = sum(s.band(low, high).matrix.real.sum(axis=0) for s in spectra.spectra)
+    for target in targets:
+        low, high = target.band(1.0)
+        near = spectra.longest.band(low, high).matrix.real.mean(axis=0)
+        size = np.sqrt((np.diag(near) - noise).clip(1e-9 * noise)) * 2 * target.damping_ratio
         sign = np.where(near[size.argmax()] < 0, -1.0, 1.0)
-        found.append(replace(target, amplitude=(size.clip(1e-9 * size.max()) * sign) + 0j))
+        found.append(replace(target, amplitude=size * sign + 0j))
     return tuple(found)
 
 
 def fit_spectra(
-    spectra: LogSpectra, binned: BinnedSpectra, targets: Sequence[Target]
+    spectra: LogSpectra, targets: Sequence[Target]
 ) -> tuple[ClusterModes | None, dict[str, Rejection]]:
     """Return credible modes and rejections."""
     low = min(target.band(BAND_HALF_WIDTH)[0] for target in targets)
     high = max(target.band(BAND_HALF_WIDTH)[1] for target in targets)
-    result = fit_modes(spectra, binned, started(spectra, binned, targets), (low, high))
+    # Far below resonances accelerations show the noise alone.
+    powers = spectra.longest.powers()
+    noise = powers[: len(powers) // 20].mean(axis=0)
+    result = fit_modes(spectra, started(spectra, targets, noise), (low, high), noise)
     return result.credible, result.rejected
 
 
@@ -212,7 +209,7 @@ def fit(
     channels: np.ndarray, targets: Sequence[Target]
 ) -> tuple[ClusterModes | None, dict[str, Rejection]]:
     """Fit targets to the samples of accelerometers."""
-    return fit_spectra(*spectra_of(channels), targets)
+    return fit_spectra(spectra_of(channels), targets)
 
 
 def found(channels: np.ndarray, targets: Sequence[Target] = (ROLL, PITCH)) -> ClusterModes:

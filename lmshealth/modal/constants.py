@@ -54,13 +54,14 @@ LEAST_FREQUENCIES = 50
 SIMILAR_BANDWIDTH = 8.0
 # Probability that noise alone makes a line somewhere in the band of a cluster.
 LINE_FALSE_ALARM = 1e-3
-# Gain in log likelihood of the binned spectra below which a mode is absent, and margin by which the
-# Bayesian information criterion must gain with a mode.
+# Expected gain in log likelihood below which a channel does not show a mode, and margin by which
+# the Bayesian information criterion must gain with a mode.
 ABSENT, EVIDENCE_MARGIN = 3.0, 10.0
 # Search without a description: share of the orders of a subspace model in which a candidate occurs;
 # gain in log likelihood by which it enters the joint model, and by which the residual of that model
-# shows a further mode (evidence decides afterwards); most modes that are published from one fit.
-STABLE, LEAST_START, LEAST_EXCESS, MOST_FOUND = 0.4, 15.0, 40.0, 5
+# shows a further mode, and where one is described (evidence decides afterwards); most modes that
+# are published from one fit.
+STABLE, LEAST_START, LEAST_EXCESS, LEAST_HINTED, MOST_FOUND = 0.4, 15.0, 40.0, 15.0, 5
 # Dispersion (variance of the residual over that of noise): flagged as loose-fit, refused as
 # poor-fit; and the ordinates needed to measure it.
 LOOSE_FIT, POOR_FIT, LEAST_ORDINATES = 1.5, 3.0, 30

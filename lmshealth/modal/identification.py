@@ -21,7 +21,7 @@ import numpy as np
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.cluster_fit import bin_cluster, fit_modes, needed_ordinates
+from lmshealth.modal.ambient.cluster_fit import fit_modes, needed_ordinates
 from lmshealth.modal.ambient.cluster_modes import (
     ClusterFit,
     FittedSpectrum,
@@ -79,6 +79,8 @@ _UNLIKE = (
     "from {:.4g} to {:.4g} Hz no modes in common with the other channels explain it, which are "
     "used without it: check whether it was recorded at the same time, or identify it by itself"
 )
+# A range from which no line is subtracted.
+_EVERYWHERE = [ResonanceRange(0.0, np.inf, 0.0)]
 # A cluster is fitted below this share of the sample rate.
 _TOP = 0.49
 # Channels of a current whose names begin so hold an excitation: any other is that of the servo,
@@ -219,18 +221,22 @@ def read_decays(
     modes = identify_decays(log, stage, channels=channels, band=band)
     used = choose_channels(log, channels)
     segments, top = select_segments(log, "settling"), _TOP * log.sample_rate
-    return ModalReading(modes, _plain_spectra(used, segments, log.sample_rate, top))
+    return ModalReading(modes, _spectra(used, segments, log.sample_rate, top, top, _EVERYWHERE))
 
 
-def _plain_spectra(
-    channels: tuple[Channel, ...], segments: Sequence[Segment], sample_rate: float, top: float
+def _spectra(
+    channels: tuple[Channel, ...],
+    segments: Sequence[Segment],
+    sample_rate: float,
+    top: float,
+    ceiling: float,
+    resonances: Sequence[ResonanceRange],
 ) -> LogSpectra:
-    """Return spectra up to a frequency in Hz from which no line is subtracted."""
-    everywhere = [ResonanceRange(0.0, np.inf, 0.0)]
+    """Return the spectra of channels; arguments as in `cross_spectra`."""
     return LogSpectra(
         tuple(channel.name for channel in channels),
         tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
-        cross_spectra(channels, segments, sample_rate, top, ceiling=top, resonances=everywhere),
+        cross_spectra(channels, segments, sample_rate, top, ceiling=ceiling, resonances=resonances),
     )
 
 
@@ -275,7 +281,7 @@ def _read_response(
         modes = named.publish(both, wanted, poles, unclear=True)
     segments = with_few_lengths(stationary(find_phases(log), 0))
     top = min(band[1] if band else np.inf, _TOP * log.sample_rate)
-    spectra = _plain_spectra(used, segments, log.sample_rate, top)
+    spectra = _spectra(used, segments, log.sample_rate, top, top, _EVERYWHERE)
     return ModalReading(modes, spectra, rejected=tuple(poles.values()))
 
 
@@ -432,18 +438,7 @@ def _transform(
             f"no segment of constant velocity without gaps lasts {shortest:.3g} s, which the modes "
             f"need; the longest piece without gaps has {longest:.3g} s",
         )
-    spectra = LogSpectra(
-        tuple(channel.name for channel in channels),
-        tuple("delta_e" if c.kind == "displacement" else "acc" for c in channels),
-        cross_spectra(
-            channels,
-            with_few_lengths(segments),
-            rate,
-            reach,
-            ceiling=ceiling,
-            resonances=resonances,
-        ),
-    )
+    spectra = _spectra(channels, with_few_lengths(segments), rate, reach, ceiling, resonances)
     return stationary(phases, 0), spectra if targets else _resolved(spectra)
 
 
@@ -601,9 +596,9 @@ def _fit_group(
     ]
     low = max(low, min(t.frequency - width for t, width in zip(near, reach, strict=True)))
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
-    binned = bin_cluster(found.spectra, near, targets, top, searched=False)
-    around, noise = found.around(near, low, high), found.noise(max(low, binned.frequency[0]), high)
-    fit = fit_modes(around, binned, near, (low, high), found.model.static, noise)
+    noise = found.noise((near[0].frequency * near[-1].frequency) ** 0.5)
+    around = found.around(near, low, high)
+    fit = fit_modes(around, near, (low, high), noise, found.model.static)
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

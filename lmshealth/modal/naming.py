@@ -141,18 +141,6 @@ def _odds(frequency: float, probability: FloatArray, targets: Sequence[Target]) 
     return f"{frequency:.5g} Hz may be {odds}"
 
 
-def shift_cost(shifts: FloatArray, search: FloatArray, own: int) -> FloatArray:
-    """Return the negative log prior of shifts of ln f, ``(n_candidates, n_modes)``.
-
-    The common shift, the mean over the first ``own`` modes, has a standard deviation of half the
-    search, what each mode differs from it a sixth. ``search`` has shape ``(n_modes,)``.
-    """
-    common = shifts[:, :own].mean(axis=1, keepdims=True)
-    cost = 0.5 * (common[:, 0] / (search.mean() * constants.COMMON_SHIFT)) ** 2
-    apart = (shifts - common) / (search * constants.OWN_SHIFT)
-    return np.asarray(cost + 0.5 * np.sum(apart**2, axis=1))
-
-
 def is_near(target: Target, frequency: float, *, slack: float = 1.0) -> bool:
     """Return whether a frequency in Hz is within so many times the search of a target."""
     return bool(abs(np.log(frequency / target.frequency)) <= slack * np.log1p(target.search))

@@ -10,7 +10,6 @@ from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.channel_checks import independent
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.stage.constants import BAND_HALF_WIDTH
 from lmshealth.stage.description import Stage
 
 
@@ -116,22 +115,3 @@ def _wear(stage: Stage) -> dict[str, FloatArray]:
     drift = stage.drift(points, names)
     held = (np.abs(drift) <= np.log1p([search[name] for name in names])).all(axis=1)
     return dict(zip(names, drift[held].T, strict=True))
-
-
-def clusters(targets: Sequence[Target]) -> list[tuple[Target, ...]]:
-    """Group neighbours to fit jointly: their bands overlap, their bandwidths are similar."""
-    groups: list[list[Target]] = []
-    for target in targets:
-        last = groups[-1] if groups else []
-        if last and len(last) < constants.MOST_TOGETHER and _interact(last[-1], target):
-            last.append(target)
-        else:
-            groups.append([target])
-    return [tuple(group) for group in groups]
-
-
-def _interact(lower: Target, upper: Target) -> bool:
-    # A narrow peak near a broad resonance would need the finest resolution over the whole band.
-    ratio = (upper.frequency * upper.damping_ratio) / (lower.frequency * lower.damping_ratio)
-    similar = 1 / constants.SIMILAR_BANDWIDTH < ratio < constants.SIMILAR_BANDWIDTH
-    return upper.band(BAND_HALF_WIDTH)[0] < lower.band(BAND_HALF_WIDTH)[1] and similar

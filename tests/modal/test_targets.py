@@ -9,7 +9,7 @@ import pytest
 
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.modal import constants
-from lmshealth.modal.targets import choose_channels, choose_targets, limit_channels
+from lmshealth.modal.targets import Target, choose_channels, choose_targets, limit_channels
 from tests.signals import make_log, make_stage
 
 NAMES = ("acc_b", "current", "delta_e", "acc_a")
@@ -80,3 +80,10 @@ def test_surplus_channels_are_named() -> None:
     assert refused.reason == "surplus" and refused.channel in ("acc_00", "acc_00b")
     few = limit_channels(make_log(values, 100.0), ["acc_00", "acc_00b"])
     assert len(few.channels) == 2 and not few.refused
+
+
+def test_a_target_has_a_band_about_it() -> None:
+    """The band reaches so many damping ratios up and down, down never below half."""
+    target = Target("roll", 100.0, 0.02, 0.15)
+    assert target.band(8.0) == pytest.approx((84.0, 116.0))
+    assert target.band(100.0)[0] == pytest.approx(50.0)

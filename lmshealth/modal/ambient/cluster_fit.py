@@ -1,7 +1,7 @@
 """Joint fit of a cluster of neighbouring modes to all channels of a log.
 
-`bin_cluster` bins the spectra around a cluster, and `fit_modes` masks spectral lines, maximises the
-posterior, prunes modes without evidence, marginalises, and rejects estimates that are not credible.
+`fit_modes` masks spectral lines, maximises the posterior, prunes modes without evidence,
+marginalises, and rejects estimates that are not credible.
 """
 
 from __future__ import annotations
@@ -25,15 +25,12 @@ from lmshealth.modal.ambient.cluster_modes import (
 )
 from lmshealth.modal.ambient.excitation import Colour, average_colours, unsteadiness
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates, average_ordinates
-from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise
+from lmshealth.modal.ambient.whittle import Likelihood, lay_out, marginalise, response
 from lmshealth.modal.modes import Modes, Rejection, paired
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
-from lmshealth.stage.constants import BAND_HALF_WIDTH
 
-# Multiplicative updates to convergence; their exponent over that for which monotonicity is proved.
-_UPDATES, _STRIDE = 25, 1.8
 # So many channels are fitted as they are; of more, directions that leave so much of each mode.
 _FEW, _SEEN = 4, 0.9
 # Ordinates at which directions are compared, at most.
@@ -56,16 +53,6 @@ _NARROWER = 0.7
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class BinnedSpectra:
-    """Spectra of all channels around a cluster, binned by medians, which lines do not move."""
-
-    frequency: FloatArray  # mean in Hz, (n_bins,)
-    level: FloatArray  # density from the median in (m/s²)²/Hz, (n_channels, n_bins)
-    count: FloatArray  # ordinates of single segments, (n_bins,)
-    neighbours: tuple[Target, ...] = ()  # outside the band, with flanks in it
-
-
-@dataclass(frozen=True, slots=True, eq=False)
 class ClusterData:
     """Data that a cluster is fitted to: the band of the channels that show any of the modes.
 
@@ -76,7 +63,6 @@ class ClusterData:
     unit: FloatArray  # root of the noise in (m/s²)/Hz^½, (n_channels,)
     basis: FloatArray  # orthonormal directions that are fitted, (n_channels, n_directions)
     spectra: LogSpectra  # of the directions
-    binned: BinnedSpectra  # of the directions
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
     static: float = 0.0  # static response of modes that is expected
@@ -110,97 +96,6 @@ class _Optimum:
         return np.asarray(np.exp(self.p[: 2 * m].reshape(2, m)))
 
 
-def bin_cluster(
-    spectra: LogSpectra,
-    cluster: tuple[Target, ...],
-    targets: tuple[Target, ...],
-    top: float,
-    *,
-    searched: bool,
-) -> BinnedSpectra:
-    """Bin the band of a cluster below ``top`` in Hz; other targets near it become neighbours.
-
-    ``searched`` widens the band by the search of each mode.
-    """
-    searches = [searched * target.search for target in cluster]
-    low = min(t.band(BAND_HALF_WIDTH)[0] * (1 - s) for t, s in zip(cluster, searches, strict=True))
-    high = max(t.band(BAND_HALF_WIDTH)[1] * (1 + s) for t, s in zip(cluster, searches, strict=True))
-    high = min(high, top)
-    width = 0.5 * min(t.damping_ratio * t.frequency for t in cluster)
-    near = tuple(t for t in targets if t not in cluster and low / 1.3 < t.frequency < 1.3 * high)
-    return bin_spectra(spectra, low, high, width, near)
-
-
-def bin_spectra(
-    spectra: LogSpectra, low: float, high: float, width: float, neighbours: tuple[Target, ...] = ()
-) -> BinnedSpectra:
-    """Bin a band; bins of ``width``, all in Hz, are widened to hold at least four ordinates."""
-    cut = [spectrum.band(low, high) for spectrum in spectra.spectra]
-    frequency = np.concatenate([s.frequency for s in cut])
-    count = np.concatenate([np.full(s.frequency.size, float(s.count)) for s in cut])
-    order = np.argsort(frequency, kind="stable")
-    n_bins = max(3, min(int((high - low) / width), frequency.size // 4))
-    # The first bins hold one ordinate more than the others.
-    size, n_larger = divmod(frequency.size, n_bins)
-    larger, smaller = np.split(order, [n_larger * (size + 1)])
-    parts = [larger.reshape(n_larger, size + 1), smaller.reshape(n_bins - n_larger, size)]
-    ordinates = np.concatenate([s.powers() / median_ordinate(s.count) for s in cut])
-    level = np.concatenate([np.median(ordinates[part], axis=1) for part in parts])
-    return BinnedSpectra(
-        np.concatenate([frequency[part].mean(axis=1) for part in parts]),
-        np.ascontiguousarray(level.T).clip(1e-300),
-        np.concatenate([count[part].sum(axis=1) for part in parts]),
-        neighbours,
-    )
-
-
-def fit_strengths(
-    binned: BinnedSpectra, targets: Sequence[Target]
-) -> tuple[FloatArray, FloatArray]:
-    """Fit the strengths of targets and neighbours and white noise as `incoherent_fit` does."""
-    modes = (*targets, *binned.neighbours)
-    f = np.array([mode.frequency for mode in modes])
-    return incoherent_fit(binned, f, np.array([mode.damping_ratio for mode in modes]))
-
-
-def incoherent_fit(
-    binned: BinnedSpectra, f: FloatArray, zeta: FloatArray, *, updates: int = _UPDATES
-) -> tuple[FloatArray, FloatArray]:
-    """Fit strengths of resonances and white noise to binned spectra, for many candidates.
-
-    Multiplicative updates [Fevotte2009] maximise the Whittle likelihood and keep the strengths
-    positive; least squares would depend on the bins that happen to be low. Natural frequencies in
-    Hz and damping ratios have shape ``(..., n_modes)``. Returns the modal PSD of each mode, then
-    the noise PSD, ``(n_channels, ..., n_modes + 1)``, and the Whittle misfit, ``(n_channels,
-    ...)``.
-    """
-    frequency, count = binned.frequency, binned.count
-    design = _design(frequency, f, zeta)
-    unit = design.mean(axis=-2)
-    design = design / unit[..., None, :]
-    levels = binned.level.reshape(-1, *[1] * (f.ndim - 1), count.size)
-    # Every part starts with an equal share of the mean level.
-    weight = np.average(levels, axis=-1, weights=count)[..., None] / unit.shape[-1]
-    weight = weight * np.ones(unit.shape)
-    transposed = np.swapaxes(design, -1, -2)
-    for _ in range(updates):
-        model = (design @ weight[..., None])[..., 0]
-        share = count / model
-        numerator = transposed @ (share * levels / model)[..., None]
-        denominator = transposed @ share[..., None]
-        weight = weight * np.sqrt(numerator / denominator)[..., 0] ** _STRIDE
-    model = (design @ weight[..., None])[..., 0]
-    misfit = np.sum(count * (np.log(model) + levels / model), axis=-1)
-    return weight / unit, np.asarray(misfit)
-
-
-def _design(frequency: FloatArray, f: FloatArray, zeta: FloatArray) -> FloatArray:
-    """Return the PSD per unit of modes and white noise, ``(..., n_bins, n_modes + 1)``."""
-    beta = f[..., None, :] / frequency[:, None]
-    shapes = 1 / ((1 - beta**2) ** 2 + (2 * zeta[..., None, :] * beta) ** 2)
-    return np.concatenate([shapes, np.ones((*shapes.shape[:-1], 1))], axis=-1)
-
-
 def needed_ordinates(n_modes: int) -> int:
     """Return the least number of Fourier frequencies of a fit."""
     return 10 + 6 * n_modes
@@ -208,24 +103,22 @@ def needed_ordinates(n_modes: int) -> int:
 
 def fit_modes(
     spectra: LogSpectra,
-    binned: BinnedSpectra,
     targets: tuple[Target, ...],
     band: tuple[float, float],
+    noise: FloatArray,
     static: float = 0.0,
-    noise: FloatArray | None = None,
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
 
-    ``static`` is the expected static response of the modes over their shapes, ``noise`` as in
-    `prepare`.
+    ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, ``static`` the
+    expected static response of the modes over their shapes.
     """
-    data = replace(prepare(spectra, binned, targets, band, noise), static=static)
+    data = replace(prepare(spectra, targets, band, noise), static=static)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
         short = {t.name: Rejection("too-short", detail, t.frequency) for t in targets}
         return ClusterFit(None, short)
-    data = mask_prominent_lines(data)
     collapsed: dict[str, Rejection] = {}
     for _ in range(_MOST_LINE_ROUNDS):
         data, optimum, lines = _fit_beside_lines(data, targets)
@@ -327,45 +220,48 @@ def _losses(optimum: _Optimum) -> list[float]:
 
 
 def prepare(
-    spectra: LogSpectra,
-    binned: BinnedSpectra,
-    present: tuple[Target, ...],
-    band: tuple[float, float],
-    noise: FloatArray | None = None,
+    spectra: LogSpectra, targets: tuple[Target, ...], band: tuple[float, float], noise: FloatArray
 ) -> ClusterData:
-    """Cut out the band in Hz of the channels that show any of the modes, in units of noise.
-
-    ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, by default what
-    binned levels show beside the modes and their neighbours.
-    """
-    strength, misfit = fit_strengths(binned, present)
-    gains = fit_strengths(binned, ())[1] - misfit
-    index = [c for c, gain in enumerate(gains) if gain >= constants.ABSENT]
-    index = index or [int(np.argmax(gains))]
-    level = binned.level[index]
-    if noise is None:
-        noise = np.maximum(strength[:, -1], 1e-2 * binned.level.min(axis=1))
-    noise = noise[index]
-    unit = np.sqrt(noise)
-    whole = spectra.select(index).each(partial(_over, unit=unit))
-    cut = whole.each(lambda spectrum: spectrum.band(*band))
+    """Cut out the band of the channels that show any of the modes; arguments as in `fit_modes`."""
+    cut = spectra.each(lambda spectrum: spectrum.band(*band))
     cut = replace(cut, spectra=tuple(s for s in cut.spectra if s.frequency.size))
-    moved = [t.amplitude[index] / unit for t in present if t.amplitude is not None]
-    many = unit.size > _FEW and len(moved) == len(present)
-    basis = _directions(moved, cut) if many else np.eye(unit.size)
+    gain = _expected_gain(cut, targets, noise)
+    index = np.flatnonzero(gain >= constants.ABSENT).tolist() or [int(gain.argmax())]
+    unit = np.sqrt(noise[index])
+    cut = chosen = cut.select(index).each(partial(_over, unit=unit))
+    basis = np.eye(unit.size)
+    if unit.size > _FEW:
+        basis = _directions(_motions(targets)[index] / unit[:, None], cut)
     if basis.shape[1] < unit.size:
         names = tuple(f"direction {k}" for k in range(basis.shape[1]))
-        project = partial(CrossSpectrum.project, basis=basis)
-        sources = (whole.source,) * len(names)
-        ours = [replace(one.each(project), channels=names, sources=sources) for one in (cut, whole)]
-        low, high = float(binned.frequency[0]), float(binned.frequency[-1])
-        width = (high - low) / binned.frequency.size
-        chosen, levels = ours[0], bin_spectra(ours[1], low, high, width, binned.neighbours)
+        chosen = cut.each(partial(CrossSpectrum.project, basis=basis))
+        chosen = replace(chosen, channels=names, sources=(cut.source,) * len(names))
     else:
-        basis, chosen = np.eye(unit.size), cut
-        levels = replace(binned, level=level / noise[:, None])
+        basis = np.eye(unit.size)
     masks = tuple(s.free for s in chosen.spectra)
-    return ClusterData(cut, unit, basis, chosen, levels, masks, tuple(index))
+    return ClusterData(cut, unit, basis, chosen, masks, tuple(index))
+
+
+def _motions(targets: Sequence[Target]) -> ComplexArray:
+    """Return the amplitudes of targets that a search found, ``(n_channels, n_modes)``."""
+    return np.stack([t.amplitude for t in targets if t.amplitude is not None], axis=1)
+
+
+def _expected_gain(spectra: LogSpectra, targets: Sequence[Target], noise: FloatArray) -> FloatArray:
+    """Return the log likelihood that the modes are expected to gain in each channel alone."""
+    power = np.abs(_motions(targets)) ** 2 / noise[:, None]
+    f, zeta = np.array([(t.frequency, t.damping_ratio) for t in targets]).T[:, :, None]
+    gain = np.zeros(noise.size)
+    for s in spectra.spectra:
+        ratio = power @ np.abs(response(f, zeta, s.frequency)) ** 2
+        gain += s.count * np.sum(ratio - np.log1p(ratio), axis=1)
+    return gain
+
+
+def _in_phase(columns: ComplexArray) -> ComplexArray:
+    """Turn each column until its largest component is positive."""
+    largest = np.take_along_axis(columns, np.abs(columns).argmax(axis=0)[None], axis=0)
+    return np.asarray(columns * np.exp(-1j * np.angle(largest)))
 
 
 def _over(spectrum: CrossSpectrum, unit: FloatArray) -> CrossSpectrum:
@@ -374,15 +270,15 @@ def _over(spectrum: CrossSpectrum, unit: FloatArray) -> CrossSpectrum:
     return replace(spectrum, transforms=spectrum.transforms / unit, foreign=foreign)
 
 
-def _directions(moved: Sequence[ComplexArray], spectra: LogSpectra) -> FloatArray:
+def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
     """Return an orthonormal basis of the directions in which the modes are seen best.
 
     They span the shapes φ, and (1 + G G*)⁻¹ φ, which avoids what is foreign, at the ordinates; both
     in units of the noise, in which nothing else distinguishes directions. There are as many as
     leave each mode its share of φ* (1 + G G*)⁻¹ φ in the mean of the ordinates.
     """
-    shapes = [np.real(phi * np.exp(-1j * np.angle(phi[np.abs(phi).argmax()]))) for phi in moved]
-    phi = np.stack(shapes, axis=1) / np.linalg.norm(shapes, axis=1)
+    shapes = _in_phase(moved).real
+    phi = shapes / np.linalg.norm(shapes, axis=0)
     foreign = [
         s.foreign[:: 1 + s.frequency.size // _MOST_COMPARED]
         for s in spectra.spectra
@@ -417,27 +313,17 @@ def _seen(basis: FloatArray, phi: FloatArray, g: ComplexArray) -> FloatArray:
     return np.asarray(np.sum(phi * (phi - g @ _share(g, phi)), axis=1).real)
 
 
-def mask_prominent_lines(data: ClusterData) -> ClusterData:
-    """Mask lines far above the binned level, before a mode can settle on one.
-
-    Twice the threshold leaves room for what the bins do not resolve. A single mode whose damping is
-    below about 1/15 of the described one is as narrow as a line, and may lose its own peak.
-    """
-    f, levels = data.binned.frequency, 2 * data.binned.level
-    spectra = data.spectra.spectra
-    return _mask_above(
-        data, [np.stack([np.interp(s.frequency, f, x) for x in levels], -1) for s in spectra]
-    )
-
-
 def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> ClusterData:
     """Mask ordinates that noise about the expectation does not reach; return ``data`` if none.
 
-    A line on a resonance is seen in the directions in which the mode does not move.
+    Each channel is compared with its level, and the trace of all over their expectation: a line on
+    a resonance is seen in the directions in which the mode does not move.
     """
-    levels, whitened = [], []
-    for spectrum, matrix in zip(data.spectra.spectra, expected, strict=True):
-        level = np.diagonal(matrix, axis1=1, axis2=2).real
+    n, n_free = data.basis.shape[1], sum(int(mask.sum()) for mask in data.masks)
+    false_alarm = constants.LINE_FALSE_ALARM / ((n + 1) * n_free)
+    masks = []
+    for spectrum, mask, matrix in zip(data.spectra.spectra, data.masks, expected, strict=True):
+        level, count = np.diagonal(matrix, axis1=1, axis2=2).real, spectrum.count
         known = np.flatnonzero(np.isfinite(level[:, 0]))
         total = np.zeros(len(level))
         with suppress(np.linalg.LinAlgError):  # channels that copy each other
@@ -445,14 +331,18 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
             total[known] = np.trace(white, axis1=1, axis2=2).real
         # A misfit of the model is no line: the expectation of a mean is raised to the level near
         # it. A single periodogram scatters too much for that, and its lines exceed any misfit.
-        if spectrum.count > 1:
-            ratio = spectrum.powers() / level / median_ordinate(spectrum.count)
+        if count > 1:
+            ratio = spectrum.powers() / level / median_ordinate(count)
             level = level * median_filter(ratio, (_LINE_NEIGHBOURS, 1)).clip(1.0)
-            near = median_filter(total, _LINE_NEIGHBOURS) / level.shape[1]
+            near = median_filter(total, _LINE_NEIGHBOURS) / n
             total = total / near.clip(1.0)
-        levels.append(level)
-        whitened.append(total)
-    return _mask_above(data, levels, whitened)
+        highest = gammainccinv(count, false_alarm) / count
+        above = (spectrum.powers() > highest * level).any(axis=1)
+        above |= total > gammainccinv(count * n, false_alarm) / count
+        masks.append(mask & ~binary_dilation(mask & above, iterations=_LINE_BINS))
+    # A band that would lose more than half of its ordinates holds no lines.
+    n_left = sum(int(mask.sum()) for mask in masks)
+    return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
 def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
@@ -462,30 +352,6 @@ def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
         apart = np.abs(spectrum.frequency[:, None] - lines).min(axis=1) * spectrum.duration
         masks.append(mask & (apart > _LINE_BINS + 0.5))
     return replace(data, masks=tuple(masks))
-
-
-def _mask_above(
-    data: ClusterData, levels: list[FloatArray], whitened: list[FloatArray] | None = None
-) -> ClusterData:
-    """Mask lines wherever any channel exceeds its level, ``(n_ordinates, n_channels)``.
-
-    Or all of them together: ``whitened`` is the trace of ordinates over their expectation.
-    """
-    n_free = sum(int(mask.sum()) for mask in data.masks)
-    n = data.basis.shape[1]
-    false_alarm = constants.LINE_FALSE_ALARM / ((n + (whitened is not None)) * n_free)
-    masks = []
-    for k, (spectrum, mask) in enumerate(zip(data.spectra.spectra, data.masks, strict=True)):
-        highest = gammainccinv(spectrum.count, false_alarm) / spectrum.count
-        above = (spectrum.powers() > highest * levels[k]).any(axis=1)
-        if whitened is not None:
-            above |= whitened[k] > gammainccinv(spectrum.count * n, false_alarm) / spectrum.count
-        lines = mask & above
-        reached = binary_dilation(lines, iterations=_LINE_BINS) if lines.any() else lines
-        masks.append(mask & ~reached)
-    # A band that would lose more than half of its ordinates holds no lines.
-    n_left = sum(int(mask.sum()) for mask in masks)
-    return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
 def group_lengths(spectra: Sequence[CrossSpectrum]) -> list[list[int]]:
@@ -545,19 +411,11 @@ def _solve(
     blocks = make_blocks(data, bandwidth, near.tolist())
     n_channels = data.basis.shape[1]
     zeta = np.array([target.damping_ratio for target in targets])
-    # A strength of zero would leave a mode without a gradient.
-    least = np.outer(0.01 * data.binned.level.min(axis=1), 4 * zeta**2)
-    strength, _ = fit_strengths(data.binned, targets)
-    amplitude = np.sqrt(np.maximum(strength[:, : len(targets)], least))
+    own = _in_phase(data.basis.T @ (_motions(targets)[list(data.index)] / data.unit[:, None]))
+    # A strength of zero would leave a mode without a gradient: a peak has 1 % of the noise or more.
+    amplitude = np.maximum(np.abs(own), 0.1 * 2 * zeta)
     reference = amplitude.argmax(axis=0).tolist()
-    sign = np.ones_like(amplitude)
-    for i, target in enumerate(targets):
-        assert target.amplitude is not None  # a search states it
-        own = data.basis.T @ (target.amplitude[list(data.index)] / data.unit)
-        own = own * np.exp(-1j * np.angle(own[np.abs(own).argmax()]))
-        amplitude[:, i] = np.maximum(np.abs(own), np.sqrt(least[:, i]))
-        sign[:, i] = np.where(own.real < 0, -1.0, 1.0)
-        reference[i] = int(amplitude[:, i].argmax())
+    sign = np.where(own.real < 0, -1.0, 1.0)
     scale = amplitude.max(axis=0)
     layout = lay_out(reference, n_channels)
     start = np.concatenate(

@@ -21,7 +21,6 @@ from scipy.special import comb
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, pivots
 from lmshealth.modal import constants
-from lmshealth.modal.ambient.hints import candidates_at
 from lmshealth.modal.ambient.joint_model import (
     LEAST_FLOOR,
     BandData,
@@ -89,9 +88,9 @@ class Found:
         floor = model.floor_at(target.frequency)
         return float((np.abs(model.phi[:, mode]) / (2 * model.zeta[mode] * np.sqrt(floor))).max())
 
-    def noise(self, low: float, high: float) -> FloatArray:
-        """Return the density of the noise of each channel in a band in Hz, in (m/s²)²/Hz."""
-        return self.model.floor_at((low * high) ** 0.5) * self.model.data.scale**2
+    def noise(self, frequency: float) -> FloatArray:
+        """Return the density of the noise of each channel at a frequency in Hz, in (m/s²)²/Hz."""
+        return self.model.floor_at(frequency) * self.model.data.scale**2
 
     def around(self, near: tuple[Target, ...], low: float, high: float) -> LogSpectra:
         """Return the spectra from low to high Hz, with the other modes as foreign."""
@@ -113,8 +112,9 @@ def search(
 ) -> Found:
     """Search a band; frequencies are in Hz.
 
-    Lines are masked in the spectra. There may be further ones where ``suspected``. Described modes
-    are ``hints`` where to look. Channels that no common modes explain are left out.
+    Lines are masked in the spectra. There may be further ones where ``suspected``. Less makes a
+    mode worth a trial where one is described (``hints``); evidence decides as for any other one.
+    Channels that no common modes explain are left out.
     """
     every = spectra.channels
     # A silent channel shows nothing, and is not unlike the others.
@@ -208,7 +208,7 @@ def _of_all_channels(
         part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
         part = part.refined(6)
         for _ in range(_ROUNDS):
-            more = _grow(part, _CLEARLY * constants.LEAST_EXCESS)
+            more = _grow(part, (), _CLEARLY * constants.LEAST_EXCESS)
             if more is None:
                 break
             part = more.refined(2)
@@ -241,12 +241,12 @@ def _explain(
         candidates = [
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
-        candidates += candidates_at(spectra, hints, high)
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
         start = _start(_bin(spectra, candidates, low, high), candidates)
         # Floors and strengths of a start are those of c = 0: refined models are compared.
         refined = [replace(start, static=c).refined(6) for c in _STATICS]
-        model = _select(_with_likelier_static(min(refined, key=lambda one: one.misfit)))
+        best = min(refined, key=lambda one: one.misfit)
+        model = _select(_with_likelier_static(best), hints)
         harmonic = find_harmonic(model, recording, harmonics, suspected)
         if harmonic is None or len(harmonics) == _MOST_HARMONICS:
             return model, tuple(harmonics), spectra, poles
@@ -302,11 +302,11 @@ def _consistent(model: JointModel) -> list[int]:
     return kept
 
 
-def _select(model: JointModel) -> JointModel:
+def _select(model: JointModel, hints: tuple[Target, ...]) -> JointModel:
     """Select the modes that the cross spectra need, by stepwise maximum likelihood."""
     for _ in range(_ROUNDS):
         model = _prune(model)
-        more = _grow(model)
+        more = _grow(model, hints)
         if more is None:
             break
         model = more
@@ -348,10 +348,12 @@ def _doubtful(model: JointModel) -> list[int]:
     return [int(i) for i in losses.argsort() if losses[i] < _DOUBTFUL or near[i]][:_MOST_TRIED]
 
 
-def _grow(model: JointModel, least: float = constants.LEAST_EXCESS) -> JointModel | None:
+def _grow(
+    model: JointModel, hints: tuple[Target, ...], least: float = constants.LEAST_EXCESS
+) -> JointModel | None:
     """Add the mode that the residual shows most clearly; None where there is no evidence."""
     for gain, f, zeta, phi in _excesses(model)[:2]:
-        if gain < least:
+        if gain < (constants.LEAST_HINTED if any(is_near(hint, f) for hint in hints) else least):
             break
         more = model.with_mode(f, zeta, phi)
         more = more.refined(3, more.nearest(f))

@@ -24,21 +24,16 @@ from lmshealth.modal.deterministic.poles import (
     PoleFit,
     best_pole,
     evidence_needed,
-    invert,
     maximise,
 )
 from lmshealth.modal.modes import paired
 
-# Accuracy of a maximum, relative.
-_CLOSE = 1e-5
 # Levels of the ambient response: start where none is found, least level, and the log posterior
 # below the largest from which on they are left out.
 _FIRST_AVERAGE_LEVEL, _LEAST_LEVEL, _UNLIKELY = 0.5, 0.1, 6.0
 # Largest step of the logarithm of a level, and its step in standard deviations where the level is
 # well known: a sum over a normal density in such steps is exact to 1e-5.
 _COARSE, _SPREADS = 0.6, 1.3
-# Longest steps, of half a Fourier frequency, by which a mode may move while its level is raised.
-_STAYS = 2.0
 # Poles tried per Fourier frequency, and their dampings.
 _TRIALS, _DAMPINGS = 4.0, np.geomspace(2e-4, 0.1, 10)
 _FIRST_LEVEL = 0.3  # of the ambient response
@@ -98,27 +93,16 @@ def average_ambient(
     place = 2 * likelihood.n_modes + mode
     start = p.copy()
     start[place] = max(abs(p[place]), _FIRST_AVERAGE_LEVEL)
-    weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
-    best = levels[int(np.argmax(weight))]
-    if abs(best.p[mode] - p[mode]) > _STAYS * likelihood.reach(p)[mode]:
-        # A level far above the noise of a clean decay displaces the mode, and another pole takes
-        # its place: start from the least level.
-        start[place] = max(abs(p[place]), _LEAST_LEVEL * (1 + _CLOSE))
-        weight, levels = _average_levels(likelihood, start, place, free, _COARSE)
-        best = levels[int(np.argmax(weight))]
-    metric = likelihood.metric(best.at)
-    spread = float(np.sqrt(np.linalg.inv(metric)[place, place])) / best.p[place]
-    if _SPREADS * spread < _COARSE:
-        weight, levels = _average_levels(likelihood, best.p, place, free, _SPREADS * spread)
-    weights, most = softmax(weight), int(np.argmax(weight))
-    inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
-    # The Hessian is costly: its ratio to the Fisher information is that of the best level.
-    wide = np.linalg.cholesky(invert(levels[most], free))
-    stretch = wide @ np.linalg.inv(np.linalg.cholesky(inverses[most]))
+    metric = likelihood.metric(likelihood.evaluate(start))
+    spread = float(np.sqrt(np.linalg.inv(metric)[place, place])) / start[place]
+    step = min(_COARSE, _SPREADS * spread)
+    weight, levels = _average_levels(likelihood, start, place, free, step)
+    weights = softmax(weight)
     where = np.array([level.p for level in levels])
     mean = weights @ where
     cov = (where - mean).T @ (weights[:, None] * (where - mean))
-    cov[np.ix_(free, free)] += stretch @ np.tensordot(weights, inverses, 1) @ stretch.T
+    inverses = np.array([np.linalg.inv(level.at.fisher[np.ix_(free, free)]) for level in levels])
+    cov[np.ix_(free, free)] += np.tensordot(weights, inverses, 1)
     return mean, cov
 
 
@@ -231,7 +215,8 @@ def estimate(found: PoleFit, modes: Sequence[int] | None = None) -> DecayEstimat
     own = paired(modes, m)
     n = len(modes)
     inverse = np.zeros((p.size, p.size))
-    inverse[np.ix_(free, free)] = invert(maximise(likelihood, p, free), free)
+    fisher = maximise(likelihood, p, free).at.fisher
+    inverse[np.ix_(free, free)] = np.linalg.inv(fisher[np.ix_(free, free)])
     joint = inverse[np.ix_(own, own)]
     mean, scales = np.empty(2 * n), np.zeros((2 * n, 2 * n))
     for k, (average, cov) in enumerate(averages):

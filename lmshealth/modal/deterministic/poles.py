@@ -1,9 +1,8 @@
-"""Poles of a modal likelihood: maximum, covariance, evidence, and the search of further ones."""
+"""Poles of a modal likelihood: maximum, evidence, and the search of further ones."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import linalg
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray, stack
 from lmshealth.modal import constants
@@ -17,8 +16,6 @@ from lmshealth.modal.deterministic.likelihood import (
 )
 
 _MOST_STEPS, _STEP_TOLERANCE = 60, 1e-5
-# Step of the difference of the Hessian in standard deviations.
-_DIFFERENCE = 0.02
 # A line's damping is within this share of the least one.
 _AT_BOUND = 0.01
 # Values of the columns of poles that are tried at once.
@@ -117,26 +114,6 @@ def _shorten(
         if there.value < at.value:
             return tried, there
     return None
-
-
-def invert(found: PoleFit, free: IntArray) -> FloatArray:
-    """Invert the Hessian, or the Fisher information where that has no inverse.
-
-    Returns the covariance of the free parameters, shape ``(n_free, n_free)``.
-    """
-    likelihood, p = found.likelihood, found.p
-    scale, reach = 1 / np.sqrt(np.diag(likelihood.metric(found.at))), likelihood.reach(p)
-    rows = []  # differences of the gradient
-    for j in free:
-        step = np.zeros(p.size)
-        step[j] = _DIFFERENCE * min(scale[j], reach[j])
-        up, down = likelihood.evaluate(p + step), likelihood.evaluate(p - step)
-        rows.append((up.gradient - down.gradient)[free] / (2 * step[j]))
-    try:
-        factor = np.linalg.cholesky(np.add(rows, np.transpose(rows)) / 2)
-    except np.linalg.LinAlgError:
-        factor = np.linalg.cholesky(found.at.fisher[np.ix_(free, free)])
-    return np.asarray(linalg.cho_solve((factor, True), np.eye(free.size)))
 
 
 def evidence_needed(likelihood: ModalLikelihood) -> float:

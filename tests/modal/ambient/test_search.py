@@ -17,7 +17,7 @@ from lmshealth.modal.ambient.joint_model import BandData, JointModel
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.identification import read_ambient
-from lmshealth.signal.spectra import CrossSpectrum
+from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 from studies.modes.without_description.worlds import FAMILIES, World, log_of
 from tests.signals import Mode, accelerations, make_log
 
@@ -149,9 +149,10 @@ def test_more_channels_make_no_interval_wider(monkeypatch: pytest.MonkeyPatch) -
     few, all_ = identified_from(values[:4]), identified_from(values)
     plain, units = cluster_fit.prepare, list[FloatArray]()
 
-    def prepare(*given: Any) -> ClusterData:
-        units.append(plain(*given[:-1]).unit ** 2)
-        return plain(*given[:-1])
+    def prepare(spectra: LogSpectra, targets: Any, band: Any, noise: FloatArray) -> ClusterData:
+        level = np.median(spectra.longest.band(*band).powers(), axis=0) / np.log(2)
+        units.append(plain(spectra, targets, band, level).unit ** 2)
+        return plain(spectra, targets, band, level)
 
     monkeypatch.setattr(cluster_fit, "prepare", prepare)
     control = identified_from(values)
