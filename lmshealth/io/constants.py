@@ -97,9 +97,6 @@ signal may be a level off."""
 SPIKE_ENERGY = 0.01
 """Energy of all bad samples of a channel, as a share of that of its noise, below which they change
 nothing: a mode's noise floor rises by less than 1 %."""
-SPIKE_SHARE = 1.0
-"""Fewest bad samples per other event of the channel: noise of heavy tails has a few that stand
-alone among many that do not, and of such noise none are singled out."""
 MOST_SPIKES = 0.01
 """Largest share of bad samples: more are part of the signal, or cut it to pieces."""
 SHAPE_SAMPLES, LEVEL_SAMPLES, FEWEST_FOR_SHAPE = 1 << 16, 1 << 13, 2000
