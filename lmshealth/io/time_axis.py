@@ -20,7 +20,6 @@ from lmshealth.io.buffers import (
     blocks,
     count,
     runs,
-    smallest_step,
 )
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
