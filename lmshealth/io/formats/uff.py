@@ -23,6 +23,7 @@ from lmshealth.io.formats.content import (
     Format,
     check_memory,
     choose,
+    foreign,
     library,
     not_numeric,
     rate_of,
@@ -42,18 +43,6 @@ _TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
 _RESPONSE, _COHERENCE = 4, 6
 _REAL, _COMPLEX = (2, 4), (5, 6)
-# Names of other functions and data sets, for messages.
-_FUNCTIONS = {
-    **{0: "unknown", 1: "complex time response", 2: "spectrum", 3: "cross spectrum"},
-    **{4: "frequency response", 5: "transmissibility", 6: "coherence", 7: "correlation"},
-    **{8: "cross correlation", 9: "power spectral density", 10: "energy spectral density"},
-    **{12: "spectrum", 27: "order function"},
-}
-_SETS = {
-    **{15: "nodes", 18: "coordinate systems", 55: "mode shapes", 82: "lines of a geometry"},
-    **{151: "header", 164: "units", 780: "elements", 781: "nodes", 2411: "nodes"},
-    **{2412: "elements", 2414: "analysis", 2420: "coordinate systems", 2467: "groups"},
-}
 # Names in a header of degrees of freedom by their code; rotations are 4 to 6.
 _DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 _HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
@@ -297,12 +286,14 @@ def _no_time_records(
     needed = "needed acceleration over time (data sets 58, function type 1)"
     kinds = sorted({header["func_type"] for header in headers})
     if kinds:
-        text = listed(f"function type {kind} ({_FUNCTIONS.get(kind, 'another')})" for kind in kinds)
+        known = foreign("uff_functions")
+        text = listed(f"function type {k} ({known.get(str(k), 'another')})" for k in kinds)
         found = f"holds no time record but {text}: {listed(names)}"
         if _RESPONSE in kinds:
             needed += "; `lmshealth frf` reads frequency responses"
         return Unusable("columns", f"{found}; {needed}")
-    text = listed(f"{number} ({_SETS.get(number, 'another')})" for number in others)
+    known = foreign("uff_sets")
+    text = listed(f"{number} ({known.get(str(number), 'another')})" for number in others)
     return Unusable("format", f"holds the data sets {text}, and no measured functions; {needed}")
 
 
