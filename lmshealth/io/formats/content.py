@@ -9,7 +9,7 @@ import tomllib
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache, partial
@@ -150,6 +150,18 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
         found = f"{len(chosen)} columns of signals, at most {constants.MOST_COLUMNS} are read"
         raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
     return chosen
+
+
+def collected(
+    sizes: Mapping[str, int],
+    parts: Iterable[tuple[str, np.ndarray]],
+    times: "Mapping[str, SinceFirst]",
+) -> dict[str, Samples]:
+    """Join the parts of columns of expected sizes; moments become times."""
+    taken = {name: Spool(size) for name, size in sizes.items()}
+    for name, values in parts:
+        taken[name].append(times[name](values) if name in times else values)
+    return {name: spool.samples() for name, spool in taken.items()}
 
 
 @contextmanager
