@@ -231,8 +231,8 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Check what the types do not state; the error lists every fault."""
-        keys = "recognise rows_after delimiter decimal names units interval offset".split()
-        given = {key: getattr(self, key) for key in keys}
+        keys = ("recognise", "rows_after", "delimiter", "decimal", "names", "units", "interval")
+        given = {key: getattr(self, key) for key in (*keys, "offset")}
         given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
         given["start.find"] = self.start and self.start.find
         each = [(key, one) for key, own in given.items()
