@@ -81,13 +81,12 @@ def unpacked(path: Path) -> Iterator[Path]:
     if not packed:
         yield path
         return
-    stored, size = path.stat().st_size, 0
     with TemporaryDirectory(prefix="lmshealth-") as folder:
         copy = Path(folder) / path.name[: -len(".gz")]
         with gzip.open(path) as whole, copy.open("wb") as target:
             for block in iter(partial(whole.read, _BLOCK), b""):
-                size += target.write(block)
-                check_size(size, stored)
+                target.write(block)
+                check_size(target.tell(), path.stat().st_size)
         yield copy
 
 
@@ -146,10 +145,15 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     chosen = [name for name in names if columns.target(name) is not None]
     if twice := repeated(chosen):
         raise Unusable("columns", f"the file names {listed(twice)} more than once")
-    if len(chosen) > constants.MOST_COLUMNS:
-        found = f"{len(chosen)} columns of signals, at most {constants.MOST_COLUMNS} are read"
-        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+    check_number(len(chosen))
     return chosen
+
+
+def check_number(n_columns: int) -> None:
+    """Refuse (``columns``) more columns of signals than a log has."""
+    if n_columns > constants.MOST_COLUMNS:
+        found = f"{n_columns} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
 
 
 def collected(
@@ -282,17 +286,15 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     that contradicts the unit of its channel as ``unit``.
     """
     named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
-    if len(named) > constants.MOST_COLUMNS:
-        found = f"{len(named)} columns of signals, at most {constants.MOST_COLUMNS} are read"
-        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+    check_number(len(named))
     # Each group of channels may have times of its own: those of the chosen rate are read.
-    counts = Counter(
-        own
-        for column, k in named
-        if (own := channels[k].rate) is not None and role_of(column) != "time"
-    )
+    signals = [channels[k].rate for column, k in named if role_of(column) != "time"]
+    counts = Counter(own for own in signals if own is not None)
     rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
-    named = [*named, *_moments(channels, named, rate, columns)]
+    # Moments are times where nothing else states the rate.
+    moments = [("time_s", k) for k, channel in enumerate(channels) if channel.moments]
+    timed = rate or columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
+    named += moments if len(moments) == 1 and not timed else []
     alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
     n_late = _aligned([channels[k] for k in alike], rate)
     samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
@@ -324,18 +326,6 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
         detail = f"starts {since} after others; all are used where they have samples"
         refused[column] = Refusal("", "gaps", detail, channel=column)
     return kept, Content({}, metadata, present, tuple(refused.values()), late=delays)
-
-
-def _moments(
-    channels: Sequence[Described],
-    named: Sequence[tuple[str, int]],
-    rate: float | None,
-    columns: ColumnMap,
-) -> list[tuple[str, int]]:
-    """Return the channel of moments as a column of times, where nothing else states the rate."""
-    found = [(channel.name, k) for k, channel in enumerate(channels) if channel.moments]
-    timed = columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
-    return [("time_s", found[0][1])] if len(found) == 1 and rate is None and not timed else []
 
 
 def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | None]:
@@ -377,17 +367,16 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
     """Name a channel as a column of the log; None if it is not to be read."""
     if channel.name in columns.columns.values():
         return channel.name
-    if role_of(channel.name) is None and columns.target(channel.name) is not None:
-        return channel.name
+    time, unit = (unit_key(channel.unit, kind) for kind in ("time", "acceleration"))
     if role_of(channel.name) is not None:
         column = _with_unit(channel, columns)
+    elif columns.target(channel.name) is not None:
+        return channel.name
+    elif time and channel.rate is None and _TIME.match(channel.name):
+        column = f"time_{time}"
+    elif columns.columns or (unit is None and not channel.acceleration):
+        return None
     else:
-        time = unit_key(channel.unit, "time")
-        if time and channel.rate is None and _TIME.match(channel.name):
-            return f"time_{time}" if columns.target(f"time_{time}") is not None else None
-        unit = unit_key(channel.unit, "acceleration")
-        if columns.columns or (unit is None and not channel.acceleration):
-            return None
         column = "acc_" + re.sub(r"\W+", "_", channel.name).strip("_")
         if unit is not None and column not in columns.units:
             column = f"{column}_{unit}"
@@ -485,9 +474,9 @@ def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], 
         scale, what, epoch = 1 / 86400, "days", None
     elif _UNIX_TIMES[0] <= start * unit < _UNIX_TIMES[1]:
         scale, what, epoch = 1 / unit, "", 0
+    elif (found := next(ticks, None)) is not None:
+        scale, what, epoch = found
     else:
-        scale, what, epoch = next(ticks, (0.0, "", None))
-    if not scale:
         return time, (), {}
     spool = Spool()
     for _, block in blocks(time):
