@@ -147,15 +147,16 @@ def _attribute(file: Any, key: str) -> str:
     # Its type is checked before it is read: the library crashes on damaged types of other classes.
     plain = h5py.h5t.TypeStringID, h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeEnumID
     kind = attribute.get_type()
-    if kind.get_size() > constants.LONGEST_ATTRIBUTE:
-        most = constants.LONGEST_ATTRIBUTE
-        raise Unusable("metadata", f"{key} claims {kind.get_size()} bytes; at most {most} are read")
+    if (size := kind.get_size()) > (most := constants.LONGEST_ATTRIBUTE):
+        raise Unusable("metadata", f"{key} claims {size} bytes; at most {most} are read")
     if not isinstance(kind, plain) or attribute.shape not in ((), (1,)):
-        raise Unusable("metadata", f"{key} is no single text or number; write it as text")
+        raise _no_single(key)
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    return as_text(value)
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else as_text(value)
+
+
+def _no_single(key: str) -> Unusable:
+    return Unusable("metadata", f"{key} is no single text or number; write it as text")
 
 
 _PARQUET = b"PAR1"
@@ -183,11 +184,8 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 raise not_numeric(name, f"values of type {kind}")
         check_size(8 * n_rows * len(chosen), path.stat().st_size)
-        metadata = {
-            key.decode("utf-8", "replace"): value.decode("utf-8", "replace")
-            for key, value in (schema.metadata or {}).items()
-            if key not in _LIBRARY_KEYS
-        }
+        pairs = (pair for pair in (schema.metadata or {}).items() if pair[0] not in _LIBRARY_KEYS)
+        metadata = dict([text.decode("utf-8", "replace") for text in pair] for pair in pairs)
         # Up to a minute at once, beyond it in blocks; nulls become NaN.
         size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
         batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
@@ -342,16 +340,14 @@ def _first(struct: Any, *names: str, default: object) -> Any:
 def _arrays(values: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Yield all arrays of a variable: fields of structs, entry after entry, columns of matrices."""
     is_number = values.dtype.kind in "fiu"
+    is_matrix = is_number and values.ndim == 2 and 1 not in values.shape and values.size
     if getattr(values.dtype, "names", None) and not _is_object(values):
         entries = values.ravel("F")
         for k, entry in enumerate(entries):
             whole = name if entries.size == 1 else f"{name}({k + 1})"
             for field in values.dtype.names:
                 yield from _arrays(entry[field], f"{whole}.{field}" if whole else field)
-    elif is_number and values.ndim == 2 and 1 not in values.shape and values.size:
-        if values.shape[1] > constants.MOST_COLUMNS:
-            yield name, values
-            return
+    elif is_matrix and values.shape[1] <= constants.MOST_COLUMNS:
         for k in range(values.shape[1]):
             yield f"{name}(:,{k + 1})", values[:, k]
     elif values.size or not is_number:
@@ -388,7 +384,7 @@ def _text(name: str, values: Any) -> str:
         value = values.item()
         # An integer may be stored as one or not.
         return str(int(value) if float(value).is_integer() else value)
-    raise Unusable("metadata", f"{name} is no single text or number; write it as text")
+    raise _no_single(name)
 
 
 def _is_mat(head: bytes) -> bool:

@@ -108,7 +108,7 @@ def _segments(path: Path) -> list[int]:
             if not lead_in.startswith(_MAGIC):
                 raise corrupt(f"{where} no segment begins")
             if len(lead_in) < _LEAD_IN:
-                raise Unusable("corrupt", f"{where} the file is cut off; copy it again")
+                raise corrupt(f"{where} the file is cut off")
             order = ">" if lead_in[4] & _BIG_ENDIAN else "<"
             rest, samples = struct.unpack(order + "QQ", lead_in[12:])
             if rest == _NEVER_FINISHED:
@@ -224,9 +224,9 @@ def _check_scales(objects: Iterable[Mapping[str, object]]) -> None:
     for properties in objects:
         for key, value in properties.items():
             scale = _SCALE.match(key)
-            is_count = key == _N_SCALES or (scale is not None and key.endswith("_Size"))
+            is_count = key == _N_SCALES or (scale and key.endswith("_Size"))
             many = is_count and not (isinstance(value, int) and value <= constants.MOST_SCALES)
-            if many or (scale is not None and int(scale[1]) > constants.MOST_SCALES):
+            if many or (scale and int(scale[1]) > constants.MOST_SCALES):
                 detail = f"{listed([key])} is {str(value)[:20]!r}; export it again"
                 raise Unusable("corrupt", detail)
 
