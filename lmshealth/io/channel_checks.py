@@ -83,18 +83,18 @@ def fit_prediction(values: Samples, bad: IntArray) -> Prediction | None:
     usable = [(x, ~within(bad, at, x.size)) for at, x in parts]
     n = sum(int(good.sum()) for _, good in usable)
     mean = float(sum(x[good].sum() for x, good in usable) / max(n, 1))
-    gram, rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
+    gram, n_rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
     for x, good in usable:
         whole = np.convolve(~good, np.ones(_ORDER + 1), "valid") < 0.5
         window = np.lib.stride_tricks.sliding_window_view(x - mean, _ORDER + 1)[whole]
         gram += window.T @ window
-        rows += len(window)
-    if rows <= constants.PREDICTION_SAMPLES:
+        n_rows += len(window)
+    if n_rows <= constants.PREDICTION_SAMPLES:
         return None
     # Columns from the oldest sample to the newest.
     phi = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=1e-13)[0]
     a = np.concatenate([[1.0], -phi[::-1]])
-    variance = float(a[::-1] @ gram @ a[::-1]) / rows
+    variance = float(a[::-1] @ gram @ a[::-1]) / n_rows
     return Prediction(mean, a, variance) if variance > 0 else None
 
 
@@ -327,11 +327,10 @@ def level_step(values: Samples) -> float | None:
     """Return the step between the levels of a quantised channel; None where it has none."""
     some = values[:BLOCK]
     levels = np.unique(some[np.isfinite(some)])
-    apart = np.diff(levels)
-    apart = apart[apart > _ROUNDING * np.ptp(levels)] if levels.size > 1 else apart
-    if not apart.size:
+    if levels.size < 2:
         return None
-    off = levels - levels[0]
+    off, apart = levels - levels[0], np.diff(levels)
+    apart = apart[apart > _ROUNDING * off[-1]]
     for part in range(1, _MOST_SKIPPED + 1):
         step = float(apart.min()) / part
         reach = 16 * step
@@ -445,10 +444,9 @@ def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> N
     """
     near = (rough.high - rough.low) / 100
     x = _sample(values, constants.SHAPE_SAMPLES)
-    if x.size < constants.FEWEST_FOR_SHAPE:
+    if x.size < constants.FEWEST_FOR_SHAPE or not 0 < left < near:
         return
-    ends = min(np.mean(x < rough.low + near), np.mean(x > rough.high - near))
-    if 0 < left < near and ends > constants.WRAP_ENDS:
+    if min(np.mean(x < rough.low + near), np.mean(x > rough.high - near)) > constants.WRAP_ENDS:
         found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
         needed = "the counter overflows; record it with more bits, or faster"
         raise Unusable("wrapped", f"{found}: {needed}")
@@ -505,15 +503,14 @@ def _spike(
     for n in (1, 2):
         tried = []
         for k in range(int(suspects[0]) + 1 - n, int(suspects[-1]) + 1):
-            own = np.arange(k, k + n) - first
-            y = x.copy()
+            own, y = np.arange(k, k + n) - first, x.copy()
             unknown = np.union1d(own, gone)
             y[unknown] = model.expected(y, unknown)
-            tried.append((float((model.errors(y) ** 2).sum()) / model.variance, own, y))
-        after, own, y = min(tried, key=lambda one: one[0])
-        rest = model.errors(y) ** 2 / model.variance
+            rest = model.errors(y) ** 2 / model.variance
+            tried.append((float(rest.sum()), float(rest.max()), own, y))
+        after, largest, own, y = min(tried, key=lambda one: one[0])
         gain = float(errors.sum()) - after
-        if rest.max() < constants.ORDINARY**2 and gain > constants.SPIKE**2:
+        if largest < constants.ORDINARY**2 and gain > constants.SPIKE**2:
             if np.abs(x[own] - y[own]).min() <= least:
                 return None
             # What as many innovations, such as those of a blow, would leave.
@@ -559,12 +556,10 @@ def check_sign(values: Samples, rough: Roughness) -> None:
 
 def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:
     """Return whether a channel comes near its edge throughout; a drift is there for a while."""
-    n = constants.LEVEL_SAMPLES // 8
-    for at in places(values.size, n):
-        x = values[at : at + n] if is_lower else -values[at : at + n]
-        if np.isfinite(x).any() and np.nanmin(x) - low > (middle - low) / 2:
-            return False
-    return True
+    n, sign = constants.LEVEL_SAMPLES // 8, 1 if is_lower else -1
+    parts = (sign * values[at : at + n] for at in places(values.size, n))
+    nearest = (np.nanmin(x) for x in parts if np.isfinite(x).any())
+    return all(least - low <= (middle - low) / 2 for least in nearest)
 
 
 def coarse_levels(values: Samples) -> str:
