@@ -70,6 +70,11 @@ class Format:
     library: str = ""
 
 
+def begins(*marks: bytes, blanks: bytes = b"") -> Callable[[bytes], bool]:
+    """Return whether first bytes, without some blanks before them, are one of the marks."""
+    return lambda head: head.lstrip(blanks).startswith(marks)
+
+
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
     """Copy a file that gzip compressed to a temporary one as it was; other files are yielded.
@@ -104,7 +109,7 @@ def gzipped(form: Format, others: Iterable[str] = ()) -> Format:
             return form.load(copy, columns, max_memory)
 
     suffixes = tuple(f"{suffix}.gz" for suffix in (*form.suffixes, *others))
-    return Format(f"gzipped {form.name}", suffixes, lambda head: head.startswith(GZIP), load)
+    return Format(f"gzipped {form.name}", suffixes, begins(GZIP), load)
 
 
 def load_by(form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -295,7 +300,8 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     moments = [("time_s", k) for k, channel in enumerate(channels) if channel.moments]
     timed = rate or columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
     named += moments if len(moments) == 1 and not timed else []
-    alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
+    least = constants.AGREEMENT
+    alike = [k for _, k in named if not rate or abs((channels[k].rate or rate) / rate - 1) <= least]
     n_late = _aligned([channels[k] for k in alike], rate)
     samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
     kept: dict[str, int] = {}
@@ -350,10 +356,6 @@ def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | No
         fits.append(found)
     # Most channels start at its start; then, most are aligned to it.
     return max(fits, key=lambda fit: (fit.count(0), -fit.count(None)), default=[])
-
-
-def _agree(one: float, other: float) -> bool:
-    return abs(one / other - 1) <= constants.AGREEMENT
 
 
 def rate_of(interval: object) -> float | None:

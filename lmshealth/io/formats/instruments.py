@@ -13,7 +13,7 @@ import numpy as np
 
 from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Described, Format, check_size, choose
+from lmshealth.io.formats.content import Content, Described, Format, begins, check_size, choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 _RTX, _RTX_DATA, _RTX_END = b"HEADER::", b"Data:\r\n", b"EOF::"
@@ -80,9 +80,6 @@ def _records(path: Path, names: list[str]) -> Iterator[list[float]]:
         raise corrupt(f"the trace cannot be read: {error}") from error
 
 
-def _is_trace(head: bytes) -> bool:
-    return head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith((b"<?xml", b"<trace"))
-
-
-RTX = Format("Renishaw laser", (".rtx",), lambda head: head.startswith(_RTX), _load_rtx)
-TRACE = Format("SINUMERIK trace", (".xml",), _is_trace, _load_trace)
+RTX = Format("Renishaw laser", (".rtx",), begins(_RTX), _load_rtx)
+_XML = begins(b"<?xml", b"<trace", blanks=b"\xef\xbb\xbf \r\n\t")
+TRACE = Format("SINUMERIK trace", (".xml",), _XML, _load_trace)

@@ -32,6 +32,7 @@ from lmshealth.io.formats.content import (
     Described,
     Format,
     SinceFirst,
+    begins,
     check_memory,
     check_size,
     choose,
@@ -392,14 +393,6 @@ def _is_mat(head: bytes) -> bool:
     return version in _TEXT_OF or (version in _HDF5_INSIDE and head.startswith(b"MATLAB"))
 
 
-def _is_hdf5(head: bytes) -> bool:
-    return head.startswith(_HDF5)
-
-
-def _is_parquet(head: bytes) -> bool:
-    return head.startswith(_PARQUET)
-
-
-HDF5 = Format("HDF5", (".h5", ".hdf5"), _is_hdf5, _load_hdf5, "h5py")
-PARQUET = Format("Parquet", (".parquet",), _is_parquet, _load_parquet, "pyarrow.parquet")
+HDF5 = Format("HDF5", (".h5", ".hdf5"), begins(_HDF5), _load_hdf5, "h5py")
+PARQUET = Format("Parquet", (".parquet",), begins(_PARQUET), _load_parquet, "pyarrow.parquet")
 MAT = Format("MAT", (".mat",), _is_mat, _load_mat, "scipy.io")

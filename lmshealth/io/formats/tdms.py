@@ -23,6 +23,7 @@ from lmshealth.io.formats.content import (
     Described,
     Format,
     SinceFirst,
+    begins,
     check_memory,
     check_size,
     choose,
@@ -271,4 +272,4 @@ def _read(
     return read
 
 
-TDMS = Format("TDMS", (".tdms",), lambda head: head.startswith(_MAGIC), _load)
+TDMS = Format("TDMS", (".tdms",), begins(_MAGIC), _load)
