@@ -131,15 +131,14 @@ class Text:
                 found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
                 needed = "needed shorter rows, and a second quote to every quote"
                 raise Unusable("corrupt", f"{found} {self.position}; {needed}")
-        held = self._without_text(held, dialect)
+        if held := self._without_text(held, dialect):
+            yield held
         end = held[held.rfind(b"\n") + 1 :]
         # The last number of a file that ends inside a row may be incomplete.
         n_found = len(fields_of(end.decode(errors="replace"), dialect.delimiter))
         n_fields = len(dialect.channels)
         if end and not end.endswith(b"\r") and n_found < n_fields:
             raise corrupt(f"the last row is cut off: {n_found} of {n_fields} fields")
-        if held:
-            yield held
 
     def _without_text(self, block: bytes, dialect: Dialect) -> bytes:
         """Leave out the lines of text behind the last row."""

@@ -378,7 +378,7 @@ def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str
         return row * n
     while row and not row[-1]:
         row.pop()
-    return [*row, *[""] * (n - len(row))]
+    return row + [""] * (n - len(row))
 
 
 def _channels(
@@ -406,14 +406,12 @@ def _channels(
                 raise corrupt(f"its header has no interval of samples for the column {own.name!r}")
             channels.append(Described("time", time.unit, own.rate, start=own.start))
             continue
-        interval = _number(intervals[k])
+        interval, name = _number(intervals[k]), names[k] or str(k)
         rate = rate_of(interval and interval * SI_TIMES[layout.interval_unit])
         # One column of times places the samples of all channels.
         start = 0.0 if len(timed) == 1 else _number(offsets[k]) or 0.0
-        one = _described(names[k] or str(k), "", columns)
-        if layout.units:  # "[g]", "g (Acceleration)"
-            unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]
-            one = Described(names[k] or str(k), unit.strip())
+        unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]  # "[g]", "g (Acceleration)"
+        one = Described(name, unit.strip()) if layout.units else _described(name, "", columns)
         channels.append(replace(one, rate=rate, start=start))
     return tuple(reversed(channels))
 
