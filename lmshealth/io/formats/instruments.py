@@ -44,10 +44,8 @@ def _load_rtx(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     """Read the signals of a trace: records with a time and a value of each signal, or some."""
-    names: list[str] = []
-    spools: dict[str, Spool] = {}
-    records, n_rows = _records(path, names), 0
-    content = Content({}, {}, ())
+    names, spools, n_rows = list[str](), dict[str, Spool](), 0
+    records, content = _records(path, names), Content({}, {}, ())
     while rows := list(islice(records, _ROWS)):
         table = np.array(rows)
         table[np.abs(table) > _NO_VALUE] = np.nan
