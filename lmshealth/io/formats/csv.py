@@ -119,21 +119,21 @@ class Text:
         blocks = iter(partial(self.read, _BLOCK), b"")
         if dialect.segments:
             blocks = _without_headers(blocks, header, dialect, dialect.segments)
-        held = b""
+        held, n_quotes = bytearray(), 0
         for block in blocks:
             # A field in quotes may go on in the next block; the end of the rows is judged at once.
-            is_open = b'"' in held and held.count(b'"') % 2  # to count takes long
-            if held and len(block) >= _TRAILER and not is_open:
-                yield held
-                held = b""
+            if held and len(block) >= _TRAILER and not n_quotes % 2:
+                yield bytes(held)
+                held.clear()
             held += block
+            n_quotes += block.count(b'"') if b'"' in block else 0  # to count takes long
             if len(held) > constants.LONGEST_BLOCK:
                 found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
                 needed = "needed shorter rows, and a second quote to every quote"
                 raise Unusable("corrupt", f"{found} {self.position}; {needed}")
-        if held := self._without_text(held, dialect):
-            yield held
-        end = held[held.rfind(b"\n") + 1 :]
+        if rows := self._without_text(bytes(held), dialect):
+            yield rows
+        end = rows[rows.rfind(b"\n") + 1 :]
         # The last number of a file that ends inside a row may be incomplete.
         n_found = len(fields_of(end.decode(errors="replace"), dialect.delimiter))
         n_fields = len(dialect.channels)
