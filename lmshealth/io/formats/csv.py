@@ -119,19 +119,19 @@ class Text:
         blocks = iter(partial(self.read, _BLOCK), b"")
         if dialect.segments:
             blocks = _without_headers(blocks, header, dialect, dialect.segments)
-        held, n_quotes = bytearray(), 0
+        held, n_quotes = list[bytes](), 0
         for block in blocks:
             # A field in quotes may go on in the next block; the end of the rows is judged at once.
             if held and len(block) >= _TRAILER and not n_quotes % 2:
-                yield bytes(held)
+                yield b"".join(held)
                 held.clear()
-            held += block
+            held.append(block)
             n_quotes += block.count(b'"') if b'"' in block else 0  # to count takes long
-            if len(held) > constants.LONGEST_BLOCK:
+            if sum(map(len, held)) > constants.LONGEST_BLOCK:
                 found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
                 needed = "needed shorter rows, and a second quote to every quote"
                 raise Unusable("corrupt", f"{found} {self.position}; {needed}")
-        if rows := self._without_text(bytes(held), dialect):
+        if rows := self._without_text(b"".join(held), dialect):
             yield rows
         end = rows[rows.rfind(b"\n") + 1 :]
         # The last number of a file that ends inside a row may be incomplete.
