@@ -67,6 +67,11 @@ def runs(marked: BoolArray, at: int = 0) -> IntArray:
     return np.flatnonzero(edges).reshape(-1, 2) + at
 
 
+def count(ranges: IntArray) -> int:
+    """Return the number of samples in half-open ranges, ``(n_ranges, 2)``, that do not overlap."""
+    return int(np.sum(ranges[:, 1] - ranges[:, 0]))
+
+
 def smallest_step(values: FloatArray) -> float:
     """Return the smallest difference of two levels of samples ``(n,)``; 0 where there is none."""
     apart = np.diff(np.unique(values[np.isfinite(values)]))

@@ -11,17 +11,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, IntArray, pivots
-from lmshealth.io import constants
-from lmshealth.io.buffers import (
-    BLOCK,
-    NO_RANGES,
-    Samples,
-    Spool,
-    blocks,
-    places,
-    runs,
-    smallest_step,
-)
+from lmshealth.io import buffers, constants
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, count, places
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import too_many
 
@@ -43,10 +34,11 @@ class Prediction:
     filter: FloatArray  # a, ``(order + 1,)``
     variance: float  # of the prediction error
 
-    @property
-    def correlation(self) -> FloatArray:
-        """b_l for l from 0 to the order, shape ``(order + 1,)``."""
-        return np.asarray(np.correlate(self.filter, self.filter, "full")[_ORDER:])
+    def precision(self, places: IntArray) -> FloatArray:
+        """Return B of unknown samples at some places, ``(n, n)``."""
+        b = np.correlate(self.filter, self.filter, "full")[_ORDER:]
+        apart = np.minimum(np.abs(places[:, None] - places), _ORDER + 1)
+        return np.asarray(np.append(b, 0.0)[apart])
 
     def errors(self, x: FloatArray) -> FloatArray:
         """Return the prediction errors of samples ``(n,)`` from the order on, ``(n - order,)``."""
@@ -61,22 +53,20 @@ class Prediction:
         known[unknown] = 0.0
         # Σ_t a_{t-i} e_t, e the errors with zeros at the unknown samples.
         lack = np.correlate(np.convolve(known, self.filter, "valid"), self.filter, "valid")
-        apart = np.abs(unknown[:, None] - unknown)
-        b = np.append(self.correlation, 0.0)[np.minimum(apart, _ORDER + 1)]
-        return np.asarray(self.mean - np.linalg.solve(b, lack[unknown - _ORDER]))
+        change = np.linalg.solve(self.precision(unknown), lack[unknown - _ORDER])
+        return np.asarray(self.mean - change)
 
     def error_shares(self, lengths: Sequence[int], n_samples: int) -> FloatArray:
-        """Return the largest share of the power spectral density that errors of gaps have.
+        """Return the largest share of the power spectral density that errors of filled gaps have.
 
-        For filling all gaps of up to each of their ascending lengths, ``(n_gaps,)``.
+        Those of all gaps up to each one, by ascending lengths, ``(n_gaps,)``.
         """
         turn = np.exp(-2j * np.pi * np.linspace(0, _USABLE, _N_FREQUENCIES))
         inverse = np.abs(np.polynomial.polynomial.polyval(turn, self.filter)) ** 2
         each: dict[int, FloatArray] = {}
         for size in set(lengths):
             powers = turn[:, None] ** np.arange(size)
-            place = np.arange(size)
-            error = np.linalg.inv(self.correlation[np.abs(place[:, None] - place)])
+            error = np.linalg.inv(self.precision(np.arange(size)))
             each[size] = np.einsum("fi,ij,fj->f", powers.conj(), error, powers).real * inverse
         total = np.cumsum([each[size] for size in lengths], axis=0) / n_samples
         return np.asarray(total.max(axis=1))
@@ -93,18 +83,18 @@ def fit_prediction(values: Samples, bad: IntArray) -> Prediction | None:
     usable = [(x, ~within(bad, at, x.size)) for at, x in parts]
     n = sum(int(good.sum()) for _, good in usable)
     mean = float(sum(x[good].sum() for x, good in usable) / max(n, 1))
-    gram, rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
+    gram, n_rows = np.zeros((_ORDER + 1, _ORDER + 1)), 0
     for x, good in usable:
         whole = np.convolve(~good, np.ones(_ORDER + 1), "valid") < 0.5
         window = np.lib.stride_tricks.sliding_window_view(x - mean, _ORDER + 1)[whole]
         gram += window.T @ window
-        rows += len(window)
-    if rows <= constants.PREDICTION_SAMPLES:
+        n_rows += len(window)
+    if n_rows <= constants.PREDICTION_SAMPLES:
         return None
     # Columns from the oldest sample to the newest.
     phi = np.linalg.lstsq(gram[:-1, :-1], gram[:-1, -1], rcond=1e-13)[0]
     a = np.concatenate([[1.0], -phi[::-1]])
-    variance = float(a[::-1] @ gram @ a[::-1]) / rows
+    variance = float(a[::-1] @ gram @ a[::-1]) / n_rows
     return Prediction(mean, a, variance) if variance > 0 else None
 
 
@@ -118,12 +108,10 @@ def within(ranges: IntArray, at: int, size: int) -> BoolArray:
 
 
 def filled(values: Samples, missing: IntArray, breaks: IntArray) -> tuple[Samples, IntArray]:
-    """Replace short gaps of a channel by the expectation of their samples.
+    """Replace short gaps of a channel by the expectation of their samples (CHECKS.md, "Method").
 
     ``missing`` are ascending half-open ranges, ``(n_ranges, 2)``; time is interrupted before the
-    samples ``breaks``. Filled are gaps of up to `LONGEST_FILLED` samples, as far as their errors
-    have at most `FILLED_ERROR` of the power spectral density at any frequency, which lie in
-    ordinary surroundings. Return the samples and the ranges that remain missing.
+    samples ``breaks``. Return the samples and the ranges that remain missing.
     """
     size = missing[:, 1] - missing[:, 0]
     short = size <= constants.LONGEST_FILLED
@@ -185,22 +173,19 @@ def missing_ranges(values: Samples, added: IntArray = NO_RANGES) -> tuple[IntArr
     their counts as a text, empty if nothing is missing. `Unusable` (``missing-samples``) where they
     are so many that they would cut the other channels to pieces.
     """
-    found = [
-        runs(~(np.abs(block) < constants.LARGEST_MAGNITUDE), at) for at, block in blocks(values)
-    ]
+    most = constants.LARGEST_MAGNITUDE
+    found = [buffers.runs(~(np.abs(block) < most), at) for at, block in blocks(values)]
     bounds = np.concatenate(found, axis=None)
     # A range that ends at the edge of a block continues in the next.
     twice = np.flatnonzero(np.diff(bounds) == 0)
-    bounds = np.delete(bounds, np.concatenate([twice, twice + 1]))
-    ranges: IntArray = bounds.reshape(-1, 2)
+    ranges = np.delete(bounds, np.concatenate([twice, twice + 1])).reshape(-1, 2)
     if not ranges.size:
         return ranges, ""
-    n_missing, n_ranges = int(np.sum(ranges[:, 1] - ranges[:, 0])), len(ranges)
+    n_missing, n_ranges = count(ranges), len(ranges)
     note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_ranges} ranges"
     # Gaps of the time are common to all channels, and were counted there.
-    own = n_missing - int(np.sum(added[:, 1] - added[:, 0]))
     many = too_many(n_ranges - len(added), values.size)
-    if own > constants.LARGEST_MISSING * values.size or many:
+    if n_missing - count(added) > constants.LARGEST_MISSING * values.size or many:
         raise Unusable("missing-samples", note)
     return ranges, note
 
@@ -243,12 +228,11 @@ def check_signal(values: Samples) -> Roughness:
     if high - low < constants.SMALLEST_RANGE:
         found = f"all {values.size} samples are within {high - low:.3g} (SI)"
         raise Unusable("flat", f"{found}; check the sensor and its unit")
-    at_high = _stuck(values, low, high, 1.0)
-    at_low = _stuck(values, -high, -low, -1.0)
+    at_high, at_low = _stuck(values, low, high, 1.0), _stuck(values, -high, -low, -1.0)
     if at_high + at_low >= constants.CLIPPED_SHARE * values.size:
         found = f"{at_low} samples are at the minimum {low:.6g} and {at_high} at the maximum"
-        needed = "widen the range of the sensor"
-        raise Unusable("clipped", f"{found} {high:.6g} (SI) of {values.size}; {needed}")
+        found += f" {high:.6g} (SI) of {values.size}"
+        raise Unusable("clipped", f"{found}; widen the range of the sensor")
     return rough
 
 
@@ -274,7 +258,7 @@ def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[in
     With r = (x² + y² + z²)^½ - g the square of r is linear in r, x², y² and z², which have equal
     weights. Arguments as in `independent`, in one unit.
     """
-    found: dict[int, list[int]] = {}
+    found = dict[int, list[int]]()
     start, stop = max(ranges, key=lambda one: one[1] - one[0])
     if len(columns) < 3 or stop - start < constants.FEWEST_FOR_SHAPE:
         return found
@@ -287,7 +271,7 @@ def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[in
             own = weights[: len(rest)]
             axes = own > own.max() / 2
             if axes.sum() > 1 and own[axes].min() > 0.95 * own.max():
-                found[k] = [j for j, is_axis in zip(rest, axes, strict=True) if is_axis]
+                found[k] = np.array(rest)[axes].tolist()
     return found
 
 
@@ -316,10 +300,10 @@ def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
         n_at += int(np.count_nonzero(at))
         n_adjacent += int(np.count_nonzero(at[1:] & at[:-1]))
         below = max(below, float(np.max(sign * block, where=~at, initial=low)))
-    if n_at < max(constants.FEWEST_STUCK, constants.CLIPPED_SHARE / 2 * values.size):
-        return 0
     step = high - below
-    if n_adjacent < constants.ADJACENT_SHARE * n_at or high - low < constants.FEWEST_LEVELS * step:
+    few = n_at < max(constants.FEWEST_STUCK, constants.CLIPPED_SHARE / 2 * values.size)
+    few |= n_adjacent < constants.ADJACENT_SHARE * n_at
+    if few or high - low < constants.FEWEST_LEVELS * step:
         return 0
     floor = high - (constants.LEVELS_BELOW + 0.5) * step
     n_below = sum(int(np.count_nonzero(sign * b > floor)) for _, b in blocks(values)) - n_at
@@ -343,11 +327,10 @@ def level_step(values: Samples) -> float | None:
     """Return the step between the levels of a quantised channel; None where it has none."""
     some = values[:BLOCK]
     levels = np.unique(some[np.isfinite(some)])
-    apart = np.diff(levels)
-    apart = apart[apart > _ROUNDING * np.ptp(levels)] if levels.size > 1 else apart
-    if not apart.size:
+    if levels.size < 2:
         return None
-    off = levels - levels[0]
+    off, apart = levels - levels[0], np.diff(levels)
+    apart = apart[apart > _ROUNDING * off[-1]]
     for part in range(1, _MOST_SKIPPED + 1):
         step = float(apart.min()) / part
         reach = 16 * step
@@ -408,15 +391,12 @@ def _refuse_unknown(values: Samples, jumps: IntArray, model: Prediction, span: f
 
 
 def _beyond(values: Samples, order: int, limit: float) -> IntArray:
-    """Return the samples whose first or second difference exceeds a limit.
+    """Return the samples whose difference from the one before, or from both beside it, is larger.
 
-    The first is that from the sample before, the second that from both beside it.
+    These are of first and second order.
     """
-    found = [
-        np.flatnonzero(np.abs(np.diff(block, order)) > limit) + at + 1
-        for at, block in blocks(values, overlap=order)
-    ]
-    return np.unique(np.concatenate(found))
+    each = ((at, np.abs(np.diff(block, order))) for at, block in blocks(values, overlap=order))
+    return np.unique(np.concatenate([np.flatnonzero(size > limit) + at + 1 for at, size in each]))
 
 
 def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Samples, int]:
@@ -464,10 +444,9 @@ def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> N
     """
     near = (rough.high - rough.low) / 100
     x = _sample(values, constants.SHAPE_SAMPLES)
-    if x.size < constants.FEWEST_FOR_SHAPE:
+    if x.size < constants.FEWEST_FOR_SHAPE or not 0 < left < near:
         return
-    ends = min(np.mean(x < rough.low + near), np.mean(x > rough.high - near))
-    if 0 < left < near and ends > constants.WRAP_ENDS:
+    if min(np.mean(x < rough.low + near), np.mean(x > rough.high - near)) > constants.WRAP_ENDS:
         found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
         needed = "the counter overflows; record it with more bits, or faster"
         raise Unusable("wrapped", f"{found}: {needed}")
@@ -488,43 +467,30 @@ def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
     model = fit_prediction(values, bad)
     if model is None:
         return NO_RANGES
-    least = constants.SPIKE_LEVELS * smallest_step(values[:BLOCK])
-    found: list[_Spike] = []
-    doubtful: list[_Spike] = []
-    others, last = 0, -_BLOW
+    least = constants.SPIKE_LEVELS * buffers.smallest_step(values[:BLOCK])
+    found, others, last = [], 0, -_BLOW
     for place in np.split(suspects, np.flatnonzero(np.diff(suspects) > 3) + 1):
-        one = _spike(values, missing, model, place, least)
-        if one is not None:
-            (found if one.clear else doubtful).append(one)
+        if (one := _spike(values, missing, model, place, least)) is not None:
+            found.append(one)
         elif place[0] - last > _BLOW:
             others, last = others + 1, int(place[0])
     # In white noise nothing goes on after a blow: there only outliers that stand alone are spikes.
-    if not others and all(one.size > constants.SPIKE_ALONE for one in doubtful):
-        found += doubtful
-    energy = sum(one.energy for one in found)
-    few = len(found) < constants.SPIKE_SHARE * others
-    if few or energy < constants.SPIKE_ENERGY * values.size:
+    if others or any(gain <= constants.SPIKE_ALONE**2 for *_, gain, clear in found if not clear):
+        found = [one for one in found if one[-1]]
+    energy = sum(gain for *_, gain, _ in found)
+    # Noise of heavy tails has a few that stand alone among many that do not.
+    if len(found) < others or energy < constants.SPIKE_ENERGY * values.size:
         return NO_RANGES
-    ranges = np.array([one.samples for one in found], dtype=np.int64)
-    return ranges[np.argsort(ranges[:, 0])]
-
-
-class _Spike(NamedTuple):
-    """Half-open range, size in standard deviations of its expectation, energy over the variance.
-
-    ``clear`` if what a blow would leave is not there.
-    """
-
-    samples: tuple[int, int]
-    size: float
-    energy: float
-    clear: bool
+    return np.array([one[:2] for one in found], dtype=np.int64)
 
 
 def _spike(
     values: Samples, missing: IntArray, model: Prediction, suspects: IntArray, least: float
-) -> _Spike | None:
-    """Judge one place: a spike of more than the least size, or None."""
+) -> tuple[int, int, float, bool] | None:
+    """Return a spike of more than the least size: its half-open range and energy over the variance.
+
+    The last is whether what a blow would leave is not there.
+    """
     first, last = int(suspects[0]) - 2 * _ORDER, int(suspects[-1]) + 2 * _ORDER + 1
     if suspects[-1] - suspects[0] > 3 or first < 0 or last > values.size:
         return None
@@ -537,21 +503,20 @@ def _spike(
     for n in (1, 2):
         tried = []
         for k in range(int(suspects[0]) + 1 - n, int(suspects[-1]) + 1):
-            own = np.arange(k, k + n) - first
-            y = x.copy()
+            own, y = np.arange(k, k + n) - first, x.copy()
             unknown = np.union1d(own, gone)
             y[unknown] = model.expected(y, unknown)
-            tried.append((float((model.errors(y) ** 2).sum()) / model.variance, own, y))
-        after, own, y = min(tried, key=lambda one: one[0])
-        rest = model.errors(y) ** 2 / model.variance
+            rest = model.errors(y) ** 2 / model.variance
+            tried.append((float(rest.sum()), float(rest.max()), own, y))
+        after, largest, own, y = min(tried, key=lambda one: one[0])
         gain = float(errors.sum()) - after
-        if rest.max() < constants.ORDINARY**2 and gain > constants.SPIKE**2:
+        if largest < constants.ORDINARY**2 and gain > constants.SPIKE**2:
             if np.abs(x[own] - y[own]).min() <= least:
                 return None
             # What as many innovations, such as those of a blow, would leave.
             blow = float(np.sort(errors)[:-n].sum())
-            span = int(own[0]) + first, int(own[-1]) + first + 1
-            return _Spike(span, gain**0.5, gain, after < constants.CLEARLY * blow)
+            start, stop = int(own[0]) + first, int(own[-1]) + first + 1
+            return start, stop, gain, after < constants.CLEARLY * blow
     return None
 
 
@@ -591,12 +556,10 @@ def check_sign(values: Samples, rough: Roughness) -> None:
 
 def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:
     """Return whether a channel comes near its edge throughout; a drift is there for a while."""
-    n = constants.LEVEL_SAMPLES // 8
-    for at in places(values.size, n):
-        x = values[at : at + n] if is_lower else -values[at : at + n]
-        if np.isfinite(x).any() and np.nanmin(x) - low > (middle - low) / 2:
-            return False
-    return True
+    n, sign = constants.LEVEL_SAMPLES // 8, 1 if is_lower else -1
+    parts = (sign * values[at : at + n] for at in places(values.size, n))
+    nearest = (np.nanmin(x) for x in parts if np.isfinite(x).any())
+    return all(least - low <= (middle - low) / 2 for least in nearest)
 
 
 def coarse_levels(values: Samples) -> str:

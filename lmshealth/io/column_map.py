@@ -26,27 +26,17 @@ Role = Literal[
     "displacement", "acceleration", "current", "reference_velocity", "reference_position", "time"
 ]
 
-_UNITS: dict[str, tuple[str, float]] = {
-    "m": ("length", 1.0),
-    "mm": ("length", 1e-3),
-    "um": ("length", 1e-6),
-    "nm": ("length", 1e-9),
-    "m_s": ("velocity", 1.0),
-    "mm_s": ("velocity", 1e-3),
-    "m_s2": ("acceleration", 1.0),
-    "mm_s2": ("acceleration", 1e-3),
-    "g": ("acceleration", 9.80665),
-    "a": ("current", 1.0),
-    "ma": ("current", 1e-3),
-    "s": ("time", 1.0),
-    "ms": ("time", 1e-3),
-    "us": ("time", 1e-6),
-    "ns": ("time", 1e-9),
-}
-SI_TIMES = {unit: factor for unit, (dimension, factor) in _UNITS.items() if dimension == "time"}
+SI_TIMES = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _TIMES = ("time", *(f"time_{unit}" for unit in SI_TIMES))
+_FACTORS = {
+    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "nm": 1e-9},
+    "velocity": {"m_s": 1.0, "mm_s": 1e-3},
+    "acceleration": {"m_s2": 1.0, "mm_s2": 1e-3, "g": 9.80665},
+    "current": {"a": 1.0, "ma": 1e-3},
+    "time": SI_TIMES,
+}
 # `_m_s2` must be tried before `_s`, or an acceleration would be read as a time.
-_LONGEST_FIRST = sorted(_UNITS, key=len, reverse=True)
+_LONGEST_FIRST = sorted((unit for own in _FACTORS.values() for unit in own), key=len, reverse=True)
 # "Â" is left of a superscript or a micro sign that some exporter encoded twice.
 _SPELLINGS = str.maketrans(
     {"/": "_", "^": None, "*": None, "µ": "u", "μ": "u", "²": "2", " ": None, "Â": None}
@@ -99,8 +89,8 @@ def unit_key(text: str, dimension: str | None = None) -> str | None:
     """Return a unit as the contract writes it (``m/s²`` is ``m_s2``); None for any other unit."""
     word = text.strip().translate(_SPELLINGS)
     word = _ALIASES.get(word, word)
-    known = word in _UNITS and dimension in (None, _UNITS[word][0])
-    return word if known else None
+    kinds = [dimension] if dimension else [*_FACTORS]
+    return word if any(word in _FACTORS[kind] for kind in kinds) else None
 
 
 def parse_column(column: str, unit: str | float | None = None) -> Signal:
@@ -116,38 +106,29 @@ def parse_column(column: str, unit: str | float | None = None) -> Signal:
     if not column.isprintable() or len(column) > constants.LONGEST_NAME:
         needed = f"printable text of at most {constants.LONGEST_NAME} characters"
         raise Unusable("columns", f"a column is called {column[:80]!r}, needed {needed}")
-    suffix = next((word for word in _LONGEST_FIRST if column.endswith("_" + word)), None)
+    suffix = next((word for word in _LONGEST_FIRST if column.endswith("_" + word)), "")
     name = column.removesuffix(f"_{suffix}")
-    fits = suffix is not None and _UNITS[suffix][0] == _DIMENSIONS[role]
-    if unit is None and suffix is not None and fits:
-        return Signal(name, role, _UNITS[suffix][1])
+    factors = _FACTORS[_DIMENSIONS[role]]
+    choices = ", ".join(f"_{word}" for word in factors)
     if unit is None:
-        found = "no known unit" if suffix is None else f"the unit {suffix}"
-        needed = f"needed one of {_choices(role)} as suffix"
-        raise Unusable("unit", f"column {column!r} carries {found}; {needed}")
-    if fits:
+        if suffix not in factors:
+            found = f"the unit {suffix}" if suffix else "no known unit"
+            needed = f"needed one of {choices} as suffix"
+            raise Unusable("unit", f"column {column!r} carries {found}; {needed}")
+        return Signal(name, role, factors[suffix])
+    if suffix in factors:
         found = f"column {column!r} carries the unit {suffix} and is given {unit!r} as well"
         raise Unusable("unit", f"{found}; name it {name!r} to read it by the latter")
-    return Signal(column, role, _factor(column, role, unit))
-
-
-def _factor(column: str, role: Role, unit: str | float) -> float:
-    """Return the SI value of one in the unit that a column map gives."""
     if isinstance(unit, str):
-        key = unit_key(unit, _DIMENSIONS[role])
-        if key is None:
-            detail = f"column {column!r} is given the unit {unit!r}; needed {_choices(role)}"
+        if (key := unit_key(unit) or "") not in factors:
+            detail = f"column {column!r} is given the unit {unit!r}; needed {choices}"
             raise Unusable("unit", detail)
-        return _UNITS[key][1]
+        return Signal(column, role, factors[key])
     least, most = constants.SCALES
     if not least <= abs(unit) <= most:
         needed = f"a number of magnitude {least:g} to {most:g}"
         raise Unusable("unit", f"column {column!r} is given the scale {unit:g}; needed {needed}")
-    return float(unit)
-
-
-def _choices(role: Role) -> str:
-    return ", ".join(f"_{unit}" for unit, (what, _) in _UNITS.items() if what == _DIMENSIONS[role])
+    return Signal(column, role, float(unit))
 
 
 class CsvLayout(Struct, frozen=True, forbid_unknown_fields=True):
@@ -250,14 +231,13 @@ class Layout(Struct, frozen=True, forbid_unknown_fields=True):
 
     def __post_init__(self) -> None:
         """Check what the types do not state; the error lists every fault."""
-        given = asdict(self)
+        keys = ("recognise", "rows_after", "delimiter", "decimal", "names", "units", "interval")
+        given = {key: getattr(self, key) for key in (*keys, "offset")}
         given |= {f"metadata.{key}": pattern for key, pattern in self.metadata.items()}
         given["start.find"] = self.start and self.start.find
-        given = {key: [value] if isinstance(value, str) else value for key, value in given.items()}
-        plain_keys = ("name", "required")
-        faults = [f"{key}: {fault}" for key, value in given.items()
-                  if isinstance(value, list) and key not in plain_keys
-                  for pattern in value if (fault := _fault(pattern))]  # fmt: skip
+        each = [(key, one) for key, own in given.items()
+                for one in (own if isinstance(own, list) else [own or ""])]  # fmt: skip
+        faults = [f"{key}: {fault}" for key, pattern in each if (fault := _fault(pattern))]
         if not faults:
             marks = {"delimiter": self.delimiter, "decimal": self.decimal or "."}
             faults = [f"{key}: got {mark!r}, needed one character, or a group () around it"
@@ -380,10 +360,8 @@ def _checked(read: Callable[[], _MapFile], name: str) -> ColumnMap:
     try:
         columns = ColumnMap(**asdict(read()))
         _check(columns)
-    except (OSError, ValidationError, ValueError) as error:
-        raise BadTable(f"{name}: {error}") from error
-    except Unusable as error:
-        raise BadTable(f"{name}: {error.detail}") from error
+    except (OSError, ValidationError, ValueError, Unusable) as error:
+        raise BadTable(f"{name}: {getattr(error, 'detail', error)}") from error
     return columns
 
 
@@ -409,17 +387,15 @@ def load_layouts(folder: str | Path) -> tuple[Layout, ...]:
 def _check(columns: ColumnMap) -> None:
     """Check names, units and metadata keys before any log is read."""
     names = [name for name in columns.columns if not RESPONSE_COLUMN.fullmatch(name)]
-    signals = [columns.signal(name).name for name in names]
-    if twice := repeated(signals):
+    if twice := repeated(columns.signal(name).name for name in names):
         raise ValueError(f"[columns] names one signal twice: {listed(twice)}")
     if twice := repeated(columns.columns.values()):
         raise ValueError(f"[columns] reads one column twice: {listed(twice)}")
     for target in columns.units:
         columns.signal(target)
     if unknown := sorted(set(columns.metadata) - set(metadata_keys())):
-        raise ValueError(
-            f"[metadata] has {listed(unknown)}; known keys are {listed(metadata_keys())}"
-        )
+        known = listed(metadata_keys())
+        raise ValueError(f"[metadata] has {listed(unknown)}; known keys are {known}")
     if columns.sample_rate_hz is not None and "sample_rate_hz" in columns.metadata:
         raise ValueError("sample_rate_hz is given twice, at the top and in [metadata]")
     for key, value in columns.metadata.items():

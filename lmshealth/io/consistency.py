@@ -11,7 +11,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, runs
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, count, runs
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import resolution, too_many
 
@@ -83,21 +83,17 @@ def compare(
     """
     size = measured[0].size
     copies = _union(_repeats(measured), _held(measured))
-    n_lost = int(np.sum(copies[:, 1] - copies[:, 0]))
     notes: list[tuple[str, str, str]] = []
-    if n_lost:
+    if n_lost := count(copies):
         found = f"{n_lost} samples repeat earlier ones in all channels, in {len(copies)} ranges"
         if n_lost > constants.LARGEST_MISSING * size or too_many(len(copies), size):
             raise Unusable("repeated", f"{found}; export the record again, each buffer once")
         notes.append(("repeated", "time_s", f"{found}: left out"))
     dropped = _NONE
     if position is not None:
-        own = _displacements(position, velocity, sample_rate)
-        if own.step > 0:
-            dropped, notes_of_rate = _moved(position, velocity, nominal, own, sample_rate)
-            known = np.concatenate([breaks, copies.ravel()])
-            dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
-            notes += [*notes_of_rate, *_dropped_notes(dropped, own)]
+        known = np.concatenate([breaks, copies.ravel()])
+        dropped, found_there = _moved(position, velocity, nominal, sample_rate, known)
+        notes += found_there
     return Findings(dropped, copies, tuple(notes))
 
 
@@ -105,27 +101,30 @@ def _moved(
     position: Samples,
     velocity: Samples | None,
     nominal: float | None,
-    own: _Blocks,
     rate: float,
+    known: IntArray,
 ) -> tuple[IntArray, list[tuple[str, str, str]]]:
-    """Compare a set position with itself, and the sample rate with it; return jumps and notes."""
+    """Compare a set position with itself, and the rate with it; return unknown jumps, and notes."""
+    notes: list[tuple[str, str, str]] = []
+    own = _displacements(position, velocity, rate)
+    if own.step <= 0:
+        return _NONE, notes
     fine = own.usual >= constants.FINE_STEPS * own.step
     dropped = _isolated(position, own) if fine else _NONE
     if velocity is not None:
         dropped, fit = _without_beat(own, dropped)
-        notes = [] if fit is None else _rate_notes(own, velocity, rate, fit)
-        return dropped if fine else _jumps(position, own), [*notes]
-    return dropped, [*_speed_notes(own, abs(nominal), rate)] if nominal else []
-
-
-def _dropped_notes(dropped: IntArray, own: _Blocks) -> Iterator[tuple[str, str, str]]:
-    """Count the jumps of a set position; too many are refused."""
+        notes += [] if fit is None else _rate_notes(own, velocity, rate, fit)
+        dropped = dropped if fine else _jumps(position, own)
+    elif nominal:
+        notes += _speed_notes(own, abs(nominal), rate)
+    dropped = dropped[(np.abs(dropped[:, None] - known) > 1).all(axis=1)]
     if dropped.size:
         found = f"the set position jumps {dropped.size} times: samples were dropped there"
         # At rest they are not seen.
         if too_many(dropped.size, _LENGTH * int(np.count_nonzero(own.way))):
             raise Unusable("dropped", f"{found}; {_NEEDED}")
-        yield "dropped", "reference_position", f"{found}, the record is cut"
+        notes.append(("dropped", "reference_position", f"{found}, the record is cut"))
+    return dropped, notes
 
 
 def _displacements(position: Samples, velocity: Samples | None, rate: float) -> _Blocks:
@@ -154,8 +153,7 @@ def _steps_of(position: Samples, way: FloatArray) -> tuple[float, float]:
     size = np.nan_to_num(np.abs(way))
     if not size.any():
         return 0.0, 0.0
-    moving = size > constants.MOVING * np.quantile(size[size > 0], 0.9)
-    motions = runs(moving)
+    motions = runs(size > constants.MOVING * np.quantile(size[size > 0], 0.9))
     start, stop = motions[np.argmax(motions[:, 1] - motions[:, 0])] * _LENGTH
     middle = max(start, (start + stop - _STRETCH) // 2)
     stretch = position[middle : min(stop, middle + _STRETCH) + 1]
@@ -216,11 +214,9 @@ def _jumps(position: Samples, own: _Blocks) -> IntArray:
     usual_error = 3 * np.quantile(np.abs(excess[steady]), 0.9) if steady.any() else 0.0
     explained = np.maximum(1.02 * own.step + 0.1 * increment, usual_error)
     odd = excess > np.maximum(np.where(exact, 0.0, explained), 0.6 * increment)
-    found = []
-    for start in np.flatnonzero(odd & steady) * _LENGTH:
-        place = position[start : start + _LENGTH + 1]
-        found.append(start + 1 + int(np.argmax(np.abs(np.diff(place)))))
-    return np.array(found, dtype=np.int64)
+    starts = np.flatnonzero(odd & steady) * _LENGTH
+    ways = [np.abs(np.diff(position[k : k + _LENGTH + 1])) for k in starts.tolist()]
+    return starts + 1 + np.array([int(np.argmax(one)) for one in ways], dtype=np.int64)
 
 
 def _without_beat(own: _Blocks, dropped: IntArray) -> tuple[IntArray, tuple[float, float] | None]:
@@ -245,10 +241,8 @@ def _rate_notes(
     """Compare the sample rate with that at which the position moves by the velocity."""
     slope, std = fit
     off, allowed = abs(slope - 1), 5 * std + _rounding(velocity, own.expected)
-    found = (
-        f"the sample rate is {rate:.8g} Hz, but the set position moves by the set velocity at "
-        f"{rate / slope:.6g} Hz"
-    )
+    found = f"the sample rate is {rate:.8g} Hz, but the set position moves by the set velocity at"
+    found += f" {rate / slope:.6g} Hz"
     if off > constants.RATE_REFUSED + allowed:
         needed = "correct the rate or a unit, or map only one of the two columns"
         raise Unusable("rate", f"{found}; {needed}")
@@ -299,9 +293,8 @@ def _fit(way: FloatArray, expected: FloatArray, step: float) -> tuple[float, flo
     A velocity that a filter delays is off by a multiple of its change.
     """
     there = np.isfinite(way + expected) & (expected > 0)
-    if there.sum() < _FEWEST:
-        return None
-    there &= expected > constants.MOVING * np.quantile(expected[there], 0.9)
+    usual = np.quantile(expected[there], 0.9) if there.any() else 0.0
+    there &= expected > constants.MOVING * usual
     if there.sum() < _FEWEST:
         return None
     change = np.nan_to_num(np.gradient(expected)[there])
@@ -346,7 +339,7 @@ def _held(measured: Sequence[Samples]) -> IntArray:
             same[at + 1 : stop] = equal & _equal(measured[1:], at + 1, stop, 1)
     held = runs(same)
     long = np.diff(held, axis=1)[:, 0] >= least
-    n_held, n_same = int(np.diff(held[long]).sum()), int(same.sum())
+    n_held, n_same = count(held[long]), int(same.sum())
     chance = max(n_same - n_held, 1) / max(size - n_held, 1)
     if n_held > size / 2 or -np.log(chance) * least < constants.CHANCE:
         return NO_RANGES
@@ -376,7 +369,7 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
     values = measured[int(np.argmax(levels))]
     size = values.size
     found: list[tuple[int, int]] = []
-    end, periodic = 0, 0
+    end = n_periodic = 0
     for at, lag in _alike(values):
         if at < end:
             continue
@@ -384,11 +377,11 @@ def _repeats(measured: Sequence[Samples]) -> IntArray:
         if stop - start >= constants.SHORTEST_REPEAT and not _by_chance(measured, start, stop, lag):
             found.append((max(start, end), stop))
             end = stop
-            periodic += stop - start if stop - start >= 3 * lag else 0
+            n_periodic += stop - start if stop - start >= 3 * lag else 0
         if too_many(len(found), size):
             break
     # A signal that was computed may be periodic.
-    return np.array([] if periodic > size / 2 else found, dtype=np.int64).reshape(-1, 2)
+    return np.array([] if n_periodic > size / 2 else found, dtype=np.int64).reshape(-1, 2)
 
 
 def _alike(values: Samples) -> Iterator[tuple[int, int]]:
@@ -406,8 +399,7 @@ def _alike(values: Samples) -> Iterator[tuple[int, int]]:
     order = np.argsort(key, kind="stable")
     same = np.flatnonzero(np.diff(key[order]) == 0)
     first, second = place[order[same]], place[order[same + 1]]
-    for k in np.argsort(second):
-        yield int(second[k]), int(second[k] - first[k])
+    yield from sorted(zip(second.tolist(), (second - first).tolist(), strict=True))
 
 
 def _extent(measured: Sequence[Samples], at: int, lag: int) -> tuple[int, int]:
@@ -415,8 +407,7 @@ def _extent(measured: Sequence[Samples], at: int, lag: int) -> tuple[int, int]:
     size, reach = measured[0].size, 64
     while True:
         low, high = max(lag, at - reach), min(size, at + reach)
-        same = _equal(measured, low, high, lag)
-        differ = low + np.flatnonzero(~same)
+        differ = low + np.flatnonzero(~_equal(measured, low, high, lag))
         start = int(differ[differ <= at].max(initial=low - 1)) + 1
         stop = int(differ[differ >= at].min(initial=high))
         if (start > low or low == lag) and (stop < high or high == size):
@@ -426,10 +417,8 @@ def _extent(measured: Sequence[Samples], at: int, lag: int) -> tuple[int, int]:
 
 def _equal(measured: Sequence[Samples], start: int, stop: int, lag: int) -> np.ndarray:
     """Return which samples of a range equal those a lag before in all channels, ``(n,)``."""
-    same = np.ones(stop - start, dtype=bool)
-    for one in measured:
-        same &= one[start:stop] == one[start - lag : stop - lag]
-    return same
+    each = [one[start:stop] == one[start - lag : stop - lag] for one in measured]
+    return np.asarray(np.all(each, axis=0))
 
 
 def _by_chance(measured: Sequence[Samples], start: int, stop: int, lag: int) -> bool:
@@ -439,8 +428,7 @@ def _by_chance(measured: Sequence[Samples], start: int, stop: int, lag: int) -> 
     equal those a lag before, too.
     """
     n, size = stop - start, measured[0].size
-    shares = [_equal(measured, start + k, stop, k).mean() for k in _LAGS if k < n]
-    beside = (max(lag, start - n), start), (stop, min(size, stop + n))
-    shares += [_equal(measured, low, high, lag).mean() for low, high in beside if low < high]
-    share = max(shares)
+    tried = [(start + k, stop, k) for k in _LAGS if k < n]
+    tried += [(max(lag, start - n), start, lag), (stop, min(size, stop + n), lag)]
+    share = max(_equal(measured, *one).mean() for one in tried if one[0] < one[1])
     return bool(share > 0 and n * -np.log(share) < constants.CHANCE)

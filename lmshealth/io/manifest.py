@@ -132,16 +132,14 @@ def to_numbers(path: Path, table: "pd.DataFrame", names: Iterable[str]) -> None:
     for name in [name for name in names if name in table.columns]:
         text = table[name]
         given = text.str.strip() != ""
-        numbers = pd.to_numeric(table[name], errors="coerce")
+        numbers = pd.to_numeric(text, errors="coerce")
         if numbers.dtype == float:  # before 3.1 pandas rounds their last digits
             known = np.isfinite(numbers)
-            numbers[known] = table[name][known].astype(float)
+            numbers[known] = text[known].astype(float)
         table[name] = numbers
-        for wrong, needed in (
-            (~np.isfinite(numbers), "a finite number"),
-            (~numbers.between(*low_high(name)), possible(name)),
-        ):
-            if (wrong := wrong & given).any():
+        unknown, odd = given & ~np.isfinite(numbers), given & ~numbers.between(*low_high(name))
+        for wrong, needed in ((unknown, "a finite number"), (odd, possible(name))):
+            if wrong.any():
                 what = f"{name} is {text[wrong].iloc[0][:80]!a}, needed {needed}"
                 raise BadTable(f"{path}, {lines(table, wrong)}: {what}")
 
@@ -156,12 +154,11 @@ def to_moments(path: Path, table: "pd.DataFrame", latest: datetime | None = None
     moments = []
     for index, text in zip(table.index, table["recorded_at"], strict=True):
         try:
-            moment = parse_moment({"recorded_at": text}, latest)
+            moments.append(parse_moment({"recorded_at": text}, latest))
         except Unusable as error:
             raise BadTable(f"{path}, line {int(index) + 2}: {error.detail}") from error
-        if moment is None:
+        if moments[-1] is None:
             raise BadTable(f"{path}, line {int(index) + 2}: recorded_at is empty")
-        moments.append(moment)
     # Of another type pandas would make Timestamps of them.
     table["recorded_at"] = pd.Series(moments, table.index, dtype=object)
 
@@ -234,11 +231,10 @@ def find_logs(
             return True
         if path.name.endswith(constants.BACKUPS) or _trouble(path, root, follow_links=follow_links):
             return False
-        if not holds_samples(path):
-            return False
-        if format_of(path) is None:
+        has_samples, is_read = holds_samples(path), format_of(path) is not None
+        if has_samples and not is_read:
             skipped.append(path)
-        return format_of(path) is not None
+        return has_samples and is_read
 
     found = _find(root, fits, follow_links=follow_links)
     named = {refusal.log for refusal in found.refused} | {name_of(one, root) for one in found.logs}
@@ -280,8 +276,7 @@ def read_manifest_beside(log: str | Path) -> Manifest:
 
 def _merged(root: Path, found: FileList, *, follow_links: bool = False) -> Manifest:
     """Read manifests of a folder, the nearest to the logs last."""
-    manifest = Manifest({}, (), {})
-    refused = list(found.refused)
+    manifest, refused = Manifest({}, (), {}), list(found.refused)
     for path in sorted(found.logs, key=lambda path: (len(path.parts), path)):
         try:
             refused += _add(manifest, path, root, follow_links=follow_links)

@@ -12,35 +12,17 @@ import numpy as np
 
 from lmshealth._private.arrays import IntArray
 from lmshealth.errors import BadLog
+from lmshealth.io import channel_checks as checks
 from lmshealth.io import constants
-from lmshealth.io.buffers import Samples, in_unit
-from lmshealth.io.channel_checks import (
-    check_sign,
-    check_signal,
-    coarse_levels,
-    filled,
-    independent,
-    magnitudes,
-    missing_ranges,
-    roughness,
-    spikes,
-    unwrapped,
-)
+from lmshealth.io import time_axis as timing
+from lmshealth.io.buffers import Samples, count, in_unit
 from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
-from lmshealth.io.consistency import Findings, compare
+from lmshealth.io.consistency import compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, parse_metadata
 from lmshealth.io.refusal import Unusable, listed, nearest, repeated, shown, visible
-from lmshealth.io.time_axis import (
-    Ranges,
-    TimeAxis,
-    pieces,
-    resampled,
-    set_velocity,
-    time_axis,
-    with_dropped,
-)
+from lmshealth.io.time_axis import Ranges, TimeAxis
 
 _NEEDED = "needed delta_e_um or acc_<name>_m_s2 (or another unit of the contract)"
 _MEASURED: tuple[Role, ...] = ("displacement", "acceleration", "current")
@@ -173,42 +155,47 @@ def _to_log(
     """Apply the log contract to the content of a file, with its metadata and sample rate."""
     metadata, rate = parsed
     series = _series(content, layout)
-    stamps = [item.values for item in series if item.signal.role == "time"]
-    axis, added = time_axis(stamps[0] if stamps else None, rate).completed()
+    stamps = next((one.values for one in series if one.signal.role == "time"), None)
+    axis, added = timing.time_axis(stamps, rate).completed()
     # Missing samples are inserted where time lacks them, and those of a set point are interpolated.
     series = [
-        _Series(signal, with_dropped(values, added, linear=signal.role in _REFERENCES))
+        _Series(signal, timing.with_dropped(values, added, linear=signal.role in _REFERENCES))
         for signal, values in series
     ]
     refused = [*content.refused, *_listed("time_s", {"gaps": axis.note})]
-    missing: list[IntArray] = [axis.lost]
-    channels = []
-    for item in series:
-        if item.signal.role in _MEASURED:
-            read = _measured(item, axis, added, refused)
-            if read is not None:
-                missing.append(read[1])
-                kind = cast(ChannelKind, item.signal.role)
-                channels.append(Channel(item.signal.name, kind, read[0]))
+    missing, channels = [axis.lost], list[Channel]()
+    for signal, values in series:
+        if signal.role in _MEASURED and (read := _measured(signal, values, axis, added, refused)):
+            channels.append(Channel(signal.name, cast(ChannelKind, signal.role), read[0]))
+            missing.append(read[1])
     if not any(channel.kind in _DYNAMIC for channel in channels):
         raise Unusable("no-signal", f"no usable channel is left: {_why(refused)}")
-    references = [item for role in _REFERENCES for item in series if item.signal.role == role]
-    gone = _missing(references[0], refused) if references else None
-    if gone is not None:
-        missing.append(gone)
-    found = _compared(series, channels, metadata.velocity, axis)
+    references = [one for role in _REFERENCES for one in series if one.signal.role == role]
+    reference = references[0] if references else None
+    gone = _missing(*reference, refused) if reference else None
+    missing += [] if gone is None else [gone]
+    # A set point over a rate that varies is no witness of one rate.
+    witness = {} if axis.clocks else {one.signal.role: one.values for one in references}
+    found = compare(
+        witness.get("reference_position"),
+        witness.get("reference_velocity"),
+        metadata.velocity,
+        [channel.values for channel in channels],
+        axis.sample_rate,
+        axis.breaks,
+    )
     for why, channel, note in found.notes:
         refused += _listed(channel, {why: note})
     breaks = np.union1d(axis.breaks, found.dropped)
-    ranges = pieces(channels[0].values.size, [*missing, found.repeated], breaks)
+    ranges = timing.pieces(channels[0].values.size, [*missing, found.repeated], breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     channels = _without_copies(channels, ranges, refused)
-    velocity = None if gone is None else references[0].values
+    velocity = reference.values if reference and gone is not None else None
     if axis.clocks:
         channels, velocity, ranges = _at_one_rate(channels, velocity, ranges, axis)
-    if velocity is not None and references[0].signal.role == "reference_position":
-        velocity = set_velocity(velocity, ranges, axis.sample_rate)
+    if reference and velocity is not None and reference.signal.role == "reference_position":
+        velocity = timing.set_velocity(velocity, ranges, axis.sample_rate)
     return Log(
         name=name,
         digest=digest,
@@ -222,17 +209,6 @@ def _to_log(
     )
 
 
-def _compared(
-    series: Sequence[_Series], channels: Sequence[Channel], nominal: float | None, axis: TimeAxis
-) -> Findings:
-    """Compare what a log states more than once about its samples and their rate."""
-    own = {item.signal.role: item.values for item in series}
-    # A set point over a rate that varies is no witness of one rate.
-    velocity, position = (None if axis.clocks else own.get(role) for role in _REFERENCES)
-    values = [channel.values for channel in channels]
-    return compare(position, velocity, nominal, values, axis.sample_rate, axis.breaks)
-
-
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:
     """Name the columns, convert them to SI and compare their lengths."""
     there = f"there: {listed(content.present)}"
@@ -242,10 +218,10 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
         near = nearest(absent, content.present)
         raise Unusable("columns", f"the column map needs {listed(absent)}; there: {near}{hint}")
     series = []
-    begin = max((content.late.get(source, 0) for source in content.columns), default=0)
-    stops = (content.late.get(name, 0) + own.size for name, own in content.columns.items())
-    end = min(stops, default=0)
-    for source in tuple(content.columns):
+    starts = {source: content.late.get(source, 0) for source in content.columns}
+    begin = max(starts.values(), default=0)
+    end = min((first + content.columns[source].size for source, first in starts.items()), default=0)
+    for source, first in starts.items():
         # Taken out: a log of hundreds of channels is in memory once.
         values = content.columns.pop(source)
         target = columns.target(source)
@@ -257,7 +233,6 @@ def _series(content: Content, columns: ColumnMap) -> list[_Series]:
             raise Unusable(error.reason, f"{error.detail}; {there}") from error
         limit = np.inf if signal.role == "time" else constants.LARGEST_MAGNITUDE
         # Channels that start later than others are used where all have samples.
-        first = content.late.get(source, 0)
         common = (begin - first, max(end - first, begin - first)) if content.late else None
         series.append(_Series(signal, in_unit(values, signal.factor, limit, common)))
     if twice := repeated(item.signal.name for item in series):
@@ -285,50 +260,49 @@ def _check_signals(
         raise Unusable("columns", f"no signal: {_NEEDED}; {there}{step}")
 
 
-def _missing(item: _Series, refused: list[Refusal]) -> IntArray | None:
+def _missing(signal: Signal, values: Samples, refused: list[Refusal]) -> IntArray | None:
     """Find the missing samples of a set point; None if it cannot be used, which is refused."""
     try:
-        gone, note = missing_ranges(item.values)
+        gone, note = checks.missing_ranges(values)
     except Unusable as error:
-        refused += _listed(item.signal.name, {error.reason: error.detail})
+        refused += _listed(signal.name, {error.reason: error.detail})
         return None
-    refused += _listed(item.signal.name, {"gaps": note})
+    refused += _listed(signal.name, {"gaps": note})
     return gone
 
 
 def _measured(
-    item: _Series, axis: TimeAxis, added: IntArray, refused: list[Refusal]
+    signal: Signal, values: Samples, axis: TimeAxis, added: IntArray, refused: list[Refusal]
 ) -> tuple[Samples, IntArray] | None:
     """Check the samples of a channel, and repair what is repaired exactly.
 
     Return its samples and the ranges that remain missing; None if it cannot be used. What was
     found is added to ``refused``.
     """
-    values, notes = item.values, dict[str, str]()
+    notes = dict[str, str]()
     try:
-        gone, notes["gaps"] = missing_ranges(values, added)
-        rough = check_signal(values)
-        values, notes["unwrapped"] = unwrapped(values, gone, rough)
-        if item.signal.role in _DYNAMIC:
-            rough = roughness(values) if notes["unwrapped"] else rough
-            check_sign(values, rough)
-            notes["levels"] = coarse_levels(values)
-            bad = spikes(values, gone, rough)
-            if bad.size:
-                n = int(np.sum(bad[:, 1] - bad[:, 0]))
-                notes["spikes"] = f"{n} samples are no part of the signal, and count as missing"
+        gone, notes["gaps"] = checks.missing_ranges(values, added)
+        rough = checks.check_signal(values)
+        values, notes["unwrapped"] = checks.unwrapped(values, gone, rough)
+        if signal.role in _DYNAMIC:
+            rough = checks.roughness(values) if notes["unwrapped"] else rough
+            checks.check_sign(values, rough)
+            notes["levels"] = checks.coarse_levels(values)
+            if (bad := checks.spikes(values, gone, rough)).size:
+                found = f"{count(bad)} samples are no part of the signal"
+                notes["spikes"] = f"{found}, and count as missing"
             gone = np.concatenate([gone, bad])
             gone = gone[np.argsort(gone[:, 0], kind="stable")]
     except Unusable as error:
-        refused += _listed(item.signal.name, {error.reason: error.detail})
+        refused += _listed(signal.name, {error.reason: error.detail})
         return None
-    values, left = filled(values, gone, axis.breaks)
+    values, left = checks.filled(values, gone, axis.breaks)
     open_ones = f"{len(left)} of {len(gone)} ranges are not filled" if left.size else ""
     if notes["gaps"] and not np.array_equal(gone, added):  # time_s has a note of those
         notes["gaps"] += f"; {open_ones or 'they are filled by linear prediction'}"
     else:
         notes["gaps"] = open_ones
-    refused += _listed(item.signal.name, notes)
+    refused += _listed(signal.name, notes)
     return values, left
 
 
@@ -338,11 +312,10 @@ def _at_one_rate(
     """Resample channels and set point of a varying rate; return them with their pieces."""
     columns = [(channel.values, True) for channel in channels]
     columns += [] if reference is None else [(reference, False)]
-    read, ranges = resampled(columns, ranges, axis)
+    read, ranges = timing.resampled(columns, ranges, axis)
     if not ranges:
         raise Unusable("time", f"{axis.note}; the pieces are too short for that")
-    pairs = zip(channels, read, strict=False)
-    channels = [replace(channel, values=values) for channel, values in pairs]
+    channels = [replace(one, values=own) for one, own in zip(channels, read, strict=False)]
     return channels, None if reference is None else read[-1], ranges
 
 
@@ -351,14 +324,14 @@ def _without_copies(
 ) -> list[Channel]:
     """Leave out channels of vibration that are combinations of the others, which are refused."""
     dynamic = [channel for channel in channels if channel.kind in _DYNAMIC]
-    order = independent([c.values for c in dynamic], ranges, len(dynamic))
+    order = checks.independent([c.values for c in dynamic], ranges, len(dynamic))
     copies = [channel for k, channel in enumerate(dynamic) if k not in order]
     others = listed(dynamic[k].name for k in sorted(order))
     detail = f"is a multiple or combination of {others}; check whether a sensor is recorded twice"
     for copy in copies:
         refused += _listed(copy.name, {"dependent": detail})
     rest = [one for one in channels if one.kind == "acceleration" and one not in copies]
-    for k, axes in magnitudes([one.values for one in rest], ranges).items():
+    for k, axes in checks.magnitudes([one.values for one in rest], ranges).items():
         what = f"is the magnitude of {listed(rest[j].name for j in axes)}, which are used"
         refused += _listed(rest[k].name, {"dependent": what})
         copies.append(rest[k])
@@ -366,7 +339,7 @@ def _without_copies(
 
 
 def _listed(channel: str, found: Mapping[str, str]) -> list[Refusal]:
-    """Make refusals of a channel by reason and detail; `_to_log` adds the name of the log."""
+    """Make refusals of a channel by reason and detail; the name of the log is added later."""
     return [Refusal("", why, detail, channel=channel) for why, detail in found.items() if detail]
 
 

@@ -3,7 +3,7 @@
 Samples are never sorted; `channel_checks` fills short gaps only (README.md, "Time").
 """
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple, Self
@@ -11,8 +11,16 @@ from typing import NamedTuple, Self
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray, IntArray
-from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, runs, smallest_step
+from lmshealth.io import buffers, constants
+from lmshealth.io.buffers import (
+    BLOCK,
+    NO_RANGES,
+    Samples,
+    Spool,
+    blocks,
+    count,
+    runs,
+)
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
@@ -20,8 +28,6 @@ Ranges = tuple[tuple[int, int], ...]
 # Time in s of samples, by their index, and its derivatives.
 Clock = Callable[..., FloatArray]
 
-# Quantile of the second differences of a position that is at most a step and an acceleration.
-_QUANTILE = 0.9
 # Intervals of which the median is the local interval; most decimals of rounded stamps, and knots
 # of a clock.
 _GROUP, _MOST_DIGITS, _MOST_KNOTS = 128, 10, 1 << 14
@@ -49,10 +55,7 @@ class TimeAxis(NamedTuple):
     dropped: IntArray = np.empty(0, dtype=np.int64)
 
     def completed(self) -> tuple[Self, IntArray]:
-        """Return the axis with dropped samples in their places, and their half-open ranges.
-
-        They are missing samples then, not interruptions.
-        """
+        """Return the axis with dropped samples in their places, and their half-open ranges."""
         shift = np.concatenate([[0], np.cumsum(self.dropped)])
         if not self.dropped.any():
             return self, NO_RANGES
@@ -102,7 +105,7 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
 
 
 def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
-    """Find the axis of stamps, rounded to a step in s; ``slack`` is allowed beyond tolerances."""
+    """Find the axis of stamps, rounded to a step in s; ``slack`` in s widens tolerances."""
     breaks, lengths, note, interval, scatter = _interruptions(time, slack)
     if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
         found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
@@ -120,7 +123,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
             lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
         clocks.append(clock)
     gone = np.concatenate([NO_RANGES, *lost])
-    n_lost = int(np.sum(gone[:, 1] - gone[:, 0]))
+    n_lost = count(gone)
     notes = [note] if note else []
     if n_lost:
         notes.append(f"{n_lost} samples have no certain time, left out")
@@ -139,22 +142,16 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
         expect_possible("sample_rate_hz", own)
     except ValueError as error:
         raise Unusable("time", f"time_s: {error}") from error
-    if not varies:
-        # Coarse stamps do not count the samples of a gap.
-        is_whole = abs(interval / step - round(interval / step)) < constants.AGREEMENT
-        is_coarse = slack > 0 or (step > constants.JITTER * interval and not is_whole)
-        lacking = np.where(is_coarse, 0.0, lengths / interval - 1)
-        dropped = np.rint(lacking).astype(np.int64)
-        certain = np.abs(lacking - dropped) < constants.JITTER
-        few = (dropped > 0) & (dropped <= constants.LONGEST_FILLED)
-        return TimeAxis(own, breaks, note, gone, (), np.where(certain & few, dropped, 0))
-    return TimeAxis(own, breaks, f"{note}: resampled to the lowest", gone, tuple(clocks))
-
-
-def _steps(time: Samples) -> Iterator[tuple[int, FloatArray]]:
-    """Yield the intervals in s block by block, in whole groups but the last."""
-    for at in range(0, time.size - 1, BLOCK):
-        yield at, np.diff(time[at : at + BLOCK + 1])
+    if varies:
+        return TimeAxis(own, breaks, f"{note}: resampled to the lowest", gone, tuple(clocks))
+    # Coarse stamps do not count the samples of a gap.
+    is_whole = abs(interval / step - round(interval / step)) < constants.AGREEMENT
+    is_coarse = slack > 0 or (step > constants.JITTER * interval and not is_whole)
+    lacking = np.where(is_coarse, 0.0, lengths / interval - 1)
+    dropped = np.rint(lacking).astype(np.int64)
+    certain = np.abs(lacking - dropped) < constants.JITTER
+    few = (dropped > 0) & (dropped <= constants.LONGEST_FILLED)
+    return TimeAxis(own, breaks, note, gone, (), np.where(certain & few, dropped, 0))
 
 
 def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float, float]:
@@ -164,7 +161,8 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     and four times the usual deviation from it in s.
     """
     middles, spreads = [], []
-    for _, steps in _steps(time):
+    starts = range(0, time.size - 1, BLOCK)  # in whole groups but the last
+    for steps in (np.diff(time[at : at + BLOCK + 1]) for at in starts):
         whole = steps.size - steps.size % _GROUP
         for groups in (steps[:whole].reshape(-1, _GROUP), steps[None, whole:]):
             if groups.size:
@@ -176,31 +174,29 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     if median.min() <= 0:
         raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
     local = np.pad(median, 1, mode="edge")
-    total, n_regular, n_gaps, missing = 0.0, 0, 0, 0.0
+    total, n_gaps, n_missing = 0.0, 0, 0.0
     breaks, lengths = [np.empty(0, dtype=np.int64)], [np.empty(0)]
-    for at, steps in _steps(time):
+    for at in starts:
+        steps = np.diff(time[at : at + BLOCK + 1])
         own = 1 + (at + np.arange(steps.size)) // _GROUP
         near = np.stack([local[own - 1], local[own], local[own + 1]])
-        odd = np.abs(steps - near) > constants.JITTER * near + slack
-        irregular = odd.all(axis=0)
-        gap = irregular & (steps > constants.GAP * near[1])
+        odd = (np.abs(steps - near) > constants.JITTER * near + slack).all(axis=0)
+        gap = odd & (steps > constants.GAP * near[1])
         n_gaps += int(gap.sum())
-        missing += float(np.round(steps[gap] / near[1, gap] - 1).sum())
-        total += float(steps[~irregular].sum())
-        n_regular += int(np.count_nonzero(~irregular))
-        breaks.append(np.flatnonzero(irregular) + at + 1)
-        lengths.append(steps[irregular])
+        n_missing += float(np.round(steps[gap] / near[1, gap] - 1).sum())
+        total += float(steps[~odd].sum())
+        breaks.append(np.flatnonzero(odd) + at + 1)
+        lengths.append(steps[odd])
     where: IntArray = np.concatenate(breaks)
-    notes = [f"{n_gaps} gaps with {missing:.0f} dropped samples"] if n_gaps else []
+    notes = [f"{n_gaps} gaps with {n_missing:.0f} dropped samples"] if n_gaps else []
     if n_odd := where.size - n_gaps:
-        notes.append(
-            f"{n_odd} of {time.size - 1} intervals differ by more than {constants.JITTER:.0%} "
-            f"from the median {np.median(median):.6g} s"
-        )
+        found = f"{n_odd} of {time.size - 1} intervals differ by more than {constants.JITTER:.0%}"
+        notes.append(f"{found} from the median {np.median(median):.6g} s")
     note = " and ".join(notes)
     if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
     # The mean over all regular intervals averages the rounding of time stamps out.
+    n_regular = time.size - 1 - where.size
     interval = total / n_regular if n_regular else float(np.median(median))
     return where, np.concatenate(lengths), note, interval, 4 * float(np.median(spread))
 
@@ -229,17 +225,15 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
     """
     if not added.size:
         return values
-    spool = Spool(values.size + int(np.sum(added[:, 1] - added[:, 0])))
-    taken = at = 0
-    for start, stop in added.tolist():
-        following = taken + start - at
+    spool, taken = Spool(values.size + count(added)), 0
+    for start, stop in [*added.tolist(), (values.size + count(added),) * 2]:
+        following = taken + start - spool.size
         for _, block in blocks(values, taken, following):
             spool.append(block)
-        first, last = values[following - 1 : following + 1] if linear else (np.nan, np.nan)
-        spool.append(np.linspace(first, last, stop - start + 2)[1:-1])
-        taken, at = following, stop
-    for _, block in blocks(values, taken):
-        spool.append(block)
+        if start < stop:
+            first, last = values[following - 1 : following + 1] if linear else (np.nan, np.nan)
+            spool.append(np.linspace(first, last, stop - start + 2)[1:-1])
+        taken = following
     return spool.samples()
 
 
@@ -271,11 +265,9 @@ def resampled(
     Signals by a windowed sinc that passes up to 0.45 of the rate; the others (second entry false)
     linearly. Return columns of the pieces one after another, and these.
     """
-    spools = [Spool() for _ in columns]
-    pieces = []
-    first, rate = np.concatenate([[0], axis.breaks]), axis.sample_rate
+    spools, pieces, rate = [Spool() for _ in columns], [], axis.sample_rate
     for start, stop in ranges:
-        clock = axis.clocks[int(np.searchsorted(first, start, side="right")) - 1]
+        clock = axis.clocks[int(np.searchsorted(axis.breaks, start, side="right"))]
         knots = np.linspace(start, stop - 1, 2 + (stop - start) // _GROUP)
         at = clock(knots)
         half = int(np.ceil(_ZEROS * max(1.0, float((np.diff(knots) / np.diff(at)).max() / rate))))
@@ -331,21 +323,18 @@ def pieces(n_samples: int, missing: Sequence[IntArray], breaks: IntArray) -> Ran
 
 def _check_order(time: Samples) -> int:
     """Require that time stamps are numbers and do not decrease; return how many repeat."""
-    unknown = backwards = repeated = 0
-    first = None
+    unknown, repeated, backwards = 0, 0, [np.empty(0, dtype=np.int64)]
     for at, stamps in blocks(time, overlap=1):
         steps = np.diff(stamps)
-        if first is None and not (steps >= 0).all():
-            first = at + int(np.argmin(steps >= 0)) + 1
         unknown += int(np.count_nonzero(~(np.abs(stamps[at > 0 :]) < constants.LARGEST_MAGNITUDE)))
-        backwards += int(np.count_nonzero(steps < 0))
+        backwards.append(np.flatnonzero(steps < 0) + at + 1)
         repeated += int(np.count_nonzero(steps == 0))
     if unknown:
         raise Unusable("time", f"{unknown} of {time.size} time stamps are no numbers")
-    if backwards:
-        found = f"time_s runs backwards {backwards} times and repeats {repeated} times"
-        where = f"in {time.size} samples, first at sample {first}"
-        raise Unusable("time", f"{found} {where}; needed increasing time stamps")
+    if (where := np.concatenate(backwards)).size:
+        found = f"time_s runs backwards {where.size} times and repeats {repeated} times"
+        found += f" in {time.size} samples, first at sample {where[0]}"
+        raise Unusable("time", f"{found}; needed increasing time stamps")
     return repeated
 
 
@@ -372,8 +361,7 @@ def set_velocity(position: Samples, pieces: Ranges, sample_rate: float) -> Sampl
     The difference spans so many samples that the steps in which positions are stored do not show.
     Position in m, velocity in m/s, both ``(n_samples,)``; NaN outside the pieces, which ascend.
     """
-    reach = _reach(position, pieces, sample_rate)
-    velocity = Spool()
+    reach, velocity = _reach(position, pieces, sample_rate), Spool()
     for start, stop in pieces:
         velocity.append(np.broadcast_to(np.nan, (start - velocity.size,)))
         for at, block in blocks(position, start, stop):
@@ -395,18 +383,13 @@ def _reach(position: Samples, pieces: Ranges, sample_rate: float) -> int:
     for start, stop in pieces:
         for _, block in blocks(position, start, stop, overlap=2):
             if block.size > 2 * most:
-                step = max(step, _step(block))
+                uneven, smallest = np.abs(np.diff(block, 2)), buffers.smallest_step(block)
+                # At a velocity of a whole number of steps per sample few differences are uneven.
+                visible = smallest if float(uneven.max()) > 0.5 * smallest else 0.0
+                # Most are at most a step and an acceleration.
+                step = max(step, visible, float(np.quantile(uneven, 0.9)))
                 average = (block[most:] - block[:-most]) * sample_rate / most
                 fastest = max(fastest, float(np.abs(average).max()))
     if fastest == 0:
         return 1
     return int(np.clip(np.ceil(step * sample_rate / (2 * constants.STEP_SHARE * fastest)), 1, most))
-
-
-def _step(block: FloatArray) -> float:
-    """Estimate the step of stored positions in m from the second differences."""
-    uneven = np.abs(np.diff(block, 2))
-    # At a velocity of a whole number of steps per sample only few differences are uneven.
-    smallest = smallest_step(block)
-    visible = smallest if float(uneven.max()) > 0.5 * smallest else 0.0
-    return max(visible, float(np.quantile(uneven, _QUANTILE)))

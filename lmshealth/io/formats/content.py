@@ -5,13 +5,14 @@ Which channels are read, by unit, rate and start; moments in columns of times.
 
 import gzip
 import re
+import tomllib
 import zipfile
 import zlib
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -69,6 +70,11 @@ class Format:
     library: str = ""
 
 
+def begins(*marks: bytes, blanks: bytes = b"") -> Callable[[bytes], bool]:
+    """Return whether first bytes, without some blanks before them, are one of the marks."""
+    return lambda head: head.lstrip(blanks).startswith(marks)
+
+
 @contextmanager
 def unpacked(path: Path) -> Iterator[Path]:
     """Copy a file that gzip compressed to a temporary one as it was; other files are yielded.
@@ -80,13 +86,12 @@ def unpacked(path: Path) -> Iterator[Path]:
     if not packed:
         yield path
         return
-    stored, size = path.stat().st_size, 0
     with TemporaryDirectory(prefix="lmshealth-") as folder:
         copy = Path(folder) / path.name[: -len(".gz")]
         with gzip.open(path) as whole, copy.open("wb") as target:
             for block in iter(partial(whole.read, _BLOCK), b""):
-                size += target.write(block)
-                check_size(size, stored)
+                target.write(block)
+                check_size(target.tell(), path.stat().st_size)
         yield copy
 
 
@@ -104,7 +109,7 @@ def gzipped(form: Format, others: Iterable[str] = ()) -> Format:
             return form.load(copy, columns, max_memory)
 
     suffixes = tuple(f"{suffix}.gz" for suffix in (*form.suffixes, *others))
-    return Format(f"gzipped {form.name}", suffixes, lambda head: head.startswith(GZIP), load)
+    return Format(f"gzipped {form.name}", suffixes, begins(GZIP), load)
 
 
 def load_by(form: str, load: Load, path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -145,10 +150,27 @@ def wanted(names: Iterable[str], columns: ColumnMap) -> list[str]:
     chosen = [name for name in names if columns.target(name) is not None]
     if twice := repeated(chosen):
         raise Unusable("columns", f"the file names {listed(twice)} more than once")
-    if len(chosen) > constants.MOST_COLUMNS:
-        found = f"{len(chosen)} columns of signals, at most {constants.MOST_COLUMNS} are read"
-        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+    check_number(len(chosen))
     return chosen
+
+
+def check_number(n_columns: int) -> None:
+    """Refuse (``columns``) more columns of signals than a log has."""
+    if n_columns > constants.MOST_COLUMNS:
+        found = f"{n_columns} columns of signals, at most {constants.MOST_COLUMNS} are read"
+        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+
+
+def collected(
+    sizes: Mapping[str, int],
+    parts: Iterable[tuple[str, np.ndarray]],
+    times: "Mapping[str, SinceFirst]",
+) -> dict[str, Samples]:
+    """Join the parts of columns of expected sizes; moments become times."""
+    taken = {name: Spool(size) for name, size in sizes.items()}
+    for name, values in parts:
+        taken[name].append(times[name](values) if name in times else values)
+    return {name: spool.samples() for name, spool in taken.items()}
 
 
 @contextmanager
@@ -166,56 +188,6 @@ def not_numeric(column: str, found: str) -> Unusable:
     return Unusable("columns", f"column {column!r} holds {found}, needed one number per sample")
 
 
-_EXPORT = "; export acceleration or following error over time as CSV, HDF5 or TDMS"
-_SOUND = f", whose samples have no unit{_EXPORT}"
-_PICTURE = f", which holds no samples{_EXPORT}"
-_SHEET = "; save the sheet with the samples as CSV"
-_ARCHIVE = "; unpack it and name the logs in it"
-_ARRAYS = "; save its arrays as columns of CSV, HDF5 or Parquet"
-
-# First bytes, what has them, and what is needed. Text follows below.
-_SIGNATURES: tuple[tuple[str, str, str], ...] = (
-    (r"RIFF....WAVE|RF64....WAVE", "a sound file (WAV)", _SOUND),
-    (r"fLaC", "a sound file (FLAC)", _SOUND),
-    (r"ID3[\x02-\x04]|\xff[\xf2\xf3\xfa\xfb][\x10-\xef]", "a sound file (MP3)", _SOUND),
-    (r"OggS|FORM....AIF[FC]|caff\x00|\.snd\x00", "a sound file", _SOUND),
-    (r"RIFF....AVI |....ftyp|\x1aE\xdf\xa3", "a film", _PICTURE),
-    (r"\x89PNG\r\n", "a picture (PNG)", _PICTURE),
-    (r"\xff\xd8\xff", "a picture (JPEG)", _PICTURE),
-    (r"GIF8[79]a|BM....\x00\x00\x00\x00|II\*\x00|MM\x00\*|RIFF....WEBP", "a picture", _PICTURE),
-    (r"%PDF-|%!PS", "a printed document (PDF or PostScript)", _PICTURE),
-    (r"\{\\rtf", "a text document (RTF)", _PICTURE),
-    (r"\xd0\xcf\x11\xe0", "an office file of the old kind (.xls, .doc, .ppt)", _SHEET),
-    (r"Rar!\x1a|7z\xbc\xaf|\xfd7zXZ|BZh[1-9]1AY|\x28\xb5\x2f\xfd", "an archive", _ARCHIVE),
-    (r".{257}ustar", "an archive (tar)", _ARCHIVE),
-    (r"\x93NUMPY", "an array of NumPy", _ARRAYS),
-    (r"ARROW1\x00|FEA1\x00", "a table of Arrow (Feather)", _ARRAYS),
-    (r"SQLite format 3\x00", "a database (SQLite)", _ARRAYS),
-    (r"(?:MDF|UnFinMF) +[34]\.", "a measurement in MDF", _EXPORT),
-    (r"CDF[\x01\x02\x05]|\x0e\x03\x13\x01", "an array file (NetCDF or HDF4)", _ARRAYS),
-    (r"\x7fELF|MZ.\x00", "a program", _EXPORT),
-    (r"\s*solid\b[^\n]*\n\s*facet\b", "a geometry (STL)", _PICTURE),
-    (r"ply\r?\nformat |OFF\r?\n\d+ \d+ \d+", "a geometry (PLY or OFF)", _PICTURE),
-    (r"    -1[ \t]*\r?\n {1,5}\d{1,5}[ b\r\n]", "a universal file (UFF)", "; rename it to .uff"),
-    (r"DIAEXTENDED", "the header of a DIAdem file, whose numbers are in others", _EXPORT),
-    (r"ISO-10303-21", "a geometry (STEP)", _PICTURE),
-    (r"(?:#[^\n]*\n|\s|(?:mtllib|o|g)\s[^\n]*\n)*v\s+\S+\s+\S+\s+\S+[^\n]*\n(?:vn?|f)\s",
-     "a geometry (OBJ)", _PICTURE),
-    (r"\s*(?:\{\s*[\"}]|\[\s*(?:[\[{\"]|-?\d[\d.eE+-]*\s*[,\]]))", "JSON", _ARRAYS),
-    (r"\s*<(?:!(?:doctype|DOCTYPE) html|(?:html|HTML)\b)", "a page of the web (HTML)", _ARRAYS),
-    (r"\s*(?:<\?xml\b|<svg\b|<\w+(?:\s[^<>]*)?>\s*<\w)", "an XML file", _ARRAYS),
-)  # fmt: skip
-_COMPILED = [
-    (re.compile(f"(?s){pattern}".encode("latin-1")), name, needed)
-    for pattern, name, needed in _SIGNATURES
-]
-# Names in a zip archive that make it a file of another kind.
-_ZIPPED = (
-    (r"xl/", "a workbook (.xlsx)", _SHEET),
-    (r"word/|ppt/", "an office file", _PICTURE),
-    (r".*\.npy$", "arrays of NumPy (.npz)", _ARRAYS),
-    (r"content\.xml$", "a workbook or text of OpenDocument (.ods, .odt)", _SHEET),
-)
 _STL_HEAD, _STL_FACET = 84, 50
 _INNER = 4096  # bytes that are unpacked
 
@@ -225,6 +197,12 @@ _FREQUENCY = re.compile(
     r"|f[\W_]*(?:in\W*)?k?hz\W*|k?hz",
     re.IGNORECASE,
 )
+
+
+@cache
+def foreign(table: str) -> Any:
+    """Return a table of ``foreign.toml``: how files that hold no log are recognised and named."""
+    return tomllib.loads((Path(__file__).parent / "foreign.toml").read_text("utf-8"))[table]
 
 
 def describe(head: bytes, path: Path) -> str:
@@ -238,12 +216,13 @@ def describe(head: bytes, path: Path) -> str:
             return describe(inner, path) if not inner.startswith(GZIP) else ""
     if head.startswith((b"PK\x03\x04", b"PK\x05\x06")):
         return _zipped(path)
-    for pattern, name, needed in _COMPILED:
-        if pattern.match(head):
-            return f"is {name}{needed}"
+    needed = foreign("needed")
+    for pattern, name, key in foreign("files")["beginnings"]:
+        if re.match(f"(?s){pattern}".encode("latin-1"), head):
+            return f"is {name}{needed[key]}"
     n_facets = int.from_bytes(head[_STL_HEAD - 4 : _STL_HEAD], "little")
     if n_facets and path.stat().st_size == _STL_HEAD + n_facets * _STL_FACET:
-        return f"is a geometry (STL){_PICTURE}"
+        return f"is a geometry (STL){needed['picture']}"
     return ""
 
 
@@ -253,10 +232,11 @@ def _zipped(path: Path) -> str:
             names = archive.namelist()
     except (zipfile.BadZipFile, ValueError, NotImplementedError):
         names = []
-    for pattern, kind, needed in _ZIPPED:
+    needed = foreign("needed")
+    for pattern, kind, key in foreign("files")["zipped"]:
         if any(re.match(pattern, name) for name in names):
-            return f"is {kind}{needed}"
-    return f"is a zip archive of {len(names)} files{_ARCHIVE}"
+            return f"is {kind}{needed[key]}"
+    return f"is a zip archive of {len(names)} files{needed['archive']}"
 
 
 def frequency_column(names: Iterable[str]) -> str:
@@ -311,18 +291,17 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     that contradicts the unit of its channel as ``unit``.
     """
     named = [(column, k) for k, c in enumerate(channels) if (column := _column(c, columns))]
-    if len(named) > constants.MOST_COLUMNS:
-        found = f"{len(named)} columns of signals, at most {constants.MOST_COLUMNS} are read"
-        raise Unusable("columns", f"{found}; name those of the log in a column map (--columns)")
+    check_number(len(named))
     # Each group of channels may have times of its own: those of the chosen rate are read.
-    counts = Counter(
-        own
-        for column, k in named
-        if (own := channels[k].rate) is not None and role_of(column) != "time"
-    )
+    signals = [channels[k].rate for column, k in named if role_of(column) != "time"]
+    counts = Counter(own for own in signals if own is not None)
     rate = max(counts, key=lambda rate: (counts[rate], rate), default=None)
-    named = [*named, *_moments(channels, named, rate, columns)]
-    alike = [k for _, k in named if rate is None or _agree(channels[k].rate or rate, rate)]
+    # Moments are times where nothing else states the rate.
+    moments = [("time_s", k) for k, channel in enumerate(channels) if channel.moments]
+    timed = rate or columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
+    named += moments if len(moments) == 1 and not timed else []
+    least = constants.AGREEMENT
+    alike = [k for _, k in named if not rate or abs((channels[k].rate or rate) / rate - 1) <= least]
     n_late = _aligned([channels[k] for k in alike], rate)
     samples = {k: n for k, n in zip(alike, n_late, strict=True) if n is not None}
     kept: dict[str, int] = {}
@@ -355,18 +334,6 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
     return kept, Content({}, metadata, present, tuple(refused.values()), late=delays)
 
 
-def _moments(
-    channels: Sequence[Described],
-    named: Sequence[tuple[str, int]],
-    rate: float | None,
-    columns: ColumnMap,
-) -> list[tuple[str, int]]:
-    """Return the channel of moments as a column of times, where nothing else states the rate."""
-    found = [(channel.name, k) for k, channel in enumerate(channels) if channel.moments]
-    timed = columns.sample_rate_hz or any(columns.is_time(column) for column, _ in named)
-    return [("time_s", found[0][1])] if len(found) == 1 and rate is None and not timed else []
-
-
 def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | None]:
     """Return by how many samples each channel starts after that to which most others fit.
 
@@ -391,10 +358,6 @@ def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | No
     return max(fits, key=lambda fit: (fit.count(0), -fit.count(None)), default=[])
 
 
-def _agree(one: float, other: float) -> bool:
-    return abs(one / other - 1) <= constants.AGREEMENT
-
-
 def rate_of(interval: object) -> float | None:
     """Convert an interval in s to a sample rate in Hz; None for an impossible one."""
     if not isinstance(interval, int | float) or not 1e-12 < interval < 1e9:
@@ -406,17 +369,16 @@ def _column(channel: Described, columns: ColumnMap) -> str | None:
     """Name a channel as a column of the log; None if it is not to be read."""
     if channel.name in columns.columns.values():
         return channel.name
-    if role_of(channel.name) is None and columns.target(channel.name) is not None:
-        return channel.name
+    time, unit = (unit_key(channel.unit, kind) for kind in ("time", "acceleration"))
     if role_of(channel.name) is not None:
         column = _with_unit(channel, columns)
+    elif columns.target(channel.name) is not None:
+        return channel.name
+    elif time and channel.rate is None and _TIME.match(channel.name):
+        column = f"time_{time}"
+    elif columns.columns or (unit is None and not channel.acceleration):
+        return None
     else:
-        time = unit_key(channel.unit, "time")
-        if time and channel.rate is None and _TIME.match(channel.name):
-            return f"time_{time}" if columns.target(f"time_{time}") is not None else None
-        unit = unit_key(channel.unit, "acceleration")
-        if columns.columns or (unit is None and not channel.acceleration):
-            return None
         column = "acc_" + re.sub(r"\W+", "_", channel.name).strip("_")
         if unit is not None and column not in columns.units:
             column = f"{column}_{unit}"
@@ -514,9 +476,9 @@ def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], 
         scale, what, epoch = 1 / 86400, "days", None
     elif _UNIX_TIMES[0] <= start * unit < _UNIX_TIMES[1]:
         scale, what, epoch = 1 / unit, "", 0
+    elif (found := next(ticks, None)) is not None:
+        scale, what, epoch = found
     else:
-        scale, what, epoch = next(ticks, (0.0, "", None))
-    if not scale:
         return time, (), {}
     spool = Spool()
     for _, block in blocks(time):

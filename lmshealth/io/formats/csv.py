@@ -1,7 +1,7 @@
 """Delimited text: leading ``# key: value`` lines, names of the columns, rows of numbers.
 
-pandas reads the rows from a stream that checks the text before pandas does: pandas accepts rows
-that are cut off, and allocates without bound for lines and quotes that do not end.
+pandas reads the rows in blocks of whole lines, which are checked before: pandas accepts rows that
+are cut off, and allocates without bound for lines and quotes that do not end.
 """
 
 import codecs
@@ -9,12 +9,13 @@ import math
 import re
 import threading
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from lmshealth.io.formats.content import (
     Content,
     Format,
     SinceFirst,
-    check_size,
     choose,
     describe,
     not_numeric,
@@ -46,9 +46,9 @@ _WARNINGS = threading.Lock()
 _BOM = b"\xef\xbb\xbf"
 # First bytes and lines from which the dialect is found.
 _HEAD_BYTES, _HEAD_LINES = 1 << 17, 400
-# Rows per block, fewer of wide tables: a block stays in the processor's cache.
-_ROWS = 1 << 16
-_FIELDS = 1 << 18
+# Bytes per block, at most those of the longest line; rows, fewer of wide tables, of which a block
+# stays in the processor's cache.
+_BLOCK, _ROWS, _FIELDS = 1 << 18, 1 << 16, 1 << 18
 _NO_ROWS = "a header line and no rows; needed rows"
 # Lines of further headers, which are no rows.
 _MAY_BE_MIXED = re.compile(rb"\n[A-Za-z*\r\n]")
@@ -83,101 +83,125 @@ def encoding_of(head: bytes) -> str:
 
 
 class Text:
-    """A text file, read by lines and then by blocks, and checked on the way.
+    """A text file, read by lines and then by blocks of whole lines, and checked on the way."""
 
-    The stream is decompressed; ``stored`` bytes on disk limit its size. From ``position`` on, the
-    byte that is read next, every row has ``n_fields`` (0 where no rows have begun); ``pending``
-    counts the bytes since the last complete row.
-    """
-
-    def __init__(self, stream: Any, stored: int) -> None:
+    def __init__(self, stream: Any) -> None:
         self._stream = stream
-        self._stored = stored
-        self.begin()
-
-    def begin(self, n_lines: int = 0, delimiter: str = ",", n_fields: int = 0) -> None:
-        """Go behind the first lines, from where on rows are expected."""
-        self._stream.seek(0)
-        self.position = self.pending = self.n_fields = 0
+        self.position = 0  # bytes that were read
         self.trailer = ""  # what is left out behind the rows
-        self._tail = b""  # bytes after the last line feed
-        self._ahead = b""  # the block that is read next
-        for _ in range(n_lines):
-            self.line()
-        self._delimiter, self.n_fields = delimiter, n_fields
 
-    def line(self) -> bytes:
-        """Read a line with its end, with the checks of `read`; empty at the end of the file."""
-        return self._checked(self._stream.readline(constants.LONGEST_LINE + 1))
+    def read(self, size: int = 0) -> bytes:
+        """Read so many bytes, and on to the end of a line; empty at the end of the file.
 
-    def read(self, size: int = -1) -> bytes:
-        """Read a block of at most ``size`` bytes; empty at the end of the file.
-
-        `Unusable`: ``corrupt`` for a NUL byte, for lines or rows without end and for an end inside
-        a row, ``too-large`` for more than the file can hold.
+        `Unusable` (``corrupt``) for a NUL byte and for a line without end.
         """
-        block, self._ahead = self._ahead or self._stream.read(size), self._stream.read(size)
-        while 0 < len(self._ahead) < _TRAILER and (more := self._stream.read(size)):
-            self._ahead += more
-        if len(self._ahead) < _TRAILER:  # the last block
-            block, self._ahead = block + self._ahead, b""
-            block = self._rows(block)
-        block = self._checked(block)
-        if not block and self._tail and not self._tail.endswith(b"\r"):
-            # The last number of a file that ends inside a row may be incomplete.
-            n_found = len(fields_of(self._tail.decode(errors="replace"), self._delimiter))
-            if n_found < self.n_fields:
-                raise corrupt(f"the last row is cut off: {n_found} of {self.n_fields} fields")
-        self.pending += len(block)
-        if self.pending > constants.LONGEST_BLOCK:
-            found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte {self.position}"
-            needed = "needed shorter rows, and a second quote to every quote"
-            raise Unusable("corrupt", f"{found}; {needed}")
+        block: bytes = self._stream.read(size) if size else b""
+        block += self._stream.readline(constants.LONGEST_LINE + 1)
+        if b"\0" in block:
+            at = self.position + block.index(0)
+            raise Unusable("corrupt", f"NUL byte at offset {at}; needed text")
+        last = block.rfind(b"\n", 0, -1) + 1
+        if len(block) - last > constants.LONGEST_LINE:
+            found = f"the line at offset {self.position + last} is longer than"
+            detail = f"{found} {constants.LONGEST_LINE} bytes; needed one row per line"
+            raise Unusable("corrupt", detail)
+        self.position += len(block)
         return block
 
-    def _rows(self, block: bytes) -> bytes:
+    def rows(self, dialect: Dialect) -> Iterator[bytes]:
+        """Yield blocks of rows, without headers between them and lines of text behind them.
+
+        `Unusable` (``corrupt``) for rows without end and for an end inside a row.
+        """
+        self._stream.seek(0)
+        self.position, self.trailer = 0, ""
+        header = [self.read() for _ in range(dialect.start)]
+        blocks = iter(partial(self.read, _BLOCK), b"")
+        if dialect.segments:
+            blocks = _without_headers(blocks, header, dialect, dialect.segments)
+        held, n_quotes = list[bytes](), 0
+        for block in blocks:
+            # A field in quotes may go on in the next block; the end of the rows is judged at once.
+            if held and len(block) >= _TRAILER and not n_quotes % 2:
+                yield b"".join(held)
+                held.clear()
+            held.append(block)
+            n_quotes += block.count(b'"') if b'"' in block else 0  # to count takes long
+            if sum(map(len, held)) > constants.LONGEST_BLOCK:
+                found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
+                needed = "needed shorter rows, and a second quote to every quote"
+                raise Unusable("corrupt", f"{found} {self.position}; {needed}")
+        if rows := self._without_text(b"".join(held), dialect):
+            yield rows
+        end = rows[rows.rfind(b"\n") + 1 :]
+        # The last number of a file that ends inside a row may be incomplete.
+        n_found = len(fields_of(end.decode(errors="replace"), dialect.delimiter))
+        n_fields = len(dialect.channels)
+        if end and not end.endswith(b"\r") and n_found < n_fields:
+            raise corrupt(f"the last row is cut off: {n_found} of {n_fields} fields")
+
+    def _without_text(self, block: bytes, dialect: Dialect) -> bytes:
         """Leave out the lines of text behind the last row."""
         start = max(0, len(block) - _TRAILER)
         lines = block[start:].splitlines(keepends=True)
         kept = len(lines)
-        while kept and (not lines[kept - 1].strip() or self._is_text(lines[kept - 1])):
+        while kept and (not lines[kept - 1].strip() or _is_remark(lines[kept - 1], dialect)):
             kept -= 1
         texts = [line for line in lines[kept:] if line.strip()]
         row = lines[kept - 1].decode("latin-1").strip() if kept else ""
         # A block that is text to its beginning has no rows; rows may begin with text, too.
-        if not self.n_fields or not texts or _WORD.match(row) or (start and kept < 2):
+        if not texts or _WORD.match(row) or (start and kept < 2):
             return block
         if n_lines := sum(not line.startswith(b"EOF") for line in texts):
             self.trailer = f"{n_lines} lines of text behind the rows left out"
         return block[: len(block) - sum(map(len, lines[kept:]))]
 
-    def _is_text(self, line: bytes) -> bool:
-        """Return whether a line is a remark or begins with a word; a word alone may be damage."""
-        text = line.decode("latin-1").strip()
-        if text.startswith(("#", "EOF")):
-            return True
-        first = (fields_of(text, self._delimiter) or [""])[0]
-        several = self.n_fields > 1 or len(text.split()) > 1
-        is_word = _WORD.match(first) and not is_number_or_moment(first)
-        return bool(is_word) and several and "\0" not in text
 
-    def __iter__(self) -> Iterator[bytes]:
-        """Iterate over lines; pandas requires it of a file."""
-        return iter(self.line, b"")
+def _is_remark(line: bytes, dialect: Dialect) -> bool:
+    """Return whether a line is a remark or begins with words; a word alone may be damage."""
+    text = line.decode("latin-1").strip()
+    if text.startswith(("#", "EOF")):
+        return True
+    first = (fields_of(text, dialect.delimiter) or [""])[0]
+    several = len(dialect.channels) > 1 or len(text.split()) > 1
+    return bool(_WORD.match(first)) and several and not is_number_or_moment(first)
 
-    def _checked(self, block: bytes) -> bytes:
-        if b"\0" in block:
-            at = self.position + block.index(0)
-            raise Unusable("corrupt", f"NUL byte at offset {at}; needed text")
-        self.position += len(block)
-        check_size(self.position, self._stored)
-        end = block.rfind(b"\n") + 1
-        self._tail = block[end:] if end else self._tail + block
-        if len(self._tail) > constants.LONGEST_LINE:
-            start = self.position - len(self._tail)
-            too_long = f"is longer than {constants.LONGEST_LINE} bytes; needed one row per line"
-            raise Unusable("corrupt", f"the line at offset {start} {too_long}")
-        return block
+
+def _without_headers(
+    blocks: Iterable[bytes], header: Sequence[bytes], dialect: Dialect, segments: Segments
+) -> Iterator[bytes]:
+    """Yield blocks without the headers of later segments; the first one is given.
+
+    `Unusable` (``format``) for segments without one column of times, which places them in time,
+    with or without headers of their own, and for segments of other columns.
+    """
+    mark = dialect.delimiter.encode()
+    pairs = (line.rstrip().removeprefix(_BOM).partition(mark) for line in header)
+    keys = {key: value for key, _, value in pairs}
+    same = b"|".join(re.escape(key.encode()) for key in segments.same)
+    value = rb"(?:" + re.escape(mark) + rb"([^\n]*)|\r?$)"
+    shared = re.compile(rb"^(" + same + rb")" + value, re.MULTILINE)
+    is_timed = [channel.name for channel in dialect.channels].count("time") == 1
+    sizes = re.findall(rb"\d+", keys.get(segments.rows.encode(), b""))
+    n_left = math.inf if is_timed or not sizes else max(map(int, sizes))
+    needed = f"needed {segments.needed}, and the same channels in all segments"
+    n_lines = len(header)
+    for block in blocks:
+        rows, found = block, ""
+        if _MAY_BE_MIXED.search(b"\n" + block):  # it is quick; most blocks are rows alone
+            rows = _NO_ROW.sub(b"", block)
+            for match in shared.finditer(block):
+                key, stated = match[1], (match[2] or b"").rstrip()
+                if not found and (keys.get(key) != stated or not is_timed):
+                    line = n_lines + block.count(b"\n", 0, match.start()) + 1
+                    found = f"{key.decode()} {stated.decode('cp1252')}"
+        n_lines += block.count(b"\n")
+        n_left -= rows.count(b"\n")
+        if not found and n_left < 0:
+            line, found = n_lines + int(n_left) + 1, f"more rows than {segments.rows} states"
+        if found:
+            raise Unusable("format", f"line {line}: a further segment, {found}; {needed}")
+        yield rows
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
@@ -186,104 +210,36 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         if foreign := describe(stream.read(_HEAD_BYTES), path):
             raise Unusable("format", foreign)
         stream.seek(0)
-        return parse_text(stream, path.stat().st_size, columns)
+        return parse_text(stream, columns)
 
 
-def parse_text(stream: Any, stored: int, columns: ColumnMap) -> Content:
+def parse_text(stream: Any, columns: ColumnMap) -> Content:
     """Read delimited text of any dialect, block by block.
 
-    What is wrong is refused as ``empty``, ``corrupt``, ``too-large``, ``metadata`` or ``columns``.
+    What is wrong is refused as ``empty``, ``corrupt``, ``metadata``, ``format`` or ``columns``.
     """
-    start = stream.read(_HEAD_BYTES)
-    encoding = columns.csv.encoding or encoding_of(start)
+    encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
     guessed = [f"{encoding} text"] if encoding != "utf-8" else []
     if encoding.startswith(("utf-16", "utf-32")):
-        stream, stored = codecs.EncodedFile(stream, "utf-8", encoding), 4 * stored
-        encoding = "utf-8"
-    text = Text(stream, stored)
-    lines = _head(text, encoding)
+        stream, encoding = codecs.EncodedFile(stream, "utf-8", encoding), "utf-8"
+    stream.seek(0)
+    text, lines = Text(stream), list[str]()
+    while text.position < _HEAD_BYTES and len(lines) < _HEAD_LINES and (line := text.read()):
+        lines.append(line.removeprefix(_BOM).decode(encoding, "replace"))
     dialect = stated_dialect(lines, columns) or find_dialect(lines, columns)
-    if dialect.segments:
-        text = Text(_SegmentStream(stream, dialect, dialect.segments), stored)
     guessed += dialect.guessed
     chosen, content = choose(dialect.channels, columns)
     metadata, samples = content.metadata | dialect.metadata, dict[str, Samples]()
     if chosen:
-        times = {name: SinceFirst(name, columns) for name in chosen if columns.is_time(name)}
-        samples = _numbers(text, chosen, dialect, times)
+        samples = _numbers(text, chosen, dialect, columns)
         guessed += [text.trailer] if text.trailer else []
     elif not (dialect.has_rows or columns.csv.delimiter) and len(lines) > dialect.start:
         detail = "text without rows of numbers; needed a line of names and rows of samples"
         raise Unusable("format", detail)
     elif dialect.segments:  # segments that cannot be read are named before names
-        text.begin(dialect.start)
-        while text.read(_HEAD_BYTES):
+        for _ in text.rows(dialect):
             pass
     return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
-
-
-class _SegmentStream:
-    """A text of several segments, of which `read` leaves out the headers of later ones.
-
-    `Unusable` (``format``) for segments without one column of times, which places them in time,
-    with or without headers of their own, and for segments of other columns.
-    """
-
-    def __init__(self, stream: IO[bytes], dialect: Dialect, segments: Segments) -> None:
-        self._stream, self._segments = stream, segments
-        self.readline = stream.readline
-        stream.seek(0)
-        header = [stream.readline(constants.LONGEST_LINE).rstrip() for _ in range(dialect.start)]
-        delimiter = dialect.delimiter.encode()
-        pairs = (line.removeprefix(_BOM).partition(delimiter) for line in header)
-        self._keys = {key: value for key, _, value in pairs}
-        same = b"|".join(re.escape(key.encode()) for key in segments.same)
-        value = rb"(?:" + re.escape(delimiter) + rb"([^\n]*)|\r?$)"
-        self._shared = re.compile(rb"^(" + same + rb")" + value, re.MULTILINE)
-        self._is_timed = [channel.name for channel in dialect.channels].count("time") == 1
-        self.seek(0)
-
-    def seek(self, position: int) -> None:
-        """Go to the beginning."""
-        self._stream.seek(position)
-        sizes = re.findall(rb"\d+", self._keys.get(self._segments.rows.encode(), b""))
-        self._n_left = math.inf if self._is_timed or not sizes else max(map(int, sizes))
-
-    def read(self, size: int) -> bytes:
-        """Read rows of about so many bytes."""
-        rows = b""
-        while not rows and (block := self._stream.read(size)):
-            block += self.readline(constants.LONGEST_LINE)
-            rows = block
-            if _MAY_BE_MIXED.search(b"\n" + block):  # it is quick; most blocks are rows alone
-                rows = _NO_ROW.sub(b"", block)
-                for match in self._shared.finditer(block):
-                    key, value = match[1], (match[2] or b"").rstrip()
-                    if self._keys.get(key) != value or not self._is_timed:
-                        text = f"{key.decode()} {value.decode('cp1252')}"
-                        raise self._refusal(-block.count(b"\n", match.start()), text)
-            if self._n_left < math.inf:
-                self._n_left -= rows.count(b"\n")
-            if self._n_left < 0:
-                found = f"more rows than {self._segments.rows} states"
-                raise self._refusal(int(self._n_left), found)
-        return rows
-
-    def _refusal(self, n_more: int, found: str) -> Unusable:
-        """Name a line by its distance from the present one."""
-        end = self._stream.tell()
-        self._stream.seek(0)
-        line = self._stream.read(end).count(b"\n") + n_more + 1
-        needed = f"needed {self._segments.needed}, and the same channels in all segments"
-        return Unusable("format", f"line {line}: a further segment, {found}; {needed}")
-
-
-def _head(text: Text, encoding: str) -> list[str]:
-    """Read the first lines."""
-    head: list[str] = []
-    while text.position < _HEAD_BYTES and len(head) < _HEAD_LINES and (line := text.line()):
-        head.append(line.removeprefix(_BOM).decode(encoding, "replace"))
-    return head
 
 
 @cache
@@ -293,8 +249,22 @@ def _is_old_pandas() -> bool:
     return (int(major), int(minor)) < (3, 1)
 
 
+class _File:
+    """A file for pandas, which takes blocks of any size."""
+
+    def __init__(self, blocks: Iterator[bytes]) -> None:
+        self._blocks = blocks
+
+    def read(self, size: int = -1) -> bytes:
+        """Return the next block; empty at the end."""
+        return next(self._blocks, b"")
+
+    def __iter__(self) -> Iterator[bytes]:
+        return self._blocks  # pandas requires it of a file
+
+
 def _numbers(
-    text: Text, places: dict[str, int], dialect: Dialect, times: Mapping[str, SinceFirst]
+    text: Text, places: dict[str, int], dialect: Dialect, columns: ColumnMap
 ) -> dict[str, Samples]:
     """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
 
@@ -303,75 +273,74 @@ def _numbers(
     """
     import pandas as pd
 
-    begin = partial(text.begin, dialect.start, dialect.delimiter, len(dialect.channels))
-    begin()
-    # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas pull
-    # request 66944): a spare column receives it. It also rounds the last digits of numbers.
-    n_spare = int(_is_old_pandas())
-    read = partial(
-        pd.read_csv,
-        text,
-        sep=r"\s+" if dialect.delimiter == " " else dialect.delimiter,
-        decimal=dialect.decimal,
-        # Numbers are ASCII in every encoding that comes here.
-        encoding_errors="replace",
-        header=None,
-        names=list(range(text.n_fields + n_spare)),
-        float_precision="round_trip" if _is_old_pandas() else None,
-        index_col=False,
-        # A block is small enough as a whole.
-        low_memory=False,
-        # Time stamps place the other rows; without them an empty row is a missing sample.
-        skip_blank_lines=bool(times),
-        chunksize=max(1, min(_ROWS, _FIELDS // text.n_fields)),
-    )
+    times = {name: SinceFirst(name, columns) for name in places if columns.is_time(name)}
+    n_fields = len(dialect.channels)
+
+    def read(times: Mapping[str, SinceFirst], **options: Any) -> dict[str, Samples]:
+        tables = pd.read_csv(
+            _File(text.rows(dialect)),  # type: ignore[call-overload]
+            sep=r"\s+" if dialect.delimiter == " " else dialect.delimiter,
+            decimal=dialect.decimal,
+            # Numbers are ASCII in every encoding that comes here.
+            encoding_errors="replace",
+            header=None,
+            # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas
+            # pull request 66944), which a spare column receives, and rounds the last digits.
+            names=list(range(n_fields + _is_old_pandas())),
+            float_precision="round_trip" if _is_old_pandas() else None,
+            index_col=False,
+            # A block is small enough as a whole.
+            low_memory=False,
+            # Time stamps place the other rows; without them an empty row is a missing sample.
+            skip_blank_lines=any(map(columns.is_time, places)),
+            chunksize=max(1, min(_ROWS, _FIELDS // n_fields)),
+            **options,
+        )
+        with tables:
+            return _spooled(tables, places, times, n_fields)
+
     with _WARNINGS, warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
         warnings.simplefilter("error", pd.errors.ParserWarning)
+        with suppress(ValueError, pd.errors.ParserWarning):
+            return read({}, dtype=dict.fromkeys(places.values(), np.float64))
         try:
-            numbers = dict.fromkeys(places.values(), np.float64)
-            return _spooled(partial(read, dtype=numbers), text, places, {})
-        except (ValueError, pd.errors.ParserWarning):
             # Half as fast, but accepts blanks and locates the fault.
-            begin()
-        try:
-            return _spooled(partial(read, skipinitialspace=True), text, places, times)
+            return read(times, skipinitialspace=True)
         except pd.errors.EmptyDataError as error:
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
             if found := _LONG_ROW.search(str(error)):
-                raise _too_long(found[1], found[2], text.n_fields) from error
+                raise _too_long(found[1], found[2], n_fields) from error
             raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
 def _spooled(
-    read: Callable[[], Any], text: Text, places: dict[str, int], times: Mapping[str, SinceFirst]
+    tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst], n_fields: int
 ) -> dict[str, Samples]:
-    """Read the rows block by block."""
-    n_rows = n_blank = 0
+    """Collect the columns of tables, block by block."""
     taken = {name: Spool() for name in places}
-    with read() as tables:
-        for table in tables:
-            text.pending = 0
-            for extra in table.columns[text.n_fields :]:
-                filled = table[extra].notna().to_numpy()
-                if filled.any():
-                    n_found = f"{text.n_fields + 1} or more"
-                    raise _too_long(n_rows + int(filled.argmax()) + 1, n_found, text.n_fields)
-            n_used = len(table)
-            if n_used and table.iloc[-1].isna().all():
-                n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
-            for name, place in places.items():
-                values = table[place]
-                is_number = values.dtype.kind in "fiu"
-                if not is_number and name not in times:
-                    raise not_numeric(name, _first_text(values.tolist(), n_rows))
-                numbers = values.to_numpy() if is_number else times[name](parse_moments(values))
-                if n_used:
-                    taken[name].append(np.full(n_blank, np.nan))
-                    taken[name].append(numbers[:n_used])
-            n_rows += len(table)
-            n_blank = len(table) - n_used + (0 if n_used else n_blank)
+    n_rows = n_blank = 0
+    for table in tables:
+        for extra in table.columns[n_fields:]:
+            is_long = table[extra].notna().to_numpy()
+            if is_long.any():
+                row = n_rows + int(is_long.argmax()) + 1
+                raise _too_long(row, f"{n_fields + 1} or more", n_fields)
+        n_used = len(table)
+        if n_used and table.iloc[-1].isna().all():
+            n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
+        for name, place in places.items():
+            values = table[place]
+            is_number = values.dtype.kind in "fiu"
+            if not is_number and name not in times:
+                raise not_numeric(name, _first_text(values.tolist(), n_rows))
+            numbers = values.to_numpy() if is_number else times[name](parse_moments(values))
+            if n_used:
+                taken[name].append(np.full(n_blank, np.nan))
+                taken[name].append(numbers[:n_used])
+        n_rows += len(table)
+        n_blank = len(table) - n_used + (0 if n_used else n_blank)
     if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}

@@ -56,7 +56,6 @@ _KEY = re.compile(
     r"(\w+[ _])?(signals?|channels?|names?|units?)|kanal(name)?|einheit(en)?", re.IGNORECASE
 )
 _KEYED = re.compile(r"[^\t,;|]*:(\s|$)")
-_UNNAMED = 'no line of names (the columns are "0", "1", ...)'
 _MICRO = str.maketrans("µμ", "uu")
 _OTHER_UNITS = frozenset(
     "min h V mV Volt Volts N Nm °C C K Hz kHz % ° deg rad rpm 1/min - counts inc W bar".split()  # noqa: SIM905
@@ -112,20 +111,17 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
         delimiter, decimal = layout.delimiter or ",", layout.decimal or "."
         n_fields = len(fields_of(lines[begin], delimiter))
         found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
-    numbered = columns.columns and all(map(str.isdecimal, columns.columns.values()))
-    stated = numbered or layout.header is False or isinstance(layout.header, list)
-    heads = [] if stated else list(_heads(lines[: found.first], skip, found))
+    above = lines[skip : found.first]
     if layout.delimiter is None and layout.decimal is None:
-        title = next((line.strip() for line in reversed(lines[skip : found.first])), "")
+        title = above[-1].strip() if above else ""
         is_pair = found.n_fields == 2 and found.delimiter == ","
         if is_pair and "," not in title and columns.target(title) is not None:
             # One name over rows such as "1,5".
             found = found._replace(delimiter=";", decimal=",", n_fields=1)
-            heads = list(_heads(lines[: found.first], skip, found))
         _check_thousands(lines[found.first :], found.delimiter)
-    _check_no_row_before(lines[skip : found.first], found)
+    _check_no_row_before(above, found)
     n_first = len(fields_of(lines[found.first], found.delimiter)) if found.share else 0
-    names, units, where = _names(heads, found, max(n_first, found.n_fields), columns)
+    names, units, where = _names(lines, skip, found, max(n_first, found.n_fields), columns)
     guessed = _guessed(found, layout, where, begin)
     channels = tuple(_described(*pair, columns) for pair in zip(names, units, strict=True))
     marks, has_rows = (found.delimiter, found.decimal), found.share > 0
@@ -194,10 +190,10 @@ def is_number_or_moment(word: str) -> bool:
 def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
     """Read the leading lines ``# key: value``, and return the line at which they end."""
     metadata: dict[str, str] = {}
-    for k in range(skip, len(lines)):
-        if lines[k].strip() and not lines[k].startswith("#"):
+    for k, line in enumerate(lines[skip:], skip):
+        if line.strip() and not line.startswith("#"):
             return metadata, k
-        key, colon, value = (part.strip() for part in lines[k].lstrip("# \t").partition(":"))
+        key, colon, value = (part.strip() for part in line.lstrip("# \t").partition(":"))
         if colon and metadata.setdefault(key, value) != value:
             both = f"{metadata[key]!r} and {value!r}"
             raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
@@ -206,12 +202,10 @@ def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
 
 def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[_Rows]:
     """Yield the rows that each delimiter and decimal mark find."""
+    used = [(k, line) for k, line in enumerate(lines[skip:], skip)
+            if line.strip() and not line.startswith("#")]  # fmt: skip
     for order, delimiter in enumerate(layout.delimiter or _DELIMITERS):
-        split = [
-            (k, fields_of(line, delimiter))
-            for k, line in enumerate(lines)
-            if k >= skip and line.strip() and not line.startswith("#")
-        ]
+        split = [(k, fields_of(line, delimiter)) for k, line in used]
         for decimal in layout.decimal or ".,":
             # Numbers with the delimiter in them are quoted.
             fits = delimiter != decimal or any('"' in line for line in lines)
@@ -230,14 +224,12 @@ def _first_row(split: Sequence[tuple[int, list[str]]], number: re.Pattern[str]) 
     Lines of keys and values, and of numbered channels, have fewer numbers than half of the rows.
     """
     shares = [_share(fields, number) for _, fields in split]
-    sizes = [
-        len(own) for (_, own), share in zip(split, shares, strict=True) if share > _LEAST_SHARE
-    ]
-    most = max(sizes, key=sizes.count, default=0)
-    rows = [(k, share) for k, share in enumerate(shares)
-            if share > _LEAST_SHARE and len(split[k][1]) == most]  # fmt: skip
-    usual = median(share for _, share in rows) if rows else 0.0
-    return next((k for k, share in rows if share > usual / 2), None)
+    sizes = {k: len(split[k][1]) for k, share in enumerate(shares) if share > _LEAST_SHARE}
+    each = [*sizes.values()]
+    most = max(each, key=each.count, default=0)
+    rows = [k for k, size in sizes.items() if size == most]
+    usual = median(shares[k] for k in rows) if rows else 0.0
+    return next((k for k in rows if shares[k] > usual / 2), None)
 
 
 def _share(fields: Sequence[str], number: re.Pattern[str]) -> float:
@@ -291,22 +283,24 @@ def _check_thousands(lines: Sequence[str], delimiter: str) -> None:
 
 
 def _names(
-    heads: Sequence[tuple[int, list[str]]], found: _Rows, most: int, columns: ColumnMap
+    lines: Sequence[str], skip: int, found: _Rows, most: int, columns: ColumnMap
 ) -> tuple[list[str], list[str], int | None]:
     """Name the columns, with their units, and return the line of the names, if there is one.
 
     A row has ``most`` fields, of which the last may be empty and without a name.
     """
-    n, layout = found.n_fields, columns.csv
-    if isinstance(layout.header, list):
-        if len(layout.header) != n:
-            detail = f"[csv] header names {len(layout.header)} columns"
-            raise Unusable("columns", f"{detail}, the first row has {n}")
-        return list(layout.header), [""] * n, None
+    n, header = found.n_fields, columns.csv.header
+    if isinstance(header, list):
+        if len(header) != n:
+            detail = f"[csv] header names {len(header)} columns, the first row has {n}"
+            raise Unusable("columns", detail)
+        return list(header), [""] * n, None
+    mapped = set(columns.columns.values())
+    unnamed = header is False or (mapped and all(map(str.isdecimal, mapped)))
+    heads = [] if unnamed else list(_heads(lines[: found.first], skip, found))
     if not heads:
         return [str(i) for i in range(n)], [""] * n, None
     # Names differ; a line of the names that the column map has needs no other sign.
-    mapped = set(columns.columns.values())
     own = [one for one in heads if mapped and mapped <= set(one[1])]
     stated = bool(own)
     unlike = [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
@@ -346,14 +340,16 @@ def _described(name: str, unit: str, columns: ColumnMap) -> Described:
 
 def _guessed(found: _Rows, layout: CsvLayout, where: int | None, begin: int) -> tuple[str, ...]:
     """List what differs from the log contract without being stated by the column map."""
-    marks = _MARKS.get(found.delimiter, f"{found.delimiter!r}")
-    listed = [
-        (layout.delimiter is None and found.delimiter != ",", f"{marks} between fields"),
-        (layout.decimal is None and found.decimal != ".", "decimal commas"),
-        (where is not None and where != begin, f"names in line {(where or 0) + 1}"),
-        (where is None and layout.header is None, _UNNAMED),
-    ]
-    return tuple(text for differs, text in listed if differs)
+    guessed = []
+    if layout.delimiter is None and found.delimiter != ",":
+        guessed.append(f"{_MARKS.get(found.delimiter, repr(found.delimiter))} between fields")
+    if layout.decimal is None and found.decimal != ".":
+        guessed.append("decimal commas")
+    if where is not None and where != begin:
+        guessed.append(f"names in line {where + 1}")
+    if where is None and layout.header is None:
+        guessed.append('no line of names (the columns are "0", "1", ...)')
+    return tuple(guessed)
 
 
 @cache
@@ -382,7 +378,7 @@ def _cells(pattern: str | None, header: str, delimiter: str, n: int) -> list[str
         return row * n
     while row and not row[-1]:
         row.pop()
-    return [*row, *[""] * (n - len(row))]
+    return row + [""] * (n - len(row))
 
 
 def _channels(
@@ -410,14 +406,12 @@ def _channels(
                 raise corrupt(f"its header has no interval of samples for the column {own.name!r}")
             channels.append(Described("time", time.unit, own.rate, start=own.start))
             continue
-        interval = _number(intervals[k])
+        interval, name = _number(intervals[k]), names[k] or str(k)
         rate = rate_of(interval and interval * SI_TIMES[layout.interval_unit])
         # One column of times places the samples of all channels.
         start = 0.0 if len(timed) == 1 else _number(offsets[k]) or 0.0
-        one = _described(names[k] or str(k), "", columns)
-        if layout.units:  # "[g]", "g (Acceleration)"
-            unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]
-            one = Described(names[k] or str(k), unit.strip())
+        unit = re.split(r"[\[\]()]", units[k].strip(" []()"))[0]  # "[g]", "g (Acceleration)"
+        one = Described(name, unit.strip()) if layout.units else _described(name, "", columns)
         channels.append(replace(one, rate=rate, start=start))
     return tuple(reversed(channels))
 

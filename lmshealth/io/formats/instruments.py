@@ -13,7 +13,7 @@ import numpy as np
 
 from lmshealth.io.buffers import Spool, as_samples
 from lmshealth.io.column_map import ColumnMap
-from lmshealth.io.formats.content import Content, Described, Format, check_size, choose
+from lmshealth.io.formats.content import Content, Described, Format, begins, check_size, choose
 from lmshealth.io.refusal import Unusable, corrupt
 
 _RTX, _RTX_DATA, _RTX_END = b"HEADER::", b"Data:\r\n", b"EOF::"
@@ -44,10 +44,8 @@ def _load_rtx(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 def _load_trace(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     """Read the signals of a trace: records with a time and a value of each signal, or some."""
-    names: list[str] = []
-    spools: dict[str, Spool] = {}
-    records, n_rows = _records(path, names), 0
-    content = Content({}, {}, ())
+    names, spools, n_rows = list[str](), dict[str, Spool](), 0
+    records, content = _records(path, names), Content({}, {}, ())
     while rows := list(islice(records, _ROWS)):
         table = np.array(rows)
         table[np.abs(table) > _NO_VALUE] = np.nan
@@ -80,9 +78,6 @@ def _records(path: Path, names: list[str]) -> Iterator[list[float]]:
         raise corrupt(f"the trace cannot be read: {error}") from error
 
 
-def _is_trace(head: bytes) -> bool:
-    return head.lstrip(b"\xef\xbb\xbf \r\n\t").startswith((b"<?xml", b"<trace"))
-
-
-RTX = Format("Renishaw laser", (".rtx",), lambda head: head.startswith(_RTX), _load_rtx)
-TRACE = Format("SINUMERIK trace", (".xml",), _is_trace, _load_trace)
+RTX = Format("Renishaw laser", (".rtx",), begins(_RTX), _load_rtx)
+_XML = begins(b"<?xml", b"<trace", blanks=b"\xef\xbb\xbf \r\n\t")
+TRACE = Format("SINUMERIK trace", (".xml",), _XML, _load_trace)

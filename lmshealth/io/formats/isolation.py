@@ -135,13 +135,10 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
 
 def _max_seconds() -> float:
     text = os.environ.get(_SETTING, "")
-    try:
-        seconds = float(text or constants.READING_SECONDS)
-    except ValueError:
-        seconds = 0.0
-    if not 0 < seconds < 1e6:
-        raise LmshealthError(f"{_SETTING} is {text!r}; needed a number of seconds above 0")
-    return seconds
+    with suppress(ValueError):
+        if 0 < (seconds := float(text or constants.READING_SECONDS)) < 1e6:
+            return seconds
+    raise LmshealthError(f"{_SETTING} is {text!r}; needed a number of seconds above 0")
 
 
 class _Reader:
@@ -197,18 +194,15 @@ class _Reader:
             if isinstance(answer, _Refused):
                 raise Unusable(answer.reason, answer.detail)
             if isinstance(answer, _Content):
-                columns = {
-                    name: spools.get(k, Spool()).samples() for name, k in answer.columns.items()
-                }
-                parts = (getattr(answer, name) for name in _PARTS)
-                return Content(columns, *parts)
+                read = {name: spools.get(k, Spool()) for name, k in answer.columns.items()}
+                columns = {name: spool.samples() for name, spool in read.items()}
+                return Content(columns, *(getattr(answer, name) for name in _PARTS))
             dtype = np.dtype(answer.dtype)
             if dtype.kind not in "fiu":
                 raise ValueError(f"samples are of type {dtype}")
-            part = np.frombuffer(self._window, dtype, answer.size)
             if answer.column not in spools:
                 spools[answer.column] = Spool(answer.expected)
-            spools[answer.column].append(part)
+            spools[answer.column].append(np.frombuffer(self._window, dtype, answer.size))
             requests.write(b"\n")
             requests.flush()
 
@@ -247,8 +241,8 @@ def _reason(status: int, request: _Request, spent: float) -> Exception:
         found = f"takes more than {request.seconds:.3g} s to be read as {request.form}"
         return Unusable("too-slow", f"{found}; copy the file again, or raise {_SETTING}")
     if status == -getattr(signal, "SIGKILL", 0):
-        detail = "the process that read it was killed, perhaps for lack of memory; run again"
-        return Unusable("too-large", detail)
+        found = "the process that read it was killed, perhaps for lack of memory"
+        return Unusable("too-large", f"{found}; run again")
     how = f"signal {-status}" if status < 0 else f"status {status}"
     return _Ended(f"the library of {request.form} crashes as it reads it ({how})")
 
@@ -306,12 +300,10 @@ def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
     try:
         module, name = request.load.split(":")
         load: Load = getattr(import_module(module), name)
-        columns = msgspec.convert(request.columns, ColumnMap)
-        path, most = Path(request.path), request.max_memory
-        content = load_by(request.form, load, path, columns, most)
-        own = {
-            name: numbers.setdefault(spool, len(numbers)) for name, spool in content.columns.items()
-        }
+        columns, path = msgspec.convert(request.columns, ColumnMap), Path(request.path)
+        content = load_by(request.form, load, path, columns, request.max_memory)
+        spools = content.columns.items()
+        own = {name: numbers.setdefault(spool, len(numbers)) for name, spool in spools}
         write(_Content(own, *(getattr(content, name) for name in _PARTS)))
     except Unusable as error:
         write(_Refused(error.reason, error.detail))

@@ -25,16 +25,18 @@ from typing import Any
 import numpy as np
 
 from lmshealth.io import constants
-from lmshealth.io.buffers import BLOCK, MINUTE, Samples, Spool, as_samples
+from lmshealth.io.buffers import BLOCK, MINUTE, Samples, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
     Described,
     Format,
     SinceFirst,
+    begins,
     check_memory,
     check_size,
     choose,
+    collected,
     library,
     not_numeric,
     rate_of,
@@ -55,18 +57,20 @@ def _load_hdf5(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         names = [n.decode("utf-8", "replace") if isinstance(n, bytes) else n for n in file]
         chosen = {name: _dataset(file, name) for name in wanted(names, columns)}
         metadata = {key: _attribute(file, key) for key in metadata_keys() if key in file.attrs}
-        check_size(8 * sum(dataset.size for dataset in chosen.values()), path.stat().st_size)
-        taken = {name: Spool(dataset.size) for name, dataset in chosen.items()}
-        for name, dataset in chosen.items():
-            # In parts of whole chunks: each is unpacked only once.
-            chunk = dataset.chunks[0] if dataset.chunks else 1
-            step = -(-BLOCK // chunk) * chunk
-            for start in range(0, dataset.size, step):
-                values = dataset[start : start + step]
-                _check_blocks(dataset, values, start)
-                taken[name].append(values)
-    read = {name: spool.samples() for name, spool in taken.items()}
-    return Content(read, metadata, tuple(names))
+        sizes = {name: dataset.size for name, dataset in chosen.items()}
+        check_size(8 * sum(sizes.values()), path.stat().st_size)
+        parts = ((name, part) for name, own in chosen.items() for part in _parts(own))
+        return Content(collected(sizes, parts, {}), metadata, tuple(names))
+
+
+def _parts(dataset: Any) -> Iterator[np.ndarray]:
+    """Read a column in parts of whole chunks: each is unpacked only once."""
+    chunk = dataset.chunks[0] if dataset.chunks else 1
+    step = -(-BLOCK // chunk) * chunk
+    for start in range(0, dataset.size, step):
+        values = dataset[start : start + step]
+        _check_blocks(dataset, values, start)
+        yield values
 
 
 def _dataset(file: Any, name: str) -> Any:
@@ -144,20 +148,16 @@ def _attribute(file: Any, key: str) -> str:
     # Its type is checked before it is read: the library crashes on damaged types of other classes.
     plain = h5py.h5t.TypeStringID, h5py.h5t.TypeIntegerID, h5py.h5t.TypeFloatID, h5py.h5t.TypeEnumID
     kind = attribute.get_type()
-    if kind.get_size() > constants.LONGEST_ATTRIBUTE:
-        most = constants.LONGEST_ATTRIBUTE
-        raise Unusable("metadata", f"{key} claims {kind.get_size()} bytes; at most {most} are read")
+    if (size := kind.get_size()) > (most := constants.LONGEST_ATTRIBUTE):
+        raise Unusable("metadata", f"{key} claims {size} bytes; at most {most} are read")
     if not isinstance(kind, plain) or attribute.shape not in ((), (1,)):
-        raise Unusable("metadata", f"{key} is no single text or number; write it as text")
+        raise _no_single(key)
     value = np.asarray(file.attrs[key]).reshape(-1)[0]
-    if isinstance(value, bytes):
-        return value.decode("utf-8", "replace")
-    return as_text(value)
+    return value.decode("utf-8", "replace") if isinstance(value, bytes) else as_text(value)
 
 
-HDF5 = Format(
-    "HDF5", (".h5", ".hdf5"), lambda head: head.startswith(_HDF5), _load_hdf5, library="h5py"
-)
+def _no_single(key: str) -> Unusable:
+    return Unusable("metadata", f"{key} is no single text or number; write it as text")
 
 
 _PARQUET = b"PAR1"
@@ -185,30 +185,18 @@ def _load_parquet(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             elif not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
                 raise not_numeric(name, f"values of type {kind}")
         check_size(8 * n_rows * len(chosen), path.stat().st_size)
-        metadata = {
-            key.decode("utf-8", "replace"): value.decode("utf-8", "replace")
-            for key, value in (schema.metadata or {}).items()
-            if key not in _LIBRARY_KEYS
-        }
+        pairs = (pair for pair in (schema.metadata or {}).items() if pair[0] not in _LIBRARY_KEYS)
+        metadata = dict([text.decode("utf-8", "replace") for text in pair] for pair in pairs)
         # Up to a minute at once, beyond it in blocks; nulls become NaN.
         size = max(1, n_rows) if n_rows <= MINUTE else BLOCK
         batches = file.iter_batches(size, columns=chosen, use_threads=False) if chosen else ()
-        taken = {name: Spool(n_rows) for name in chosen}
-        for batch in batches:
-            for name, spool in taken.items():
-                values = batch.column(name).to_numpy(zero_copy_only=False)
-                spool.append(times[name](values) if name in times else values)
-    read = {name: spool.samples() for name, spool in taken.items()}
+        parts = (
+            (name, batch.column(name).to_numpy(zero_copy_only=False))
+            for batch in batches
+            for name in chosen
+        )
+        read = collected(dict.fromkeys(chosen, n_rows), parts, times)
     return Content(read, metadata, tuple(schema.names))
-
-
-PARQUET = Format(
-    "Parquet",
-    (".parquet",),
-    lambda head: head.startswith(_PARQUET),
-    _load_parquet,
-    library="pyarrow.parquet",
-)
 
 
 _MAT_HEADER = 128
@@ -226,8 +214,8 @@ def _load_mat(path: Path, columns: ColumnMap, max_memory: float) -> Content:
     with path.open("rb") as stream:
         version = stream.read(_MAT_HEADER)[-4:]
     if version in _HDF5_INSIDE:
-        needed = "save it in MATLAB with the option -v7"
-        raise Unusable("format", f"MAT-file of version 7.3; {needed}")
+        detail = "MAT-file of version 7.3; save it in MATLAB with the option -v7"
+        raise Unusable("format", detail)
     variables = _variables(path)
     names = [name for name, _, _ in variables]
     chosen = _chosen(names, columns)
@@ -236,9 +224,7 @@ def _load_mat(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         found, content = choose([channel for channel, _ in channels], columns)
         samples = {name: as_samples(channels[k][1]) for name, k in found.items()}
         return replace(content, columns=samples)
-    read: dict[str, Samples] = {}
-    metadata: dict[str, str] = {}
-    present: list[str] = []
+    read, metadata, present = dict[str, Samples](), dict[str, str](), list[str]()
     for variable, shape, kind in variables:
         if variable not in chosen:
             continue
@@ -266,10 +252,10 @@ def _load_mat(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 def _variables(path: Path) -> list[tuple[str, tuple[int, ...], str]]:
     """List name, shape and class of each variable with a name."""
     matlab: Any = import_module("scipy.io.matlab")
+    found: list[tuple[str, tuple[int, ...], str]] = []
     try:
-        found: list[tuple[str, tuple[int, ...], str]] = matlab.whosmat(path, appendmat=False)
+        found += matlab.whosmat(path, appendmat=False)
     except TypeError:  # of an object of a newer class, which has no shape
-        found = []
         with path.open("rb") as stream:
             parts = matlab.varmats_from_mat(stream)
         for _, part in parts:
@@ -292,15 +278,14 @@ def _check_claim(
 
 def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
     """Choose the variables that hold the log."""
-    if columns.mat.variable is not None:
-        chosen = {columns.mat.variable}
-        if columns.mat.variable not in names:
-            detail = f"the column map needs the variable {columns.mat.variable}; there: "
-            raise Unusable("columns", detail + listed(names))
-    else:
-        roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
-        known = roots | set(metadata_keys())
-        chosen = {name for name in names if name in known or columns.target(name)}
+    roots = {re.split(r"[.({]", source)[0] for source in columns.columns.values()}
+    known = roots | set(metadata_keys())
+    chosen = {name for name in names if name in known or columns.target(name)}
+    if (variable := columns.mat.variable) is not None:
+        chosen = {variable}
+        if variable not in names:
+            detail = f"the column map needs the variable {variable}; there: {listed(names)}"
+            raise Unusable("columns", detail)
     if twice := repeated(name for name in names if name in chosen):
         raise Unusable("columns", f"the file holds {listed(twice)} more than once")
     return chosen
@@ -321,24 +306,20 @@ def _testlab(
         _check_claim(variable, shape, kind, path.stat().st_size, max_memory)
         struct = matlab.loadmat(path, appendmat=False, variable_names=[variable])[variable]
         values = _inside(struct, "y_values", "values")
-        step, start = (_inside(struct, "x_values", key) for key in ("increment", "start_value"))
-        if values is None or step is None or values.dtype.kind not in "fiu" or values.ndim != 2:
+        has_step = _inside(struct, "x_values", "increment") is not None
+        if values is None or not has_step or values.dtype.kind not in "fiu" or values.ndim != 2:
             continue
         columns = values.reshape(-1, 1) if 1 in values.shape else values
-        label = _inside(struct, "y_values", "quantity", "label")
         stated = _inside(struct, "function_record", "name")
-        names = (
-            [] if stated is None else [str(np.ravel(one)[0]) for one in stated.ravel() if one.size]
-        )
+        cells = () if stated is None else stated.ravel()
+        names = [str(np.ravel(one)[0]) for one in cells if one.size]
         if len(names) != columns.shape[1]:
             names = [f"{variable}:{k + 1}" for k in range(columns.shape[1])]
-        unit = str(label.ravel()[0]) if label is not None and label.size else ""
-        begin = 0.0 if start is None or not start.size else float(start.ravel()[0])
-        rate = rate_of(float(step.ravel()[0])) if step.size else None
-        for k, name in enumerate(names):
-            channels.append(
-                (Described(name, unit, rate, start=begin, size=len(columns)), columns[:, k])
-            )
+        unit = str(_first(struct, "y_values", "quantity", "label", default=""))
+        start = float(_first(struct, "x_values", "start_value", default=0.0))
+        rate = rate_of(float(_first(struct, "x_values", "increment", default=0.0)))
+        for name, own in zip(names, columns.T, strict=True):
+            channels.append((Described(name, unit, rate, start=start, size=own.size), own))
     return channels
 
 
@@ -351,19 +332,23 @@ def _inside(struct: Any, *names: str) -> Any:
     return struct
 
 
+def _first(struct: Any, *names: str, default: object) -> Any:
+    """Return the first entry of such a field, by default another."""
+    found = _inside(struct, *names)
+    return default if found is None or not found.size else found.ravel()[0]
+
+
 def _arrays(values: Any, name: str) -> Iterator[tuple[str, Any]]:
     """Yield all arrays of a variable: fields of structs, entry after entry, columns of matrices."""
     is_number = values.dtype.kind in "fiu"
+    is_matrix = is_number and values.ndim == 2 and 1 not in values.shape and values.size
     if getattr(values.dtype, "names", None) and not _is_object(values):
         entries = values.ravel("F")
         for k, entry in enumerate(entries):
             whole = name if entries.size == 1 else f"{name}({k + 1})"
             for field in values.dtype.names:
                 yield from _arrays(entry[field], f"{whole}.{field}" if whole else field)
-    elif is_number and values.ndim == 2 and 1 not in values.shape and values.size:
-        if values.shape[1] > constants.MOST_COLUMNS:
-            yield name, values
-            return
+    elif is_matrix and values.shape[1] <= constants.MOST_COLUMNS:
         for k in range(values.shape[1]):
             yield f"{name}(:,{k + 1})", values[:, k]
     elif values.size or not is_number:
@@ -383,12 +368,9 @@ def _series(name: str, values: Any) -> np.ndarray:
     kinds = {"U": "text", "c": "complex numbers", "O": "cells"}
     found = "a sparse matrix" if issparse(values) else kinds.get(values.dtype.kind)
     found = _OBJECT if _is_object(values) else found
-    if found is None and values.size not in values.shape:
-        found = f"numbers of shape {values.shape}"
-    if found is not None:
-        raise not_numeric(name, found)
-    series: np.ndarray = values.ravel()
-    return series
+    if found or values.size not in values.shape:
+        raise not_numeric(name, found or f"numbers of shape {values.shape}")
+    return np.asarray(values.ravel())
 
 
 def _text(name: str, values: Any) -> str:
@@ -403,7 +385,7 @@ def _text(name: str, values: Any) -> str:
         value = values.item()
         # An integer may be stored as one or not.
         return str(int(value) if float(value).is_integer() else value)
-    raise Unusable("metadata", f"{name} is no single text or number; write it as text")
+    raise _no_single(name)
 
 
 def _is_mat(head: bytes) -> bool:
@@ -411,4 +393,6 @@ def _is_mat(head: bytes) -> bool:
     return version in _TEXT_OF or (version in _HDF5_INSIDE and head.startswith(b"MATLAB"))
 
 
-MAT = Format("MAT", (".mat",), _is_mat, _load_mat, library="scipy.io")
+HDF5 = Format("HDF5", (".h5", ".hdf5"), begins(_HDF5), _load_hdf5, "h5py")
+PARQUET = Format("Parquet", (".parquet",), begins(_PARQUET), _load_parquet, "pyarrow.parquet")
+MAT = Format("MAT", (".mat",), _is_mat, _load_mat, "scipy.io")

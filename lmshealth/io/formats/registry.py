@@ -53,9 +53,8 @@ def _checked(form: Any, others: Sequence[Format]) -> Format:
         raise TypeError(f"it is a {type(form).__name__}, needed a Format")
     taken = {suffix for other in others for suffix in other.suffixes} | set(TEXT_SUFFIXES)
     if not form.suffixes or any(suffix.endswith(tuple(taken)) for suffix in form.suffixes):
-        raise ValueError(
-            f"its suffixes are {listed(form.suffixes)}, needed some that are not taken"
-        )
+        found = f"its suffixes are {listed(form.suffixes)}"
+        raise ValueError(f"{found}, needed some that are not taken")
     return form
 
 
@@ -124,9 +123,9 @@ def fault_of(content: object) -> str:
         )
         if not isinstance(name, str) or not (array or isinstance(samples, Stored)):
             return f"column {name!r} that is no array of numbers of one dimension"
-    pairs = [*content.metadata.items()]
-    if wrong := next((key for key, text in pairs if not isinstance(text, str)), None):
-        return f"metadata {wrong!r} that are no text"
+    for key, text in content.metadata.items():
+        if not isinstance(text, str):
+            return f"metadata {key!r} that are no text"
     return ""
 
 
@@ -137,7 +136,7 @@ def confirm(path: Path) -> Format:
         head = stream.read(_HEAD)
     if not head:
         raise Unusable("empty", "0 bytes; copy the file again")
-    name = "" if form is None else form.name
+    name = format_name(path)
     try:
         if form is not None and form.sniff(head):
             return form

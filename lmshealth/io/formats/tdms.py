@@ -23,9 +23,11 @@ from lmshealth.io.formats.content import (
     Described,
     Format,
     SinceFirst,
+    begins,
     check_memory,
     check_size,
     choose,
+    collected,
     library,
     not_numeric,
     rate_of,
@@ -73,22 +75,22 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         parts = _parts(path)
         chosen, content = choose(_described(channels, parts), columns)
         wanted = {name: channels[k] for name, k in chosen.items()}
-        times = _times(wanted, columns)
+        times = {name: SinceFirst(name, columns) for name, one in wanted.items()
+                 if one.dtype.kind == "M" and columns.is_time(name)}  # fmt: skip
         read = _read(file, wanted, times, path.stat().st_size)
         is_timed = any(map(columns.is_time, read))
         stamps = None if is_timed else _stamps([parts[c.path] for c in wanted.values()])
         if stamps is not None and content.late:
             raise Unusable("time", _UNLIKE)
-        # The increment of a channel is that of its last segment.
-        clock = content.metadata if stamps is None else {}
-        read |= {} if stamps is None else {"time_s": stamps}
         starts = [since.first for since in times.values()]
         starts += [channel.properties.get("wf_start_time") for channel in wanted.values()]
-        own = {
-            key: as_text(file.properties[key]) for key in metadata_keys() if key in file.properties
-        }
+        given = {key: file.properties.get(key) for key in metadata_keys()}
     start = next((s for s in starts if isinstance(s, np.datetime64) and s > _EPOCH), None)
-    metadata = ({} if start is None else {"recorded_at": as_text(start)}) | clock | own
+    metadata = {} if start is None else {"recorded_at": as_text(start)}
+    # The increment of a channel is that of its last segment.
+    metadata |= content.metadata if stamps is None else {}
+    metadata |= {key: as_text(value) for key, value in given.items() if value is not None}
+    read |= {} if stamps is None else {"time_s": stamps}
     return replace(content, columns=read, metadata=metadata)
 
 
@@ -107,7 +109,7 @@ def _segments(path: Path) -> list[int]:
             if not lead_in.startswith(_MAGIC):
                 raise corrupt(f"{where} no segment begins")
             if len(lead_in) < _LEAD_IN:
-                raise Unusable("corrupt", f"{where} the file is cut off; copy it again")
+                raise corrupt(f"{where} the file is cut off")
             order = ">" if lead_in[4] & _BIG_ENDIAN else "<"
             rest, samples = struct.unpack(order + "QQ", lead_in[12:])
             if rest == _NEVER_FINISHED:
@@ -173,14 +175,12 @@ def _starts(parts: Mapping[str, Sequence[_Part]]) -> dict[str, float | None]:
         if hasattr(part.start, "as_datetime64") and part.start.as_datetime64("us") > _EPOCH
     }
     earliest = min(moments.values(), default=None)
-    found: dict[str, float | None] = {}
-    for name, part in first.items():
-        offset = float(part.offset) if isinstance(part.offset, int | float) else 0.0
-        since = 0.0
-        if earliest is not None and name in moments:
-            since = float((moments[name] - earliest) / np.timedelta64(1, "ns")) / 1e9
-        is_stated = earliest is None or name in moments
-        found[name] = since + offset if is_stated and np.isfinite(offset) else None
+    found: dict[str, float | None] = dict.fromkeys(first)
+    for name in moments or first:
+        offset = first[name].offset
+        since = float((moments[name] - earliest) / np.timedelta64(1, "ns")) / 1e9 if moments else 0
+        start = since + (float(offset) if isinstance(offset, int | float) else 0.0)
+        found[name] = start if np.isfinite(start) else None
     return found
 
 
@@ -225,9 +225,9 @@ def _check_scales(objects: Iterable[Mapping[str, object]]) -> None:
     for properties in objects:
         for key, value in properties.items():
             scale = _SCALE.match(key)
-            is_count = key == _N_SCALES or (scale is not None and key.endswith("_Size"))
+            is_count = key == _N_SCALES or (scale and key.endswith("_Size"))
             many = is_count and not (isinstance(value, int) and value <= constants.MOST_SCALES)
-            if many or (scale is not None and int(scale[1]) > constants.MOST_SCALES):
+            if many or (scale and int(scale[1]) > constants.MOST_SCALES):
                 detail = f"{listed([key])} is {str(value)[:20]!r}; export it again"
                 raise Unusable("corrupt", detail)
 
@@ -249,34 +249,27 @@ def _described(channels: Sequence[Any], parts: Mapping[str, Sequence[_Part]]) ->
     ]
 
 
-def _times(wanted: dict[str, Any], columns: ColumnMap) -> dict[str, SinceFirst]:
-    """Return the conversion of the columns of moments; all others must be numbers."""
-    found: dict[str, SinceFirst] = {}
-    for name, channel in wanted.items():
-        if channel.dtype.kind == "M" and columns.is_time(name):
-            found[name] = SinceFirst(name, columns)
-        elif channel.dtype.kind not in "fiu":
-            raise not_numeric(name, f"values of type {channel.dtype}")
-    return found
-
-
 def _read(
     file: Any, wanted: dict[str, Any], times: Mapping[str, SinceFirst], stored: int
 ) -> dict[str, Samples]:
     """Read the wanted channels in one pass, each of shape ``(n_samples,)``."""
-    check_size(8 * sum(len(channel) for channel in wanted.values()), stored)
-    taken = {name: Spool() for name in wanted}
-    for chunk in file.data_chunks() if wanted else ():
-        for name, channel in wanted.items():
-            samples = chunk[channel.group_name][channel.name]
-            if len(samples):
-                values = samples[:]
-                taken[name].append(times[name](values) if name in times else values)
     for name, channel in wanted.items():
-        if taken[name].size != len(channel):
-            found = f"{taken[name].size} of {len(channel)} samples are there"
+        if name not in times and channel.dtype.kind not in "fiu":
+            raise not_numeric(name, f"values of type {channel.dtype}")
+    sizes = {name: len(channel) for name, channel in wanted.items()}
+    check_size(8 * sum(sizes.values()), stored)
+    parts = (
+        (name, samples[:])
+        for chunk in (file.data_chunks() if wanted else ())
+        for name, channel in wanted.items()
+        if len(samples := chunk[channel.group_name][channel.name])
+    )
+    read = collected(dict.fromkeys(wanted, 0), parts, times)
+    for name, samples in read.items():
+        if samples.size != sizes[name]:
+            found = f"{samples.size} of {sizes[name]} samples are there"
             raise Unusable("corrupt", f"{name}: {found}")
-    return {name: spool.samples() for name, spool in taken.items()}
+    return read
 
 
-TDMS = Format("TDMS", (".tdms",), lambda head: head.startswith(_MAGIC), _load)
+TDMS = Format("TDMS", (".tdms",), begins(_MAGIC), _load)

@@ -6,6 +6,7 @@ and pairs tags wrongly where a line of another data set ends like one.
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lmshealth._private.arrays import ComplexArray, FloatArray
-from lmshealth.io.buffers import Samples, as_samples, blocks
+from lmshealth.io.buffers import Samples, as_samples
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import (
     Content,
@@ -23,6 +24,7 @@ from lmshealth.io.formats.content import (
     Format,
     check_memory,
     choose,
+    foreign,
     library,
     not_numeric,
     rate_of,
@@ -42,18 +44,6 @@ _TIME_RESPONSE, _UNKNOWN = 1, 0
 _TIME, _ACCELERATION = 17, 12
 _RESPONSE, _COHERENCE = 4, 6
 _REAL, _COMPLEX = (2, 4), (5, 6)
-# Names of other functions and data sets, for messages.
-_FUNCTIONS = {
-    **{0: "unknown", 1: "complex time response", 2: "spectrum", 3: "cross spectrum"},
-    **{4: "frequency response", 5: "transmissibility", 6: "coherence", 7: "correlation"},
-    **{8: "cross correlation", 9: "power spectral density", 10: "energy spectral density"},
-    **{12: "spectrum", 27: "order function"},
-}
-_SETS = {
-    **{15: "nodes", 18: "coordinate systems", 55: "mode shapes", 82: "lines of a geometry"},
-    **{151: "header", 164: "units", 780: "elements", 781: "nodes", 2411: "nodes"},
-    **{2412: "elements", 2414: "analysis", 2420: "coordinate systems", 2467: "groups"},
-}
 # Names in a header of degrees of freedom by their code; rotations are 4 to 6.
 _DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 _HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
@@ -86,8 +76,7 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
         dates = _dates(file.headers)
         described = [_describe(*named) for named in zip(file.headers, names, dates, strict=True)]
         chosen, content = choose(described, columns)
-        read: dict[str, Samples] = {}
-        stamps: dict[str, Samples] = {}
+        read, stamps, n_stamped = dict[str, Samples](), None, 0
         for name, k in chosen.items():
             header = file.headers[k]
             if not _is_time_record(header):
@@ -96,13 +85,13 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
             time, values = file.numbers(k, name, _SECONDS)
             read[name] = as_samples(values)
             if header["abscissa_spacing"] == _UNEVEN:
-                stamps[name] = as_samples(time)
-    if stamps:
-        first = next(iter(stamps.values()))
-        if len(stamps) < len(read) or not all(_equal(x, first) for x in stamps.values()):
+                stamps = time if stamps is None else stamps
+                n_stamped += np.array_equal(time, stamps)
+    if stamps is not None:
+        if n_stamped < len(read):
             detail = "the records have different time stamps; needed the same for all"
             raise Unusable("time", detail)
-        read["time_s"] = first
+        read["time_s"] = as_samples(stamps)
     return replace(content, columns=read)
 
 
@@ -131,14 +120,13 @@ def load_functions(path: Path, max_memory: float) -> list[Function]:
             if header["ord_data_type"] not in (_REAL if coherence else _COMPLEX):
                 raise not_numeric(name, "no complex numbers: export real and imaginary parts")
             axis, values = file.numbers(k, name, _HERTZ)
-            dof = [_dof(header, role) for role in ("rsp", "ref")]
-            if dof[0] == dof[1] == "0":
-                dof = [name, ""]
-            unit = [header[f"{side}_axis_units_lab"].strip() for side in ("ordinate", "orddenom")]
-            text = "/".join(f"({u})" for u in unit if u not in ("", "NONE"))
-            functions.append(
-                Function(dof[0], dof[1], axis, values.astype(complex), coherence, text)
-            )
+            output, force = (_dof(header, role) for role in ("rsp", "ref"))
+            if output == force == "0":
+                output, force = name, ""
+            units = [header[f"{side}_axis_units_lab"].strip() for side in ("ordinate", "orddenom")]
+            unit = "/".join(f"({one})" for one in units if one not in ("", "NONE"))
+            values = values.astype(complex)
+            functions.append(Function(output, force, axis, values, coherence, unit))
     return functions
 
 
@@ -272,13 +260,14 @@ def _without_padding(lines: bytes) -> bytes:
     rows = lines[layout.start :].splitlines()
     n_whole, last = divmod(layout.n_values - 1, len(layout.widths))
     width = sum(layout.widths[: last + 1])
+    end, after = rows[n_whole : n_whole + 1], rows[n_whole + 1 :]
     try:
-        after = [row[width:] if k == 0 else row for k, row in enumerate(rows[n_whole:])]
-        if any(float(word) != 0 for row in after for word in row.split()):
+        padding = b" ".join([*(row[width:] for row in end), *after])
+        if any(float(word) != 0 for word in padding.split()):
             return lines
     except ValueError:
         return lines
-    rows = [*rows[:n_whole], *(row[:width] for row in rows[n_whole : n_whole + 1])]
+    rows = [*rows[:n_whole], *(row[:width] for row in end)]
     return lines[: layout.start] + b"".join(row + b"\n" for row in rows)
 
 
@@ -297,12 +286,14 @@ def _no_time_records(
     needed = "needed acceleration over time (data sets 58, function type 1)"
     kinds = sorted({header["func_type"] for header in headers})
     if kinds:
-        text = listed(f"function type {kind} ({_FUNCTIONS.get(kind, 'another')})" for kind in kinds)
+        known = foreign("uff_functions")
+        text = listed(f"function type {k} ({known.get(str(k), 'another')})" for k in kinds)
         found = f"holds no time record but {text}: {listed(names)}"
         if _RESPONSE in kinds:
             needed += "; `lmshealth frf` reads frequency responses"
         return Unusable("columns", f"{found}; {needed}")
-    text = listed(f"{number} ({_SETS.get(number, 'another')})" for number in others)
+    known = foreign("uff_sets")
+    text = listed(f"{number} ({known.get(str(number), 'another')})" for number in others)
     return Unusable("format", f"holds the data sets {text}, and no measured functions; {needed}")
 
 
@@ -323,14 +314,12 @@ def _dates(headers: Sequence[Header]) -> list[float]:
     """
     found = [_DATE.search(header["id3"]) for header in headers]
     lengths = [header["num_pts"] * header["abscissa_inc"] for header in headers]
-    if not all(found) or not min(lengths, default=0.0) > 0:
-        return [0.0] * len(headers)
-    try:
+    moments = list[datetime]()
+    with suppress(ValueError):
         moments = [datetime.strptime(" ".join(m.groups()), "%d %b %y %H %M %S") for m in found if m]
-    except ValueError:
-        return [0.0] * len(headers)
     since = [(moment - moments[0]).total_seconds() for moment in moments]
-    apart = max(since) - min(since) > max(lengths)
+    is_stated = len(since) == len(headers) > 0 and min(lengths) > 0
+    apart = is_stated and max(since) - min(since) > max(lengths)
     return since if apart else [0.0] * len(headers)
 
 
@@ -343,8 +332,7 @@ def _describe(header: Header, name: str, date: float) -> Described:
     unit = "" if unit == "NONE" else unit
     if not _is_time_record(header):
         return Described(name, f"{unit}, no time record: function type {header['func_type']}")
-    acceleration = header["ordinate_spec_data_type"] == _ACCELERATION
-    if acceleration:
+    if acceleration := header["ordinate_spec_data_type"] == _ACCELERATION:
         # pyuff cannot read a superscript two in the Windows encoding.
         unit = unit.replace("\ufffd", "2")
     uneven = header["abscissa_spacing"] == _UNEVEN
@@ -357,12 +345,6 @@ def _is_time_record(header: Header) -> bool:
     kind = header["func_type"]
     of_unknown = kind == _UNKNOWN and header["abscissa_spec_data_type"] == _TIME
     return (kind == _TIME_RESPONSE or of_unknown) and header["ord_data_type"] in _REAL
-
-
-def _equal(one: Samples, other: Samples) -> bool:
-    return one.size == other.size and all(
-        np.array_equal(part, other[at : at + part.size]) for at, part in blocks(one)
-    )
 
 
 UFF = Format("UFF58", (".uff", ".unv"), lambda head: _START.match(head) is not None, _load)

@@ -24,7 +24,7 @@ def parse(text, **layout):
 def parse_with(text, columns):
     """Parse text or bytes by a column map."""
     data = text if isinstance(text, bytes) else text.encode()
-    return parse_text(io.BytesIO(data), len(data), columns)
+    return parse_text(io.BytesIO(data), columns)
 
 
 def test_leading_lines():
