@@ -64,8 +64,8 @@ class LifeData(ReadOnly):
         if n_logs < min_logs or now <= 0:
             raise NotEnoughData(
                 fact(
-                    "{stage}: {n} logs with a mode of the map over {travel:.4g} km; a life needs "
-                    "at least {least} logs and some travel",
+                    "{stage}: logs with a mode of the map: {n}, over {travel:.4g} km; a life "
+                    "needs at least {least} logs and some travel",
                     stage=history.stage,
                     n=n_logs,
                     travel=now / 1000,
