@@ -30,6 +30,7 @@ from lmshealth.tracking.contradictions import (
     contradiction_notices,
     doubt_of_clock,
 )
+from lmshealth.tracking.covariates import covariate_notices
 from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
@@ -196,6 +197,7 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     for history, refused in machines:
         found = missing_mode_notices(history, refused)
         found += contradiction_notices(len(history.logs), refused)
+        found += covariate_notices(history.covariates, given["stage"])
         print_notes(f"{history.stage}: {notice}" for notice in found)
     return machines
 

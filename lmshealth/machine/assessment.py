@@ -44,6 +44,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.contradictions import contradiction_notices, doubt_of_clock
+from lmshealth.tracking.covariates import covariate_notices
 from lmshealth.tracking.history import History, build_history, missing_mode_notices
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
@@ -268,6 +269,7 @@ def _before_tracking(
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
     notices += contradiction_notices(len(history.logs), refused)
+    notices += covariate_notices(history.covariates, stage)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]

@@ -72,6 +72,8 @@ DAMPING_WALK = 0.5
 BIAS_STD = (0.005, 0.2)
 # d ln f per unit of a covariate that no stage description describes.
 COVARIATE_STD = 0.001
+# Possible effect on ln f of a covariate beyond its values so far from which that is noticed: 30 K.
+EXTRAPOLATED = 0.03
 # Amplitude of the daily cycle by which a structure may lag behind its temperature sensor (K), and
 # the least that the times of the logs must resolve.
 LAGGED_CYCLE, LEAST_CYCLE = 2.0, 0.5

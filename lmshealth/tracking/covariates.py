@@ -7,6 +7,8 @@ from datetime import datetime
 import numpy as np
 
 from lmshealth._private.arrays import FloatArray
+from lmshealth._private.tables import fact
+from lmshealth.io.log import Notice
 from lmshealth.stage.description import Covariate, Stage
 from lmshealth.tracking import constants
 
@@ -73,3 +75,34 @@ def _daily(covariate: Covariate, recorded_at: Sequence[datetime]) -> list[Regres
     none = np.zeros(angle.size)
     names = (f"{covariate.name}:day-cos", f"{covariate.name}:day-sin")
     return [Regressor(n, w, covariate.prior_std, none) for n, w in zip(names, waves, strict=True)]
+
+
+def covariate_notices(covariates: Mapping[str, FloatArray], stage: Stage) -> list[Notice]:
+    """Return notices about covariates whose last values are far from those of all logs before.
+
+    Their effect on ln f is extrapolated, and may exceed `constants.EXTRAPOLATED`: a stuck sensor.
+    """
+    notices = []
+    for covariate in stage.description.covariate:
+        values = covariates.get(covariate.name, np.empty(0))
+        known = values[np.isfinite(values)].tolist()
+        first = stage.description.baseline.logs
+        low, high, far = min(known[:first], default=0.0), max(known[:first], default=0.0), 0
+        for value in known[first:]:
+            beyond = max(low - value, value - high, 0.0)
+            is_far = beyond * covariate.prior_std > constants.EXTRAPOLATED
+            far = far + 1 if is_far else 0
+            if not is_far:
+                low, high = min(low, value), max(high, value)
+        if far:
+            what = fact(
+                "{name} is {value:.4g} in the last log, far outside of {low:.4g} to {high:.4g} in "
+                "the logs before: its effect is extrapolated.",
+                name=covariate.name,
+                value=known[-1],
+                low=low,
+                high=high,
+            )
+            to_do = fact("Check its sensor, or its values in manifest.csv.")
+            notices.append(Notice("covariate-far", "caution", covariate.name, what, to_do))
+    return notices

@@ -19,6 +19,7 @@ from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.tables import machine_tables
 from lmshealth.report.text import changes, headline, service_on_day
+from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import Step
 from tests.assessments import Assessment, Maker, make, nothing
 from tests.lives import FREQUENCY, MODES, make_reading, make_stage
@@ -165,6 +166,22 @@ def test_after_a_reset_of_the_odometer_no_health_is_stated(tmp_path: Path) -> No
     (notice,) = (one for one in notices(found) if one.severity == "serious")
     assert notice.code == "logs-contradict" and notice.what == found.doubt == found.judgement.why
     assert "no-verdict" in make_status(found, summarise(found, found.service())).conditions
+
+
+@pytest.mark.parametrize(("value", "noticed"), [(-40.0, True), (5.0, False)])
+def test_a_covariate_far_from_all_before_is_noticed(
+    tmp_path: Path, value: float, noticed: bool
+) -> None:
+    """A sensor stuck at -40 °C is, also in the third such log; a cold day is not."""
+    stage, logs = load_stage("lms-y"), few_logs(12, 0.0, 1)
+    values = [20.0 + k % 3 for k in range(9)] + 3 * [value]
+    logs = [
+        replace(log, metadata=replace(log.metadata, covariates={"temperature_c": one}))
+        for log, one in zip(logs, values, strict=True)
+    ]
+    found = [one for one in notices(assess(logs, stage)) if one.code == "covariate-far"]
+    assert [one.where for one in found] == noticed * ["temperature_c"]
+    assert not noticed or f"{value:g} in the last log, far outside of 20 to 22" in found[0].what
 
 
 def test_scatter_is_no_large_drift(tmp_path: Path) -> None:
