@@ -19,6 +19,7 @@ from lmshealth.batch.store import (
     unpack_or_none,
 )
 from lmshealth.errors import LmshealthError
+from lmshealth.io.log import Refusal
 from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
 from lmshealth.machine.assessment import (
     Assessment,
@@ -53,11 +54,12 @@ class Machine:
     work: Maintenance
     epochs: int
     seed: int
+    lost: tuple[Refusal, ...] = ()  # of its logs as a whole
 
     @property
     def key(self) -> str:
         """Key of its assessment in a store."""
-        inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed
+        inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed, self.lost
         return fingerprint(VERSION, *inputs)
 
 
@@ -127,8 +129,15 @@ def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
     def work() -> PackedAssessment:
         readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
         before = unpack_or_none(known.get(key), LifeState)
-        how = {"epochs": machine.epochs, "seed": machine.seed}
-        found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
+        found, after = assess_from(
+            readings,
+            machine.stage,
+            machine.work,
+            epochs=machine.epochs,
+            seed=machine.seed,
+            before=before,
+            lost=machine.lost,
+        )
         parts = {} if after is None else {key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 

@@ -88,6 +88,7 @@ class Ingested:
     refused: tuple[Refusal, ...]
     logs: frozenset[str]
     n_cached: int
+    lost: dict[str, tuple[Refusal, ...]]  # refusals of logs of each machine, as far as it is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,8 +121,7 @@ class _Outcome(NamedTuple):
         refused = () if isinstance(found.outcome, LogEstimates) else found.outcome
         key = task.key(found.description)
         packed = pack(found) if is_new and found.lasting else None
-        machine = None if refused else found.stage
-        return cls((task.name, key), found.description, machine, refused, packed)
+        return cls((task.name, key), found.description, found.stage, refused, packed)
 
 
 def ingest(
@@ -148,9 +148,12 @@ def ingest(
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}
     lost: list[Refusal] = []
+    # Machine of each log, by the manifest or its own metadata.
+    owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
 
     def add(found: _Outcome) -> None:
         lost.extend(found.refused)
+        owners[found.key[0]] = found.machine or owners.get(found.key[0])
         if not found.refused:
             own = groups.setdefault(str(found.machine), {}).setdefault(found.description, [])
             own.append(found.key)
@@ -176,8 +179,13 @@ def ingest(
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
+    own: dict[str, list[Refusal]] = {}
+    for one in (*archive.refused, *refused, *lost):
+        if one.reason not in ("duplicate", NOT_LISTED):
+            own.setdefault(str(owners.get(one.log)), []).append(one)
     return Ingested(
         machines=machines,
+        lost={name: tuple(own.get(name, ())) for name in machines},
         refused=(*archive.refused, *refused, *lost),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,

@@ -221,6 +221,11 @@ def run(
     {'roll': 'not-excited', 'pitch': 'not-excited', 'yaw': 'not-excited'}
     """
     folder, out = Path(folder), Path(out)
+    if folder.absolute().resolve().is_relative_to(out.resolve()):
+        step = "name another folder, which may be inside of it"
+        raise LmshealthError(
+            f"{out}: contains the logs, and no file of the output is a log; {step}"
+        )
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
@@ -229,7 +234,15 @@ def run(
         ingested = ingest(folder, stages, resources, out=out, settings=settings)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         machines = [
-            Machine(name, logs, stage, work.of(name), settings.epochs, settings.seed)
+            Machine(
+                name=name,
+                logs=logs,
+                stage=stage,
+                work=work.of(name),
+                epochs=settings.epochs,
+                seed=settings.seed,
+                lost=ingested.lost[name],
+            )
             for name, (stage, logs) in ingested.machines.items()
         ]
         failed = assess_all(machines, resources)

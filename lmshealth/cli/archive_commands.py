@@ -106,7 +106,8 @@ def run(
         terminal.print_json(_document(result))
     else:
         used = result.n_logs - result.n_refused
-        again = f", {result.n_remembered} of them in an earlier run" if result.n_remembered else ""
+        again = f"; results of {result.n_remembered} are of an earlier run"
+        again = again if result.n_remembered else ""
         terminal.print_line(f"{used} of {result.n_logs} logs analysed{again}.")
         if result.n_unlisted:
             terminal.print_line(
@@ -156,7 +157,7 @@ def watch(logs: Path, stages: tuple[Stage, ...], out: Path, interval: float, **g
             used = f"{result.n_logs - result.n_refused} of {result.n_logs} logs analysed"
             more = f", {result.n_unlisted} not in manifest.csv" if result.n_unlisted else ""
             terminal.print_line(
-                f"{now}{used}, {result.n_remembered} of them in an earlier run{more}"
+                f"{now}{used}; results of {result.n_remembered} are of an earlier run{more}"
             )
             for change in result.changes:
                 terminal.print_line(f"{now}{change}")

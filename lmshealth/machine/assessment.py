@@ -61,7 +61,7 @@ class Assessment:
     health: Health | None  # none without a health parameter, or with too few logs
     prognosis: Prognosis | None  # none without health, or without a limit
     judgement: Verdict
-    refused: tuple[Refusal, ...]  # everything of this machine that was not analysed
+    refused: tuple[Refusal, ...]  # everything of its readable logs that was not analysed
     notices: tuple[Notice, ...]  # about logs and maintenance; `notices` of this folder adds others
     seed: int  # seed of all random streams
     # Spectra of the logs of the history; None when no log covers the band of the modes.
@@ -78,6 +78,7 @@ class Assessment:
     calibration: Calibration | None = None
     doubt: str = ""  # why names of modes, odometer or dates are in doubt; then there is no health
     today: date | None = None  # day of its status; None for that of the last log
+    lost: tuple[Refusal, ...] = ()  # its logs that were refused as a whole, without estimates
 
     def __repr__(self) -> str:
         judged, service = self.judgement, self.service()
@@ -225,12 +226,14 @@ def assess_from(
     epochs: int,
     seed: int,
     before: LifeState | None = None,
+    lost: Sequence[Refusal] = (),
 ) -> tuple[Assessment, LifeState | None]:
     """Assess a machine as `assess` does, from the state that its assessment before has left.
 
-    Also returned is the state from which the next assessment begins.
+    Also returned is the state from which the next assessment begins. `lost` are refusals of logs of
+    the machine as a whole.
     """
-    made = _before_tracking(readings, stage, work, seed)
+    made = replace(_before_tracking(readings, stage, work, seed), lost=tuple(lost))
     history = made.history
     try:
         tracked = track(history, stage)

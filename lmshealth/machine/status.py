@@ -26,6 +26,7 @@ from lmshealth.life.verdict import (
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.summary import Summary, days_between, prognosis_rows
+from lmshealth.tracking.constants import CONTRADICTING_SHARE, FEW_CONTRADICTIONS
 from lmshealth.tracking.contradictions import doubt_of_clock
 
 _SEVERITIES = "serious", "caution", "note"
@@ -35,6 +36,7 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
     """Return the notices about a machine, the serious ones first: rows of ``warnings.csv``."""
     found = [*assessment.notices, *_of_names(assessment), *_of_track(assessment)]
     found += [*_of_health(assessment), *_of_laws(assessment), *_of_channels(assessment)]
+    found += _of_lost_logs(assessment)
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
@@ -154,6 +156,23 @@ def _of_channels(assessment: Assessment) -> Iterator[Notice]:
         repaired = not WARNINGS[reason]
         to_do = fact("refused.csv lists all.")
         yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
+
+
+def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
+    """Yield a notice about logs that were refused as a whole."""
+    lost = {row.log: row.reason for row in assessment.lost}
+    if not lost:
+        return
+    total = len(lost) + len(assessment.history.logs)
+    many = len(lost) > max(FEW_CONTRADICTIONS, CONTRADICTING_SHARE * total)
+    what = fact(
+        "{n} of {total} logs of this machine are refused as a whole ({reasons}).",
+        n=len(lost),
+        total=total,
+        reasons=", ".join(dict.fromkeys(lost.values())),
+    )
+    to_do = fact("refused.csv has the reasons.")
+    yield Notice("logs-refused", "caution" if many else "note", max(lost), what, to_do)
 
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:
@@ -502,8 +521,11 @@ def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str,
     for code in _ENDING:
         if code in now.conditions and code not in earlier:
             yield code, "", _detail(code, now)
-        elif code in earlier.keys() - now.conditions.keys() - confirmed and not (
-            before and before.silent
+        elif (
+            before
+            and code in earlier.keys() - now.conditions.keys() - confirmed
+            and now.recorded_at > before.recorded_at  # not by another day or description
+            and not before.silent
         ):
             yield "recovered", code, f"log of {now.recorded_at.date().isoformat()}"
 

@@ -183,6 +183,7 @@ def _postponed(
 def _track_content(assessment: Assessment) -> dict[str, Any]:
     """Collect what the page shows of modes, events, covariates and data quality."""
     track, history, stage = assessment.track, assessment.history, assessment.stage
+    refused = (*assessment.lost, *assessment.refused)
     influences: tuple[CovariateEffect, ...] = ()
     content: dict[str, Any] = dict.fromkeys(("consistency", "nis", "noise_scale", "widening"))
     mac = _mac(assessment)
@@ -206,7 +207,8 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
         "corrected": _grouped(corrected, attrgetter("covariate")),
         "uncorrected": list(_uncorrected(history, stage)),
         "mode_use": list(_mode_use(history, track, stage, assessment.refused)),
-        "reasons": Counter(item.reason for item in assessment.refused).most_common(),
+        "reasons": Counter(item.reason for item in refused).most_common(),
+        "refused": refused,
         "hashes": list(zip(history.logs, assessment.digests, strict=False)),
     }
 

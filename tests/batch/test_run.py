@@ -718,6 +718,11 @@ def test_a_folder_that_cannot_be_written_to_is_an_error(tmp_path: Path, modes_on
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
         with pytest.raises(LmshealthError, match=f"{out}: cannot be written to"):
             run(logs, [modes_only], out)
+    for out in (logs, tmp_path):
+        there = sorted(out.iterdir())
+        with pytest.raises(LmshealthError, match=f"{out}: contains the logs"):
+            run(logs, [modes_only], out)
+        assert sorted(out.iterdir()) == there
 
 
 def test_settings_show_no_password() -> None:
@@ -870,6 +875,32 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     tables = ["maintenance.csv", "manifest.csv"]
     assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
     assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+
+
+@pytest.mark.slow
+def test_a_page_counts_the_logs_of_its_machine_that_were_refused(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """By the manifest, or by a log's own metadata where these can be read; others are of no page.
+
+    Each is one row of refused.csv, and a page without one states that no part was refused.
+    """
+    logs, out = write_archive(tmp_path / "logs", 4), tmp_path / "out"
+    run(logs, [modes_only], out)
+    assert "No part of them was refused" in (out / "test-A.html").read_text()
+    (logs / "log-01.h5").write_bytes(b"nothing")
+    (logs / "of-whom.h5").write_bytes(b"nothing")
+    with h5py.File(logs / "log-02.h5", "r+") as file:
+        file.attrs["recorded_at"] = "2999-01-01T00:00:00Z"
+    listed = "".join(f"{name}.h5,test-A\n" for name in ("log-01", "log-02", "gone"))
+    (logs / "manifest.csv").write_text("file,stage\n" + listed)
+    run(logs, [modes_only], out)
+    (notice,) = (row for row in rows(out / "warnings.csv") if row["code"] == "logs-refused")
+    assert notice["what"].startswith("3 of 5 logs of this machine are refused as a whole (")
+    assert notice["severity"] == "caution"
+    assert "3 parts refused" in (out / "test-A.html").read_text()
+    refused = sorted(row["log"] for row in rows(out / "refused.csv"))
+    assert refused == ["gone.h5", "log-01.h5", "log-02.h5", "of-whom.h5"]
 
 
 @pytest.mark.slow

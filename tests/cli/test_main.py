@@ -756,7 +756,7 @@ def test_a_clean_run_is_status_0_and_prints_the_path_of_its_report(
     assert str(tmp_path / "out" / "index.html") in result.stdout
     assert result.stderr == ""
     again = run(folder / "good", stage, tmp_path / "out")
-    assert "2 of them in an earlier run" in again.stdout
+    assert "results of 2 are of an earlier run" in again.stdout
 
 
 @pytest.mark.slow

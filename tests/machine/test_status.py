@@ -209,9 +209,12 @@ def test_what_moves_with_each_log_is_announced_once_per_baseline() -> None:
     assert [one.what for one in compare(found, served, moment, None)[1]] == ["service-due"]
     late = status(inspect_by=TODAY - timedelta(days=1))
     found = compare(sound, late, moment, None)[0]
-    found, changes = compare(found, sound, moment, None)
+    # Another description, or another day, is no log that has come.
+    assert compare(found, sound, moment, None)[1] == []
+    newer = status(recorded_at=LAST + timedelta(days=1))
+    found, changes = compare(found, newer, moment, None)
     assert [str(one) for one in changes] == [
-        "M7-Y: recovered inspection-overdue → log of 2026-11-20"
+        "M7-Y: recovered inspection-overdue → log of 2026-11-21"
     ]
     assert [one.what for one in compare(found, late, moment, None)[1]] == ["inspection-overdue"]
 
