@@ -140,10 +140,12 @@ def ingest(
     logs = (path for path in archive.logs if path not in settings.growing)
     found = [path for path in logs if inside not in path.resolve().parents]
     tasks, refused = _tasks(folder, found, manifest, settings.columns, resources)
+    copies = {one.log for one in refused if one.reason == "duplicate"}
+    unlisted = (name_of(path, folder) for path in found if manifest.omits(path))
     refused += [
-        Refusal(name_of(path, folder), NOT_LISTED, "it is read with its own metadata; add a row")
-        for path in found
-        if manifest.omits(path)
+        Refusal(name, NOT_LISTED, "it is read with its own metadata; add a row")
+        for name in unlisted
+        if name not in copies
     ]
     # By machine and description; only names and keys are kept, not the estimates.
     groups: dict[str, dict[str, list[LogKey]]] = {}

@@ -37,6 +37,7 @@ from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleto
 
 if TYPE_CHECKING:
     from lmshealth.modal.identification import ModalReading
+    from lmshealth.modal.modes import Modes
 
 Result = TypeVar("Result")
 
@@ -153,21 +154,29 @@ def _next_steps(log: Log, map_file: Path, band: tuple[int, int] | None) -> list[
 
 
 def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | None:
-    """Write a description of the modes of a log, where it has some; few channels are quick.
+    """Write a description of the modes of a log, where it has some.
 
-    Its clock is the time if no log has an odometer.
-    Return a band in Hz around the clear ones.
+    Its clock is the time if no log has an odometer. Return a band in Hz around those that are clear
+    in few channels, which is quick; all channels are searched in it, as by `modes`.
     """
     from lmshealth.modal.identification import read_modes
 
     used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
-            modes = read_modes(log, channels=used, progress=report).modes
+            find = partial(read_modes, log, progress=report)
+            modes = find(channels=used).modes
+            if band := _band_of(modes):
+                modes = find(band=band).modes
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes), odometer=odometer)
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])
         return None
+    return band
+
+
+def _band_of(modes: "Modes") -> tuple[int, int] | None:
+    """Return a band in Hz around the clear modes, None without any."""
     clear = modes.frequency[modes.snr >= _CLEAR]
     return (int(clear.min() / _BESIDE), math.ceil(clear.max() * _BESIDE)) if clear.size else None
 

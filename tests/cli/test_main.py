@@ -11,6 +11,7 @@ import sqlite3
 import subprocess
 import sys
 import tomllib
+import tomllib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -1070,10 +1071,14 @@ def test_init_proposes_what_modes_needs(tmp_path: Path) -> None:
     header, row = (tmp_path / "manifest.csv").read_text().splitlines()
     assert header.startswith("file,stage")
     assert row == f"a.txt,{tmp_path.name},,,,recorded_at: not found"
-    modes = call("modes", logs[0], "--columns", str(tmp_path / "map.toml"), "--format", "json")
+    band = ["--band", str(low), str(high), "--format", "json"]
+    modes = call("modes", logs[0], "--columns", str(tmp_path / "map.toml"), *band)
     assert modes.exit_code == 0
-    found = json.loads(modes.stdout)["modes"]
-    assert any(abs(one["frequency_hz"] - 62) < 1 for one in found)
+    found = [one["frequency_hz"] for one in json.loads(modes.stdout)["modes"]]
+    assert any(abs(f - 62) < 1 for f in found)
+    # The description has the modes that the proposed command finds.
+    described = tomllib.loads((tmp_path / "my-stage.toml").read_text())["mode"]
+    assert [one["frequency_hz"] for one in described] == pytest.approx(found, rel=1e-4)
     assert call("stage", str(tmp_path / "my-stage.toml")).exit_code == 0
     again = call("init", logs[0], "--out", str(tmp_path))
     assert again.exit_code == 2 and "map.toml" in again.stderr and "--overwrite" in again.stderr
