@@ -11,7 +11,6 @@ import sqlite3
 import subprocess
 import sys
 import tomllib
-import tomllib
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
