@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray, IntArray
+from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, count, runs
 from lmshealth.io.refusal import Unusable
@@ -325,9 +325,9 @@ def _rounding(velocity: Samples, expected: FloatArray) -> float:
 def _held(measured: Sequence[Samples]) -> IntArray:
     """Find stretches in which all of several channels hold one value, ``(n, 2)``, ascending.
 
-    A driver that loses its data may write zeros, or the last sample. The noise of two channels is
-    never constant in both for so long, unless they are so coarse that samples are often equal; a
-    record that is held for most of its time has another clock.
+    A driver that loses its data may write zeros, or the last sample: signals jump at the ends of a
+    stretch. They do not where a machine stands still, and its channels are coarse. A record that is
+    held for most of its time, and never for long, has another clock.
     """
     size, least = measured[0].size, constants.SHORTEST_REPEAT - 1
     if len(measured) < 2:
@@ -338,12 +338,37 @@ def _held(measured: Sequence[Samples]) -> IntArray:
             stop = at + block.size
             same[at + 1 : stop] = equal & _equal(measured[1:], at + 1, stop, 1)
     held = runs(same)
-    long = np.diff(held, axis=1)[:, 0] >= least
-    n_held, n_same = count(held[long]), int(same.sum())
-    chance = max(n_same - n_held, 1) / max(size - n_held, 1)
-    if n_held > size / 2 or -np.log(chance) * least < constants.CHANCE:
+    held = held[np.diff(held, axis=1)[:, 0] >= least]
+    n_held = count(held)
+    chance = max(int(same.sum()) - n_held, 1) / max(size - n_held, 1)
+    by_chance = -np.log(chance) * least < constants.CHANCE
+    if (
+        by_chance
+        or not len(held)
+        or _is_slow(held, size)
+        or not _jump_at_ends(measured, held, same)
+    ):
         return NO_RANGES
-    return np.asarray(held[long])
+    return np.asarray(held)
+
+
+def _is_slow(held: IntArray, size: int) -> bool:
+    """Return whether samples are held for most of the time, never for long: by a slower clock."""
+    return count(held) > size / 2 and np.diff(held, axis=1).max() < constants.SLOW_CLOCK
+
+
+def _jump_at_ends(measured: Sequence[Samples], held: IntArray, same: BoolArray) -> bool:
+    """Return whether a channel jumps at most ends of stretches, in terms of its usual values."""
+    size = measured[0].size
+    found = np.zeros(len(held))
+    for one in measured:
+        parts = [block[~same[at : at + block.size]] for at, block in blocks(one)]
+        spread = max(float(np.concatenate(parts).std()), np.finfo(float).tiny)
+        for k, (start, stop) in enumerate(held.tolist()):
+            ends = [(i - 1, i) for i in (start - 1, stop) if 0 < i < size]
+            jumps = (abs(float(one[b : b + 1][0]) - float(one[a : a + 1][0])) for a, b in ends)
+            found[k] = max(found[k], max(jumps, default=0.0) / spread)
+    return bool(np.median(found) > constants.HELD_JUMP)
 
 
 def _union(*found: IntArray) -> IntArray:

@@ -162,6 +162,9 @@ JUMP = 1.55
 # happens once in 4^16 = 4e9. It is by chance where that has a probability above exp(-40), by the
 # share of its samples that equal their neighbours.
 SHORTEST_REPEAT, CHANCE = 16, 40.0
+# Of samples that all channels hold: longest stretch of a slower clock, and jump at their ends in
+# standard deviations of the channel from which they are no standstill.
+SLOW_CLOCK, HELD_JUMP = 100, 0.5
 
 # Metadata
 

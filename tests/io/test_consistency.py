@@ -244,6 +244,26 @@ def test_samples_that_all_channels_hold_are_left_out(value):
     assert compare(None, None, None, slow, RATE, NO_BREAKS).notes == ()
 
 
+@pytest.mark.parametrize("share", [0.3, 0.9])
+def test_a_record_that_is_mostly_held_is_refused(share):
+    """However large the share is: what is left would be cut to pieces."""
+    signals = np.stack([noise(20_000, 1), noise(20_000, 2)])
+    for start in range(0, 20_000, 1000):
+        signals[:, start : start + round(1000 * share)] = 0.0
+    with pytest.raises(Unusable, match="samples repeat earlier ones"):
+        compare(None, None, None, list(signals), RATE, NO_BREAKS)
+
+
+@pytest.mark.parametrize("rest", [0.2, 0.6])
+def test_a_machine_at_rest_with_coarse_channels_is_used(rest):
+    """Ten bits show nothing while it stands; its signals fade and grow without a jump."""
+    t = np.arange(20_000)
+    slope = np.clip((np.abs(t - 10_000) - 10_000 * rest) / 2000, 0, 1)
+    signals = [rounded(slope * noise(20_000, seed), 0.05) for seed in (1, 2)]
+    assert min((own[1:] == own[:-1]).mean() for own in signals) > 0.9 * rest
+    assert compare(None, None, None, signals, RATE, NO_BREAKS).notes == ()
+
+
 def test_one_channel_that_repeats_is_no_repeated_buffer():
     """All channels must repeat."""
     one, other = noise(20_000, 1), noise(20_000, 2)
