@@ -183,8 +183,9 @@ def ingest(
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
     own: dict[str, list[Refusal]] = {}
     for one in (*archive.refused, *refused, *lost):
-        if one.reason not in ("duplicate", NOT_LISTED):
-            own.setdefault(str(owners.get(one.log)), []).append(one)
+        owner = owners.get(one.log)
+        if owner is not None and one.reason not in ("duplicate", NOT_LISTED):
+            own.setdefault(owner, []).append(one)
     return Ingested(
         machines=machines,
         lost={name: tuple(own.get(name, ())) for name in machines},

@@ -4,7 +4,7 @@ import math
 import re
 import shlex
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -167,7 +167,8 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
             find = partial(read_modes, log, progress=report)
             modes = find(channels=used).modes
             if band := _band_of(modes):
-                modes = find(band=band).modes
+                with suppress(BadLog):  # those of few channels then
+                    modes = find(band=band).modes
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes), odometer=odometer)
     except (BadLog, BadStage) as why:
         terminal.print_notes([f"{path.name}: {why}"])

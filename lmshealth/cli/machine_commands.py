@@ -110,7 +110,7 @@ def _reading(given: dict[str, Any]) -> dict[str, Any]:
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Return what the reader of a track must take into account."""
     notes = [notice.what for notice in missing_mode_notices(history, refused)]
-    notes += map(str, contradiction_notices(len(history.logs), refused))
+    notes += map(str, contradiction_notices(len(history.logs), refused, history.contradictions))
     if not history.has_odometer:
         notes.append("not every log has travel_km: the clock is the time")
     if len(history.logs) == 1:
@@ -196,9 +196,10 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     print_notes(notes)
     for history, refused in machines:
         found = missing_mode_notices(history, refused)
-        found += contradiction_notices(len(history.logs), refused)
+        found += contradiction_notices(len(history.logs), refused, history.contradictions)
         found += covariate_notices(history.covariates, given["stage"])
-        print_notes(f"{history.stage}: {notice}" for notice in found)
+        doubt = doubt_of_clock(found)  # printed as the reason why there is no life
+        print_notes(f"{history.stage}: {notice}" for notice in found if notice.what != doubt)
     return machines
 
 
@@ -278,7 +279,7 @@ def _lives(
     found, lost, stage = [], [], given["stage"]
     for k, (history, refused) in enumerate(machines):
         progress("sampling", k, len(machines))
-        contradictions = contradiction_notices(len(history.logs), refused)
+        contradictions = contradiction_notices(len(history.logs), refused, history.contradictions)
         try:
             tracked = track_modes(history, stage)
             doubt = doubt_of_clock(contradictions) or doubt_of_names(stage, history, tracked)

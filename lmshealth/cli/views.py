@@ -508,7 +508,8 @@ def _advice(life: Life, service: Service) -> Iterator[str]:
     yield f"Service: {service_text(service)} ({rule})."
     risk = probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":
-        yield f"No service is needed within {km(life.horizon)}."
+        shown = " for what the modes show" if life.undetermined else ""
+        yield f"No service is needed within {km(life.horizon)}{shown}."
     elif service.by is None:
         yield "The usage is too low for a calendar date."
     elif service.kind == "now":

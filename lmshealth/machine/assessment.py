@@ -271,7 +271,7 @@ def _before_tracking(
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
-    notices += contradiction_notices(len(history.logs), refused)
+    notices += contradiction_notices(len(history.logs), refused, history.contradictions)
     notices += covariate_notices(history.covariates, stage)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}

@@ -199,7 +199,8 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
             value=prognosis.chi_square,
             dof=dof,
         )
-        to_do = fact("Do not rely on the remaining life, and record further logs soon.")
+        rely = fact("Do not rely on the remaining life, and record further logs soon.")
+        to_do = fact("Record further logs soon.") if by_chance else rely
         yield Notice("laws-do-not-fit", "caution" if by_chance else "serious", "", what, to_do)
     fleet = assessment.calibration
     if fleet is not None and fleet.p_value < SURPRISE:
@@ -331,7 +332,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("OFF_SPEC", "large-drift", "large-drift" in serious),
         ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
-        ("MAINTENANCE_REQUIRED", "service-due", by is not None and by <= soon),
+        ("MAINTENANCE_REQUIRED", "service-due", judged and by is not None and by <= soon),
         ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
         ("CHECK_FUNCTION", "unconfirmed-jump", _UNCONFIRMED & status.warnings.keys()),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),

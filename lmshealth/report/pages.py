@@ -15,10 +15,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from scipy.special import chdtrc
 
 from lmshealth._private.files import write_text
 from lmshealth.io.log import Refusal
-from lmshealth.life.constants import LONE_NAMED
+from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
@@ -151,7 +152,8 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
         return None
     low, high = chi_square_band(np.array(dof, dtype=float)).tolist()
     side = "above" if value > high else "below" if value < low else "inside"
-    return {"value": value, "dof": dof, "low": low, "high": high, "side": side}
+    found = {"value": value, "dof": dof, "low": low, "high": high, "side": side}
+    return found | {"is_refuted": bool(chdtrc(dof, value) < MIN_FIT)}
 
 
 def _outside_map(assessment: Assessment) -> Iterator[dict[str, Any]]:

@@ -383,10 +383,10 @@ def service_on_day(summary: Summary) -> str:
         return tr("{service}, unless it was repaired", service=words)
     if summary.service.kind == "later" and summary.unknown:
         return tr("unknown without a log")
-    if summary.service.kind == "later" and summary.step.partial:
-        return tr("none by what the modes show")
     if summary.service.kind == "later" and summary.step.kind in ("inspect", "find-cause"):
         return tr("open until the cause is found")
+    if summary.service.kind == "later" and summary.step.partial:
+        return tr("none by what the modes show")
     return words
 
 
@@ -408,7 +408,7 @@ _STEPS = {
     ),
     "check-loss": mark(
         "Record a log at once: the last one deviates from those before. If the machine was "
-        "repaired in between, enter that in maintenance.csv; if not, {work} is due by {by}."
+        "repaired in between, enter that in maintenance.csv; if not, {work} is due {by}."
     ),
     "log-now": mark(
         "Record a log now: it is overdue, and the state since the last one is unknown."
@@ -440,6 +440,8 @@ def next_step(step: NextStep) -> str:
     known = _WORK.get(step.word)
     work = tr(known) if known else tr("work on {name}", name=spell(step.parameter))
     by = "" if step.by is None else day(step.by)
+    if step.kind == "check-loss":
+        by = tr("now") if step.case[1] == "now" else tr("by {day}", day=by)
     often, horizon = _often(step.log_every), km(step.horizon)
     words = _LATER_IN_PART if step.partial and step.kind == "later" else _STEPS[step.kind]
     return tr(words, work=work, by=by, often=often, horizon=horizon)

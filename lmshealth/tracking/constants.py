@@ -196,9 +196,9 @@ LEAST_LOGS_NEW, LEAST_LOGS_NAMED = 3, 2
 # machine in use, a third or more. One that was idle so long loses one log, until a second one
 # confirms its date. Rates need so many logs.
 IDLE_S, LONGEST_IDLE_S, IDLE_SHARE, DATED_LOGS = 365.25 * 86400, 10 * 365.25 * 86400, 0.02, 5
-# Of more logs than these that contradict the others, and more than this share of all, it is not
-# known which are right: a clock or an odometer was reset.
-FEW_CONTRADICTIONS, CONTRADICTING_SHARE = 2, 0.1
+# Of more logs in a row than these that contradict the others, or more than these and this share of
+# all, it is not known which are right: a clock or an odometer was reset. Slips are single logs.
+FEW_CONTRADICTIONS, CONTRADICTING_SHARE = 2, 0.15
 # So many logs in a row without an assigned estimate of a mode are reported.
 MISSING_LOGS = 3
 # Smallest relative standard deviation of a frequency in a foreign table, and smallest and largest

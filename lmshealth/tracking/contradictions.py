@@ -3,6 +3,7 @@
 from bisect import bisect_right
 from collections.abc import Sequence
 from datetime import UTC, datetime
+from itertools import groupby
 
 import numpy as np
 
@@ -16,6 +17,7 @@ from lmshealth.tracking import constants
 
 LEFT_OUT = ("odometer", "date", "odd-rate")
 """Reasons for which a log as a whole is left out of a history."""
+_TIMES = LEFT_OUT[:2]
 NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 """In place of the moment of a log that states none."""
 
@@ -36,11 +38,21 @@ def without_contradictions(
     return ordered, refused
 
 
-def contradiction_notices(n_used: int, refused: Sequence[Refusal]) -> list[Notice]:
+def most_in_a_row(readings: Sequence[LogEstimates], refused: Sequence[Refusal]) -> int:
+    """Return how many logs in a row of time are left out for their odometer or date, at most."""
+    out = {one.log for one in refused if one.reason in _TIMES}
+    rows = groupby(sort_by_time(readings), lambda one: one.log in out)
+    return max((len([*own]) for is_out, own in rows if is_out), default=0)
+
+
+def contradiction_notices(
+    n_used: int, refused: Sequence[Refusal], in_a_row: int = 0
+) -> list[Notice]:
     """Return notices about logs that contradict the others of a machine, ``n_used`` of them.
 
-    One of the code ``logs-contradict`` is serious: too many contradict by odometer or date to know
-    which are right, so that no health must be inferred from the others.
+    One of the code ``logs-contradict`` is serious: so many contradict by odometer or date, in all
+    or ``in_a_row``, that a clock was reset and it is not known which are right: no health must be
+    inferred from the others.
     """
     rates = [one.log for one in refused if one.reason == "odd-rate"]
     notices = []
@@ -53,12 +65,13 @@ def contradiction_notices(n_used: int, refused: Sequence[Refusal]) -> list[Notic
             "Find out which rate is right (refused.csv has both), and correct manifest.csv."
         )
         notices.append(Notice("odd-rate", "caution", rates[0], what, to_do))
-    times = [one.log for one in refused if one.reason in ("odometer", "date")]
+    times = [one.log for one in refused if one.reason in _TIMES]
     n, total = len(times), len(times) + n_used
     if not n:
         return notices
     to_do = fact("Correct odometer or date of the logs of refused.csv in manifest.csv.")
-    if n > max(constants.FEW_CONTRADICTIONS, constants.CONTRADICTING_SHARE * total):
+    few = constants.FEW_CONTRADICTIONS
+    if in_a_row > few or n > max(few, constants.CONTRADICTING_SHARE * total):
         what = fact(
             "{n} of {total} logs contradict the others by odometer or date, as after a reset: "
             "which of them are right is not known, so that no health is published.",

@@ -12,6 +12,8 @@ from lmshealth.io.log import Notice
 from lmshealth.stage.description import Covariate, Stage
 from lmshealth.tracking import constants
 
+_SET = ("payload_kg", "position_mm")  # known, not measured: a new value is no fault
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Regressor:
@@ -84,22 +86,24 @@ def covariate_notices(covariates: Mapping[str, FloatArray], stage: Stage) -> lis
     """
     notices = []
     for covariate in stage.description.covariate:
-        values = covariates.get(covariate.name, np.empty(0))
-        known = values[np.isfinite(values)].tolist()
+        values = covariates.get(covariate.name, np.full(1, np.nan))
+        known = values[np.isfinite(values)]
+        # Of the logs before; the middle of the first ones, as one of these may be wrong.
         first = stage.description.baseline.logs
-        low, high, far = min(known[:first], default=0.0), max(known[:first], default=0.0), 0
-        for value in known[first:]:
+        if not np.isfinite(values[-1]) or known.size <= first or covariate.name in _SET:
+            continue
+        low, high = np.quantile(known[:first], (0.25, 0.75)).tolist()
+        for value in known[first:].tolist():
             beyond = max(low - value, value - high, 0.0)
             is_far = beyond * covariate.prior_std > constants.EXTRAPOLATED
-            far = far + 1 if is_far else 0
             if not is_far:
                 low, high = min(low, value), max(high, value)
-        if far:
+        if is_far:
             what = fact(
-                "{name} is {value:.4g} in the last log, far outside of {low:.4g} to {high:.4g} in "
-                "the logs before: its effect is extrapolated.",
+                "{name} is {value:.4g} in the last log, far outside of its range before, {low:.4g} "
+                "to {high:.4g}: its effect is extrapolated.",
                 name=covariate.name,
-                value=known[-1],
+                value=values[-1],
                 low=low,
                 high=high,
             )

@@ -17,7 +17,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
-from lmshealth.tracking.contradictions import NO_MOMENT, without_contradictions
+from lmshealth.tracking.contradictions import NO_MOMENT, most_in_a_row, without_contradictions
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.maintenance import RESETS, Action
 
@@ -87,6 +87,7 @@ class History(Result):
     loop_error: FloatArray  # RMS following error below 40 Hz in m, ``(n_logs,)``, NaN where unknown
     baselines: tuple[int, ...]  # logs at which health is 1: the first, and one after each reset
     steps: tuple[Step, ...] = ()  # declared ones, in order
+    contradictions: int = 0  # most logs in a row that are left out for their odometer or date
 
     def __post_init__(self) -> None:
         n, r = len(self.logs), len(self.series)
@@ -304,6 +305,7 @@ def build_history(
         loop_error=np.array([r.loop_error or np.nan for r in ordered], dtype=float),
         baselines=_baselines(ordered, steps),
         steps=steps,
+        contradictions=most_in_a_row(readings, refused),
     )
     return history, refused
 

@@ -181,7 +181,7 @@ def test_a_covariate_far_from_all_before_is_noticed(
     ]
     found = [one for one in notices(assess(logs, stage)) if one.code == "covariate-far"]
     assert [one.where for one in found] == noticed * ["temperature_c"]
-    assert not noticed or f"{value:g} in the last log, far outside of 20 to 22" in found[0].what
+    assert not noticed or f"{value:g} in the last log, far outside of" in found[0].what
 
 
 def test_scatter_is_no_large_drift(tmp_path: Path) -> None:

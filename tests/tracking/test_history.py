@@ -91,21 +91,29 @@ def test_one_mistyped_odometer_does_not_rewrite_the_life(stage: Stage) -> None:
         assert f"{wrong / 1000:g}" in refused[0].detail
 
 
-@pytest.mark.parametrize(("reset", "doubt"), [(11, False), (9, True), (3, True)])
+@pytest.mark.parametrize(
+    ("n_logs", "reset", "slips", "doubt"),
+    [
+        *((12, 11, (), False), (12, 9, (), True), (12, 3, (), True), (101, 91, (), True)),
+        *((60, 60, (5, 17, 30, 44, 45), False), (12, 12, (3, 6), False)),
+    ],
+)
 def test_after_a_reset_of_the_odometer_no_log_is_known_to_be_right(
-    stage: Stage, reset: int, doubt: bool
+    stage: Stage, n_logs: int, reset: int, slips: tuple[int, ...], doubt: bool
 ) -> None:
-    """More than two logs, and a tenth, contradict the others: a serious notice instead of health.
+    """More than two logs in a row contradict the others: a serious notice instead of health.
 
-    A single one is left out.
+    Single ones are left out, also several of a long life.
     """
-    travels = [1e5 * (k + 1 if k < reset else 0.5 + k - reset) for k in range(12)]
+    travels = [1e5 * (k + 1 if k < reset else 0.5 + k - reset) for k in range(n_logs)]
+    for k in slips:
+        travels[k] = 1e9
     readings = [make_reading(str(k), k, s, {"roll": 4.8}) for k, s in enumerate(travels)]
     history, refused = build_history(readings, stage)
-    (notice,) = contradiction_notices(len(history.logs), refused)
+    (notice,) = contradiction_notices(len(history.logs), refused, history.contradictions)
     severity, code = ("serious", "contradict") if doubt else ("caution", "left-out")
     assert (notice.severity, notice.code) == (severity, f"logs-{code}")
-    assert notice.what.startswith(f"{len(refused)} of 12 logs")
+    assert notice.what.startswith(f"{len(refused)} of {n_logs} logs")
     assert doubt_of_clock([notice]) == (notice.what if doubt else "")
 
 
@@ -476,7 +484,7 @@ def test_a_log_whose_frequencies_follow_another_rate_is_left_out(stage, at, odd)
     assert history.logs == tuple(str(k) for k in range(12) if k != at)
     [one] = [own for own in refused if own.reason == "odd-rate"]
     assert one.log == str(at) and f"{odd:g} Hz" in one.detail and "20000 Hz" in one.detail
-    [notice] = contradiction_notices(len(history.logs), refused)
+    [notice] = contradiction_notices(len(history.logs), refused, history.contradictions)
     assert (notice.code, notice.severity, notice.where) == ("odd-rate", "caution", str(at))
 
 
@@ -511,7 +519,8 @@ def test_other_rates_whose_frequencies_agree_are_kept(stage, rates):
     """A rate that was set otherwise moves no frequency."""
     history, refused = build_history(rated(rates, follow=0.0), stage)
     assert (
-        len(history.logs) == len(rates) and contradiction_notices(len(history.logs), refused) == []
+        len(history.logs) == len(rates)
+        and contradiction_notices(len(history.logs), refused, history.contradictions) == []
     )
 
 
@@ -522,4 +531,7 @@ def test_a_rate_that_is_off_by_less_than_modes_resolve_is_noted(stage):
     [one] = refused
     assert (one.log, one.reason, one.channel) == ("11", "rate", "sample_rate_hz")
     assert "19990 Hz" in one.detail and "20000 Hz" in one.detail
-    assert one.reason in WARNINGS and contradiction_notices(len(history.logs), refused) == []
+    assert (
+        one.reason in WARNINGS
+        and contradiction_notices(len(history.logs), refused, history.contradictions) == []
+    )
