@@ -19,7 +19,6 @@ from lmshealth.batch.store import (
     unpack_or_none,
 )
 from lmshealth.errors import LmshealthError
-from lmshealth.io.log import Refusal
 from lmshealth.life.fleet_prior import EndedLife, FleetContribution, FleetPrior, fleet_priors
 from lmshealth.machine.assessment import (
     Assessment,
@@ -54,12 +53,11 @@ class Machine:
     work: Maintenance
     epochs: int
     seed: int
-    lost: tuple[Refusal, ...] = ()  # of its logs as a whole
 
     @property
     def key(self) -> str:
         """Key of its assessment in a store."""
-        inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed, self.lost
+        inputs = self.logs, self.stage.digest, self.work, self.epochs, self.seed
         return fingerprint(VERSION, *inputs)
 
 
@@ -129,15 +127,8 @@ def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
     def work() -> PackedAssessment:
         readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
         before = unpack_or_none(known.get(key), LifeState)
-        found, after = assess_from(
-            readings,
-            machine.stage,
-            machine.work,
-            epochs=machine.epochs,
-            seed=machine.seed,
-            before=before,
-            lost=machine.lost,
-        )
+        how = {"epochs": machine.epochs, "seed": machine.seed}
+        found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
         parts = {} if after is None else {key: pack(after)}
         return replace(pack_assessment(found), parts=parts)
 

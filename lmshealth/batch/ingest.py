@@ -88,7 +88,6 @@ class Ingested:
     refused: tuple[Refusal, ...]
     logs: frozenset[str]
     n_cached: int
-    lost: dict[str, tuple[Refusal, ...]]  # refusals of logs of each machine, as far as it is known
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,15 +180,10 @@ def ingest(
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
-    own: dict[str, list[Refusal]] = {}
-    for one in (*archive.refused, *refused, *lost):
-        owner = owners.get(one.log)
-        if owner is not None and one.reason not in ("duplicate", NOT_LISTED):
-            own.setdefault(owner, []).append(one)
+    every = (*archive.refused, *refused, *lost)
     return Ingested(
         machines=machines,
-        lost={name: tuple(own.get(name, ())) for name in machines},
-        refused=(*archive.refused, *refused, *lost),
+        refused=tuple(replace(one, machine=owners.get(one.log) or "") for one in every),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,
     )
@@ -412,8 +406,8 @@ def identify_log(
         log = read(task.path, name=task.name, **how)
         if log.digest != task.digest:
             raise BadLog(task.name, "changed", "it is being written to; run again")
-        require_identity(log, odometer=False)
         stage, asked = log.metadata.stage, log.metadata.description
+        require_identity(log, odometer=False)
         described = _matching(stages, log.metadata)
         if described is None:
             by = _none_of(stages)

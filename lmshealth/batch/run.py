@@ -52,6 +52,8 @@ from lmshealth.tracking.maintenance import read_maintenance
 # Output of one machine
 
 # matplotlib's settings are shared by the threads of a Dask worker.
+# Reasons of refusals by which no log is lost.
+_COPIES = "duplicate", NOT_LISTED
 _DRAWING = threading.Lock()
 
 
@@ -59,7 +61,8 @@ _DRAWING = threading.Lock()
 class MachineRecord:
     """Packed results of a machine, from which its page (a file) and its rows are made.
 
-    ``logs`` is None where no tables are needed; ``before`` is its previous report.
+    ``logs`` is None where no tables are needed; ``before`` is its previous report, ``lost`` are its
+    logs that were refused as a whole.
     """
 
     machine: str
@@ -67,6 +70,7 @@ class MachineRecord:
     assessment: bytes | None
     logs: PackedLogs | None
     before: Summary | None
+    lost: tuple[Refusal, ...] = ()
     language: Language = "en"  # of its page
 
 
@@ -87,6 +91,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     logs = unpack_logs(record.logs or ())
     if found is None or (record.logs is not None and not logs):
         return None
+    found = replace(found, lost=record.lost)
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
@@ -234,15 +239,7 @@ def run(
         ingested = ingest(folder, stages, resources, out=out, settings=settings)
         refused = (*ingested.refused, *(one.refusal for one in work.unread))
         machines = [
-            Machine(
-                name=name,
-                logs=logs,
-                stage=stage,
-                work=work.of(name),
-                epochs=settings.epochs,
-                seed=settings.seed,
-                lost=ingested.lost[name],
-            )
+            Machine(name, logs, stage, work.of(name), settings.epochs, settings.seed)
             for name, (stage, logs) in ingested.machines.items()
         ]
         failed = assess_all(machines, resources)
@@ -295,11 +292,12 @@ def report(
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
     judging = _judging(store, settings)
+    refused = store.refused(one.refused for one in present)
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
         own = ((one.machine, one.key, files[one.machine]) for one in present)
-        records = (_record(*one, store, settings.language) for one in own)
+        records = (_record(*one, store, settings.language, refused) for one in own)
         made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
         made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
         for record, [output] in made:
@@ -312,7 +310,6 @@ def report(
         raise store.unfilled("no assessment that this version of lmshealth can read")
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
-    refused = store.refused(one.refused for one in present)
     with in_language(settings.language):
         index = write_index(out, ranked, refused, today=judging.moment.date())
     return RunResult(
@@ -345,9 +342,8 @@ def _counted(
     result: RunResult, ingested: Ingested, refused: Sequence[Refusal], excluded: set[str]
 ) -> tuple[RunResult, set[str]]:
     """Add the counts of logs to a result; return the logs that were refused as a whole too."""
-    apart = "duplicate", NOT_LISTED
-    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in apart)
-    others = {refusal.log for refusal in refused if refusal.reason not in apart}
+    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
+    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
     lost = (others - copies | excluded) & ingested.logs
     counted = replace(
         result,
@@ -410,7 +406,7 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources, judging.language):
+        for name, output in _outputs(left, keys, files, resources, judging.language, refused):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -438,6 +434,7 @@ def _outputs(
     files: Mapping[str, str],
     resources: Resources,
     language: Language,
+    refused: Sequence[Refusal],
 ) -> Iterator[tuple[str, MachineOutput | str]]:
     """Yield the outputs of machines; those of unchanged results are taken from the store.
 
@@ -447,7 +444,7 @@ def _outputs(
 
     def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
         name = machine.name
-        return _record(name, keys[name], files[name], store, language, logs)
+        return _record(name, keys[name], files[name], store, language, refused, logs)
 
     # Its logs, which are large, follow from their names and keys.
     own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
@@ -483,11 +480,13 @@ def _record(
     file: str,
     store: Store,
     language: Language,
+    refused: Sequence[Refusal],
     logs: PackedLogs | None = None,
 ) -> MachineRecord:
-    """Fetch the results of a machine from the store."""
+    """Fetch the results of a machine from the store; ``refused`` are of all machines."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    return MachineRecord(machine, file, assessment, logs, before, language)
+    lost = tuple(one for one in refused if one.machine == machine and one.reason not in _COPIES)
+    return MachineRecord(machine, file, assessment, logs, before, lost, language)
 
 
 # Watch

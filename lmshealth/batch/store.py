@@ -353,7 +353,7 @@ class Store:
         return dict(self._all("parts", machine))
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
-        """Store a list of logs that belong to no machine, and return its key."""
+        """Store a list of logs that were refused as a whole, and return its key."""
         key = fingerprint(refused)
         self._put("refused", {key: pack(refused)})
         return key
@@ -362,7 +362,7 @@ class Store:
         """Make an assessment the present one of a machine, and delete its other assessments.
 
         The keys are that of the assessment, and those of others of the machine that stay;
-        ``refused`` is that of the list of logs that belong to no machine.
+        ``refused`` is that of the list of logs that were refused as a whole.
         """
         key = keys[0]
         summary = self._get("summary", key, machine)
@@ -391,7 +391,7 @@ class Store:
         return tuple(sorted(present, key=lambda one: one.machine))
 
     def refused(self, keys: Iterable[str]) -> tuple[Refusal, ...]:
-        """Fetch lists of logs that belong to no machine, each refusal once."""
+        """Fetch lists of logs that were refused as a whole, each refusal once."""
         asked = dict.fromkeys(keys)
         found = {
             key: unpack_or_none(content, tuple[Refusal, ...]) or ()

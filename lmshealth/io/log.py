@@ -112,6 +112,8 @@ class Refusal:
     source: str = ""
     # Of a refused mode in Hz.
     frequency: float | None = field(default=None, compare=False, kw_only=True)
+    # Of a log as a whole in an archive, as far as it is known.
+    machine: str = field(default="", compare=False, kw_only=True)
 
 
 # Reasons of warnings among the refusals of a log, which name a channel: it is used nevertheless.

@@ -226,14 +226,12 @@ def assess_from(
     epochs: int,
     seed: int,
     before: LifeState | None = None,
-    lost: Sequence[Refusal] = (),
 ) -> tuple[Assessment, LifeState | None]:
     """Assess a machine as `assess` does, from the state that its assessment before has left.
 
-    Also returned is the state from which the next assessment begins. `lost` are refusals of logs of
-    the machine as a whole.
+    Also returned is the state from which the next assessment begins.
     """
-    made = replace(_before_tracking(readings, stage, work, seed), lost=tuple(lost))
+    made = _before_tracking(readings, stage, work, seed)
     history = made.history
     try:
         tracked = track(history, stage)

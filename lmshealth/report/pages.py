@@ -450,7 +450,7 @@ def write_index(
 ) -> Path:
     """Write ``index.html`` and ``how-to-read.html``; the order of the summaries is of no effect.
 
-    ``refused`` are logs that belong to no machine; ``today`` is the day of the page, by default
+    ``refused`` are logs that were not analysed; ``today`` is the day of the page, by default
     that of the newest log.
     """
     ranked = by_urgency(summaries)

@@ -881,7 +881,7 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
 def test_a_page_counts_the_logs_of_its_machine_that_were_refused(
     tmp_path: Path, modes_only: Stage
 ) -> None:
-    """By the manifest, or by a log's own metadata where these can be read; others are of no page.
+    """Whose log it is states the manifest where the log cannot be read; others are of no page.
 
     Each is one row of refused.csv, and a page without one states that no part was refused.
     """
