@@ -342,7 +342,8 @@ def claims(record: Row) -> Iterator[Claim]:
     once = sum(event["alerts"] == 1 for event in events)
     yield counted("events announced once", once, len(events), beside, met=passed[check])
     beside = f"{record['late']} alerts, judged above, that a log is later than asked for"
-    yield Claim("alarms of the six healthy machines", str(sum(record["alarms"].values())), "",
+    what = "alarms of the six healthy machines, but for late logs"
+    yield Claim(what, str(sum(record["alarms"].values())), "",
                 beside, passed["no alarm of a healthy machine"])  # fmt: skip
 
 
