@@ -51,9 +51,9 @@ from lmshealth.tracking.maintenance import read_maintenance
 
 # Output of one machine
 
-# matplotlib's settings are shared by the threads of a Dask worker.
 # Reasons of refusals by which no log is lost.
 _COPIES = "duplicate", NOT_LISTED
+# matplotlib's settings are shared by the threads of a Dask worker.
 _DRAWING = threading.Lock()
 
 
@@ -293,11 +293,12 @@ def report(
     progress("reporting", 0, len(present))
     judging = _judging(store, settings)
     refused = store.refused(one.refused for one in present)
+    lost = _lost_of(refused)
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
         own = ((one.machine, one.key, files[one.machine]) for one in present)
-        records = (_record(*one, store, settings.language, refused) for one in own)
+        records = (_record(*one, store, settings.language, lost) for one in own)
         made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
         made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
         for record, [output] in made:
@@ -394,7 +395,7 @@ def _report(
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
-    refused_key = store.put_refused(tuple(refused))
+    refused_key, lost = store.put_refused(tuple(refused)), _lost_of(refused)
     rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
@@ -406,7 +407,7 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources, judging.language, refused):
+        for name, output in _outputs(left, keys, files, resources, judging.language, lost):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -434,7 +435,7 @@ def _outputs(
     files: Mapping[str, str],
     resources: Resources,
     language: Language,
-    refused: Sequence[Refusal],
+    lost: Mapping[str, tuple[Refusal, ...]],
 ) -> Iterator[tuple[str, MachineOutput | str]]:
     """Yield the outputs of machines; those of unchanged results are taken from the store.
 
@@ -444,7 +445,7 @@ def _outputs(
 
     def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
         name = machine.name
-        return _record(name, keys[name], files[name], store, language, refused, logs)
+        return _record(name, keys[name], files[name], store, language, lost, logs)
 
     # Its logs, which are large, follow from their names and keys.
     own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
@@ -480,13 +481,22 @@ def _record(
     file: str,
     store: Store,
     language: Language,
-    refused: Sequence[Refusal],
+    lost: Mapping[str, tuple[Refusal, ...]],
     logs: PackedLogs | None = None,
 ) -> MachineRecord:
-    """Fetch the results of a machine from the store; ``refused`` are of all machines."""
+    """Fetch the results of a machine from the store; ``lost`` are of all machines."""
     assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    lost = tuple(one for one in refused if one.machine == machine and one.reason not in _COPIES)
-    return MachineRecord(machine, file, assessment, logs, before, lost, language)
+    own = lost.get(machine, ())
+    return MachineRecord(machine, file, assessment, logs, before, own, language)
+
+
+def _lost_of(refused: Iterable[Refusal]) -> dict[str, tuple[Refusal, ...]]:
+    """Return the logs of each machine that were refused as a whole."""
+    found: dict[str, list[Refusal]] = {}
+    for one in refused:
+        if one.reason not in _COPIES:
+            found.setdefault(one.machine, []).append(one)
+    return {machine: tuple(own) for machine, own in found.items()}
 
 
 # Watch

@@ -25,13 +25,14 @@ from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.report import tables
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
 from lmshealth.stage.description import Decision
-from lmshealth.tracking.contradictions import (
-    LEFT_OUT,
+from lmshealth.tracking.contradictions import LEFT_OUT
+from lmshealth.tracking.covariates import covariate_notices
+from lmshealth.tracking.history import (
+    History,
     contradiction_notices,
     doubt_of_clock,
+    missing_mode_notices,
 )
-from lmshealth.tracking.covariates import covariate_notices
-from lmshealth.tracking.history import History, missing_mode_notices
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.smoother import smooth
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals
@@ -110,7 +111,7 @@ def _reading(given: dict[str, Any]) -> dict[str, Any]:
 def _notes(history: History, refused: list[Refusal]) -> list[str]:
     """Return what the reader of a track must take into account."""
     notes = [notice.what for notice in missing_mode_notices(history, refused)]
-    notes += map(str, contradiction_notices(len(history.logs), refused, history.contradictions))
+    notes += map(str, contradiction_notices(history, refused))
     if not history.has_odometer:
         notes.append("not every log has travel_km: the clock is the time")
     if len(history.logs) == 1:
@@ -196,10 +197,10 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     print_notes(notes)
     for history, refused in machines:
         found = missing_mode_notices(history, refused)
-        found += contradiction_notices(len(history.logs), refused, history.contradictions)
+        found += contradiction_notices(history, refused)
         found += covariate_notices(history.covariates, given["stage"])
-        doubt = doubt_of_clock(found)  # printed as the reason why there is no life
-        print_notes(f"{history.stage}: {notice}" for notice in found if notice.what != doubt)
+        # What is serious is printed as the reason why there is no life.
+        print_notes(f"{history.stage}: {one}" for one in found if one.severity != "serious")
     return machines
 
 
@@ -279,10 +280,9 @@ def _lives(
     found, lost, stage = [], [], given["stage"]
     for k, (history, refused) in enumerate(machines):
         progress("sampling", k, len(machines))
-        contradictions = contradiction_notices(len(history.logs), refused, history.contradictions)
         try:
             tracked = track_modes(history, stage)
-            doubt = doubt_of_clock(contradictions) or doubt_of_names(stage, history, tracked)
+            doubt = doubt_of_clock(history, refused) or doubt_of_names(stage, history, tracked)
             if doubt:
                 raise NotEnoughData(f"{history.stage}: {doubt}")
             accepted = accepted_estimates(history, tracked)

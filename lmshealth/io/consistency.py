@@ -12,6 +12,7 @@ import numpy as np
 from lmshealth._private.arrays import BoolArray, FloatArray, IntArray
 from lmshealth.io import constants
 from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, blocks, count, runs
+from lmshealth.io.channel_checks import within
 from lmshealth.io.refusal import Unusable
 from lmshealth.io.time_axis import resolution, too_many
 
@@ -82,7 +83,8 @@ def compare(
         where that happens too often to cut the record.
     """
     size = measured[0].size
-    copies = _union(_repeats(measured), _held(measured))
+    ranges = np.concatenate([_repeats(measured), _held(measured)])
+    copies = runs(within(ranges, 0, size)) if len(ranges) else NO_RANGES
     notes: list[tuple[str, str, str]] = []
     if n_lost := count(copies):
         found = f"{n_lost} samples repeat earlier ones in all channels, in {len(copies)} ranges"
@@ -369,17 +371,6 @@ def _jump_at_ends(measured: Sequence[Samples], held: IntArray, same: BoolArray) 
             jumps = (abs(float(one[b : b + 1][0]) - float(one[a : a + 1][0])) for a, b in ends)
             found[k] = max(found[k], max(jumps, default=0.0) / spread)
     return bool(np.median(found) > constants.HELD_JUMP)
-
-
-def _union(*found: IntArray) -> IntArray:
-    """Join half-open ranges, ``(n, 2)`` each, to ascending ones that do not touch."""
-    ranges = np.concatenate(found)
-    ranges = ranges[np.argsort(ranges[:, 0])]
-    if len(ranges) < 2:
-        return ranges
-    ends = np.maximum.accumulate(ranges[:, 1])
-    first = np.flatnonzero(np.append(True, ranges[1:, 0] > ends[:-1]))
-    return np.stack([ranges[first, 0], ends[np.append(first[1:] - 1, len(ranges) - 1)]], axis=1)
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:

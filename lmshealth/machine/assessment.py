@@ -43,9 +43,14 @@ from lmshealth.machine.service import Service, decide
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.contradictions import contradiction_notices, doubt_of_clock
 from lmshealth.tracking.covariates import covariate_notices
-from lmshealth.tracking.history import History, build_history, missing_mode_notices
+from lmshealth.tracking.history import (
+    History,
+    build_history,
+    contradiction_notices,
+    doubt_of_clock,
+    missing_mode_notices,
+)
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
@@ -240,7 +245,7 @@ def assess_from(
         return replace(made, notices=(*made.notices, notice)), None
     by_log = {reading.log: reading for reading in readings}
     used = [by_log[log] for log in history.logs]
-    doubt = doubt_of_clock(made.notices) or doubt_of_names(stage, history, tracked, used)
+    doubt = doubt_of_clock(history, made.refused) or doubt_of_names(stage, history, tracked, used)
     refused = (*made.refused, *outlier_refusals(history, tracked))
     judgement = judge(stage, history, None, tracked, doubt=doubt)
     made = replace(made, track=tracked, doubt=doubt, refused=refused, judgement=judgement)
@@ -269,7 +274,7 @@ def _before_tracking(
     history, refused = build_history(readings, stage, work.actions)
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
-    notices += contradiction_notices(len(history.logs), refused, history.contradictions)
+    notices += contradiction_notices(history, refused)
     notices += covariate_notices(history.covariates, stage)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}

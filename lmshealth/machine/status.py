@@ -26,8 +26,7 @@ from lmshealth.life.verdict import (
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.summary import Summary, days_between, prognosis_rows
-from lmshealth.tracking.constants import CONTRADICTING_SHARE, FEW_CONTRADICTIONS
-from lmshealth.tracking.contradictions import doubt_of_clock
+from lmshealth.tracking.contradictions import are_many
 
 _SEVERITIES = "serious", "caution", "note"
 
@@ -42,7 +41,7 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
 
 def _of_names(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about names of modes and flags of their last estimates."""
-    if assessment.doubt not in ("", doubt_of_clock(assessment.notices)):
+    if assessment.doubt and all(one.what != assessment.doubt for one in assessment.notices):
         yield Notice("names-in-doubt", "serious", "", assessment.doubt)
     latest = assessment.latest
     flags = () if latest is None else zip(latest.modes.names, latest.modes.flags, strict=True)
@@ -164,7 +163,6 @@ def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
     if not lost:
         return
     total = len(lost) + len(assessment.history.logs)
-    many = len(lost) > max(FEW_CONTRADICTIONS, CONTRADICTING_SHARE * total)
     what = fact(
         "{n} of {total} logs of this machine are refused as a whole ({reasons}).",
         n=len(lost),
@@ -172,7 +170,9 @@ def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
         reasons=", ".join(dict.fromkeys(lost.values())),
     )
     to_do = fact("refused.csv has the reasons.")
-    yield Notice("logs-refused", "caution" if many else "note", max(lost), what, to_do)
+    yield Notice(
+        "logs-refused", "caution" if are_many(len(lost), total) else "note", max(lost), what, to_do
+    )
 
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:

@@ -9,7 +9,7 @@ excitation, and what is credible is published. A description gives hints to the 
 what was found.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
@@ -351,20 +351,16 @@ def read_ambient(
     seen = [*tested, *whole.removed_lines, *(line for one in fitted for line in one.lines)]
     lines = name_lines(seen, [s.velocity for s in stretches], stage, 1.5 / whole.duration)
     lines += _wandering(sought)
-    credible = [one.modes for fit in fits if (one := fit.credible) is not None]
-    unlike = set.intersection(*({*part.left_out} for part in sought))
-    shown = tuple(name for name in whole.channels if name not in unlike)
     rejected = [
         Refusal(log.name, why.reason, why.detail, mode=name, frequency=why.frequency)
         for fit in fits
         for name, why in fit.rejected.items()
     ]
-    refused = [
-        Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
-        for part in sought
-        for name in part.left_out
-    ]
-    modes = merge(credible, lines, (*log.refused, *refused, *short), shown)
+    credible = [one.modes for fit in fits if (one := fit.credible) is not None]
+    refused = (*log.refused, *_unlike_others(log, sought), *short)
+    unlike = set.intersection(*({*part.left_out} for part in sought))
+    shown = tuple(name for name in whole.channels if name not in unlike)
+    modes = merge(credible, lines, refused, shown)
     if stage is not None:
         modes = named.publish(modes, hints, {row.mode: row for row in rejected})
     elif modes.names:
@@ -373,6 +369,13 @@ def read_ambient(
         nothing = _nothing_found(log, lines, rejected)
         modes = replace(modes, refused=(*modes.refused, nothing))
     return ModalReading(modes, whole, tuple(one.fitted for one in fitted), tuple(rejected), sought)
+
+
+def _unlike_others(log: Log, sought: Sequence[Found]) -> Iterator[Refusal]:
+    """Yield a refusal of each channel that a search has left out."""
+    for part in sought:
+        for name in part.left_out:
+            yield Refusal(log.name, "unlike-others", _UNLIKE.format(*part.band), channel=name)
 
 
 def _wandering(sought: Sequence[Found]) -> tuple[Line, ...]:

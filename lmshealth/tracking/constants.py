@@ -204,8 +204,8 @@ MISSING_LOGS = 3
 # Smallest relative standard deviation of a frequency in a foreign table, and smallest and largest
 # standard deviation of a drift: smaller ones are lost in rounding, a factor of 20 is no drift.
 LEAST_RELATIVE_STD, LEAST_DRIFT_STD, MOST_DRIFT = 1e-7, 1e-9, 3.0
-# Range of damping ratios, and relative standard deviation beyond which one says nothing: their
-# squares must be finite and positive.
+# Range of damping ratios, and relative standard deviation beyond which one has no information:
+# their squares must be finite and positive.
 DAMPING, MOST_RELATIVE_STD = (1e-9, 10.0), 1e3
 
 # Logs of a history that is smoothed for its covariates: in a longer one few logs are so early that

@@ -8,16 +8,16 @@ from itertools import groupby
 import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray
-from lmshealth._private.tables import fact
 from lmshealth.io.constants import AGREEMENT
-from lmshealth.io.log import Notice, Refusal
+from lmshealth.io.log import Refusal
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.tracking import constants
 
 LEFT_OUT = ("odometer", "date", "odd-rate")
 """Reasons for which a log as a whole is left out of a history."""
-_TIMES = LEFT_OUT[:2]
+BY_CLOCK = LEFT_OUT[:2]
+"""Those of its odometer or date."""
 NO_MOMENT = datetime.max.replace(tzinfo=UTC)
 """In place of the moment of a log that states none."""
 
@@ -29,67 +29,25 @@ def sort_by_time(readings: Sequence[LogEstimates]) -> tuple[LogEstimates, ...]:
 
 def without_contradictions(
     readings: Sequence[LogEstimates],
-) -> tuple[tuple[LogEstimates, ...], list[Refusal]]:
-    """Sort logs by time; refuse those whose odometer, date or sample rate contradicts others."""
-    ordered, refused = sort_by_time(readings), list[Refusal]()
+) -> tuple[tuple[LogEstimates, ...], list[Refusal], int]:
+    """Sort logs by time; refuse those whose odometer, date or sample rate contradicts others.
+
+    Also returned is how many in a row are refused for their odometer or date, at most.
+    """
+    every, refused = sort_by_time(readings), list[Refusal]()
+    ordered = every
     for check in (_without_odometer_errors, _without_lone_dates, _without_odd_rates):
         ordered, found = check(ordered)
         refused += found
-    return ordered, refused
+    out = {one.log for one in refused if one.reason in BY_CLOCK}
+    rows = groupby(every, lambda one: one.log in out)
+    in_a_row = max((len([*own]) for is_out, own in rows if is_out), default=0)
+    return ordered, refused, in_a_row
 
 
-def most_in_a_row(readings: Sequence[LogEstimates], refused: Sequence[Refusal]) -> int:
-    """Return how many logs in a row of time are left out for their odometer or date, at most."""
-    out = {one.log for one in refused if one.reason in _TIMES}
-    rows = groupby(sort_by_time(readings), lambda one: one.log in out)
-    return max((len([*own]) for is_out, own in rows if is_out), default=0)
-
-
-def contradiction_notices(
-    n_used: int, refused: Sequence[Refusal], in_a_row: int = 0
-) -> list[Notice]:
-    """Return notices about logs that contradict the others of a machine, ``n_used`` of them.
-
-    One of the code ``logs-contradict`` is serious: so many contradict by odometer or date, in all
-    or ``in_a_row``, that a clock was reset and it is not known which are right: no health must be
-    inferred from the others.
-    """
-    rates = [one.log for one in refused if one.reason == "odd-rate"]
-    notices = []
-    if rates:
-        what = fact(
-            "{n} logs have another sample rate, which their frequencies follow: they are left out.",
-            n=len(rates),
-        )
-        to_do = fact(
-            "Find out which rate is right (refused.csv has both), and correct manifest.csv."
-        )
-        notices.append(Notice("odd-rate", "caution", rates[0], what, to_do))
-    times = [one.log for one in refused if one.reason in _TIMES]
-    n, total = len(times), len(times) + n_used
-    if not n:
-        return notices
-    to_do = fact("Correct odometer or date of the logs of refused.csv in manifest.csv.")
-    few = constants.FEW_CONTRADICTIONS
-    if in_a_row > few or n > max(few, constants.CONTRADICTING_SHARE * total):
-        what = fact(
-            "{n} of {total} logs contradict the others by odometer or date, as after a reset: "
-            "which of them are right is not known, so that no health is published.",
-            n=n,
-            total=total,
-        )
-        return [*notices, Notice("logs-contradict", "serious", times[-1], what, to_do)]
-    what = fact(
-        "{n} of {total} logs contradict the others by odometer or date, and are left out.",
-        n=n,
-        total=total,
-    )
-    return [*notices, Notice("logs-left-out", "caution", times[-1], what, to_do)]
-
-
-def doubt_of_clock(notices: Sequence[Notice]) -> str:
-    """Return why odometer and dates do not allow any health; empty where they do."""
-    return next((one.what for one in notices if one.code == "logs-contradict"), "")
+def are_many(n: int, total: int) -> bool:
+    """Return whether so many of all logs are no slips of single ones."""
+    return n > max(constants.FEW_CONTRADICTIONS, constants.CONTRADICTING_SHARE * total)
 
 
 def _without_odometer_errors(

@@ -17,7 +17,12 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
-from lmshealth.tracking.contradictions import NO_MOMENT, most_in_a_row, without_contradictions
+from lmshealth.tracking.contradictions import (
+    BY_CLOCK,
+    NO_MOMENT,
+    are_many,
+    without_contradictions,
+)
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.maintenance import RESETS, Action
 
@@ -257,7 +262,7 @@ def build_history(
     if not readings:
         name = "" if stage is None else f"{stage.name}: "
         raise NotEnoughData(f"{name}no usable log")
-    ordered, refused = without_contradictions(readings)
+    ordered, refused, in_a_row = without_contradictions(readings)
     # Missing values are None here and NaN in arrays.
     travel = np.array([r.metadata.travel for r in ordered], dtype=float)
     moments = tuple(r.metadata.recorded_at or NO_MOMENT for r in ordered)
@@ -305,7 +310,7 @@ def build_history(
         loop_error=np.array([r.loop_error or np.nan for r in ordered], dtype=float),
         baselines=_baselines(ordered, steps),
         steps=steps,
-        contradictions=most_in_a_row(readings, refused),
+        contradictions=in_a_row,
     )
     return history, refused
 
@@ -439,6 +444,51 @@ def _line_up(
         part = np.array([one.cov for one in some])[:, of[:, None], of]
         cov[at[:, :, None], to[:, None], to] = part
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
+
+
+def doubt_of_clock(history: History, refused: Sequence[Refusal]) -> str:
+    """Return why odometer and dates do not allow any health; empty where they do.
+
+    So many logs contradict the others, in all or in a row, that a clock was reset and it is not
+    known which are right.
+    """
+    n = sum(one.reason in BY_CLOCK for one in refused)
+    total = n + len(history.logs)
+    if history.contradictions <= constants.FEW_CONTRADICTIONS and not are_many(n, total):
+        return ""
+    return fact(
+        "{n} of {total} logs contradict the others by odometer or date, as after a reset: "
+        "which of them are right is not known, so that no health is published.",
+        n=n,
+        total=total,
+    )
+
+
+def contradiction_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:
+    """Return notices about logs of a machine that contradict the others."""
+    rates = [one.log for one in refused if one.reason == "odd-rate"]
+    notices = []
+    if rates:
+        what = fact(
+            "{n} logs have another sample rate, which their frequencies follow: they are left out.",
+            n=len(rates),
+        )
+        to_do = fact(
+            "Find out which rate is right (refused.csv has both), and correct manifest.csv."
+        )
+        notices.append(Notice("odd-rate", "caution", rates[0], what, to_do))
+    times = [one.log for one in refused if one.reason in BY_CLOCK]
+    if not times:
+        return notices
+    to_do = fact("Correct odometer or date of the logs of refused.csv in manifest.csv.")
+    if doubt := doubt_of_clock(history, refused):
+        return [*notices, Notice("logs-contradict", "serious", times[-1], doubt, to_do)]
+    what = fact(
+        "{n} of {total} logs contradict the others by odometer or date, and are left out.",
+        n=len(times),
+        total=len(times) + len(history.logs),
+    )
+    return [*notices, Notice("logs-left-out", "caution", times[-1], what, to_do)]
 
 
 def missing_mode_notices(history: History, refused: Sequence[Refusal]) -> list[Notice]:

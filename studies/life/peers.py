@@ -22,7 +22,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -76,12 +76,9 @@ def without_logs(kind: str, k: int) -> Row:
     return {"health": None, "left": left[left > 0][:SAMPLES].tolist(), "cpu_s": 0.0}
 
 
-def by_progpy(kind: str, k: int) -> Row:
-    """Filter a life by progpy, and predict it."""
+def preload_model() -> Any:
+    """Return a model of progpy, which is imported late."""
     from progpy import PrognosticsModel
-    from progpy.predictors import MonteCarlo
-    from progpy.state_estimators import ParticleFilter
-    from progpy.uncertain_data import UnweightedSamples
 
     class Preload(PrognosticsModel):  # type: ignore[misc]
         """Loss of preload by a power of the travel, which is the time (km)."""
@@ -108,11 +105,20 @@ def by_progpy(kind: str, k: int) -> Row:
         def event_state(self, x: Row) -> dict[str, Array]:
             return {"limit": 1 - _loss(x) / LOST}
 
-    start, life, rng = time.process_time(), life_of(kind, k), np.random.default_rng(k)
-    np.random.seed(k)  # noqa: NPY002 (progpy draws from the global generator)
     noise = {"travel": 0.0, "ln_life": JITTER, "ln_power": JITTER}
     noise |= dict.fromkeys(_SCALES, JITTER / 10)
-    model = Preload(process_noise=noise, measurement_noise=NOISE)
+    return Preload(process_noise=noise, measurement_noise=NOISE)
+
+
+def by_progpy(kind: str, k: int) -> Row:
+    """Filter a life by progpy, and predict it."""
+    from progpy.predictors import MonteCarlo
+    from progpy.state_estimators import ParticleFilter
+    from progpy.uncertain_data import UnweightedSamples
+
+    start, life, rng = time.process_time(), life_of(kind, k), np.random.default_rng(k)
+    np.random.seed(k)  # noqa: NPY002 (progpy draws from the global generator)
+    model = preload_model()
     prior = {
         "travel": np.zeros(PARTICLES),
         "ln_life": rng.normal(np.log(LIFE_KM[0]), LIFE_KM[1], PARTICLES),

@@ -15,15 +15,13 @@ from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import WARNINGS, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.contradictions import (
-    contradiction_notices,
-    doubt_of_clock,
-    sort_by_time,
-)
+from lmshealth.tracking.contradictions import sort_by_time
 from lmshealth.tracking.history import (
     History,
     Series,
     build_history,
+    contradiction_notices,
+    doubt_of_clock,
     missing_mode_notices,
 )
 from lmshealth.tracking.maintenance import Action
@@ -110,11 +108,11 @@ def test_after_a_reset_of_the_odometer_no_log_is_known_to_be_right(
         travels[k] = 1e9
     readings = [make_reading(str(k), k, s, {"roll": 4.8}) for k, s in enumerate(travels)]
     history, refused = build_history(readings, stage)
-    (notice,) = contradiction_notices(len(history.logs), refused, history.contradictions)
+    (notice,) = contradiction_notices(history, refused)
     severity, code = ("serious", "contradict") if doubt else ("caution", "left-out")
     assert (notice.severity, notice.code) == (severity, f"logs-{code}")
     assert notice.what.startswith(f"{len(refused)} of {n_logs} logs")
-    assert doubt_of_clock([notice]) == (notice.what if doubt else "")
+    assert doubt_of_clock(history, refused) == (notice.what if doubt else "")
 
 
 def dated(days: list[float], travel: list[float], stage: Stage) -> tuple[list[str], list[str]]:
@@ -484,7 +482,7 @@ def test_a_log_whose_frequencies_follow_another_rate_is_left_out(stage, at, odd)
     assert history.logs == tuple(str(k) for k in range(12) if k != at)
     [one] = [own for own in refused if own.reason == "odd-rate"]
     assert one.log == str(at) and f"{odd:g} Hz" in one.detail and "20000 Hz" in one.detail
-    [notice] = contradiction_notices(len(history.logs), refused, history.contradictions)
+    [notice] = contradiction_notices(history, refused)
     assert (notice.code, notice.severity, notice.where) == ("odd-rate", "caution", str(at))
 
 
@@ -518,10 +516,7 @@ def test_headers_that_alternate_keep_the_first_rate(stage):
 def test_other_rates_whose_frequencies_agree_are_kept(stage, rates):
     """A rate that was set otherwise moves no frequency."""
     history, refused = build_history(rated(rates, follow=0.0), stage)
-    assert (
-        len(history.logs) == len(rates)
-        and contradiction_notices(len(history.logs), refused, history.contradictions) == []
-    )
+    assert len(history.logs) == len(rates) and contradiction_notices(history, refused) == []
 
 
 def test_a_rate_that_is_off_by_less_than_modes_resolve_is_noted(stage):
@@ -531,7 +526,4 @@ def test_a_rate_that_is_off_by_less_than_modes_resolve_is_noted(stage):
     [one] = refused
     assert (one.log, one.reason, one.channel) == ("11", "rate", "sample_rate_hz")
     assert "19990 Hz" in one.detail and "20000 Hz" in one.detail
-    assert (
-        one.reason in WARNINGS
-        and contradiction_notices(len(history.logs), refused, history.contradictions) == []
-    )
+    assert one.reason in WARNINGS and contradiction_notices(history, refused) == []

@@ -71,14 +71,7 @@ def main() -> None:
         records = study.trials.collect(examine, tasks, pool=pool)
     families = {name: summarise([r for r in records if r["family"] == name]) for name in seeds}
     passed = verdicts(families)
-    study.conclude(
-        {
-            "families": families,
-            "passed": passed,
-        },
-        not_met=NOT_MET,
-        quick_may_fail=True,
-    )
+    study.conclude({"families": families, "passed": passed}, not_met=NOT_MET, quick_may_fail=True)
 
 
 def examine(family: str, seed: int, peers: bool = False) -> dict[str, Any]:
@@ -216,10 +209,8 @@ def claims(record: Mapping[str, Any]) -> Iterator[Claim]:
     families = record["families"].values()
     wandering = sum(one["wandering"] for one in families)
     called = sum(one["wandering_called_modes"] for one in families)
-    yield Claim(
-        "harmonics that wander by 1 % and are called modes", f"{called} of {wandering}",
-        met=not called,
-    )  # fmt: skip
+    what = "harmonics that wander by 1 % and are called modes"
+    yield Claim(what, f"{called} of {wandering}", met=not called)
     hits, n = (sum(one["coverage"]["f"][key] for one in families) for key in ("hits", "n"))
     narrow = sum(one["control_narrower"]["f"]["hits"] for one in families)
     low, high = clopper_pearson(hits, n)
