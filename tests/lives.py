@@ -131,6 +131,7 @@ def stage_text(
     *,
     n_modes: int = 2,
     model_std: float = 0.05,
+    common_std: float = 0.0,
     tail: str = TEMPERATURE,
 ) -> str:
     """Write a stage description."""
@@ -140,6 +141,7 @@ def stage_text(
     parts += [f"[[parameter]]{parameter}" for parameter in parameters]
     if parameters:
         parts.append(f'[map]\nfile = "map.csv"\nmodel_std = {model_std}')
+        parts += [f"common_std = {common_std}"] * (common_std > 0)
     return "\n".join([*parts, tail])
 
 
@@ -159,10 +161,12 @@ def make_stage(
     *,
     n_modes: int = 2,
     model_std: float = 0.05,
+    common_std: float = 0.0,
     tail: str = TEMPERATURE,
 ) -> Stage:
     """Write a stage with its map into a folder and load it."""
-    text = stage_text(parameters, n_modes=n_modes, model_std=model_std, tail=tail)
+    errors = {"model_std": model_std, "common_std": common_std}
+    text = stage_text(parameters, n_modes=n_modes, tail=tail, **errors)
     names = [re.findall(r'name = "(\w+)"', parameter)[0] for parameter in parameters]
     folder.mkdir(parents=True, exist_ok=True)
     if parameters:

@@ -469,6 +469,7 @@ class LifeBelief:
     slopes: FloatArray
     model_std: float
     intercept_std: float
+    common_std: float = 0.0
     reference: float = 21.0
     b_std: float = 1e-3
 
@@ -537,6 +538,8 @@ def life_covariance(
             shared = min(clock[k], clock[o])
             for slope in belief.slopes:
                 cov[a, c] += slope[i] * slope[j] * setting.deviation**2 * shared / clock.max()
+            for own in alone:
+                cov[a, c] += belief.common_std**2 * own[k, i] * own[o, j]
             if k == o:
                 cov[a, c] += setting.scale**2 * history.cov[first + k][i, j]
             if k == o and i == j and unknown[k]:

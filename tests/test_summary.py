@@ -136,7 +136,7 @@ def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.Monkey
     study.conclude({"passed": {"it is": True}})
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["question"] == "Is it so?"
-    assert summary._duration(record["recorded"]) == "0 s, after 3 min before an interruption"
+    assert summary._duration(record["recorded"]) == "0 s, after 3 min before"
 
 
 def test_quick_form_records_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,6 +18,7 @@ from lmshealth.life.posterior.data import KM
 from lmshealth.life.posterior.likelihood import NO_MODE, lone_kernel, scatter_prior
 from lmshealth.life.posterior.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
 from lmshealth.life.prognosis import early_life, parameters_with_limit, rate_std
+from lmshealth.stage import constants as of_stage
 from lmshealth.stage.degradation_laws import Unchanging
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
@@ -344,10 +345,13 @@ def _path(stage: Stage, clock: FloatArray, parts: Sequence[Part]) -> FloatArray:
     return np.column_stack(columns)
 
 
-def map_std(rng: np.random.Generator, stage: Stage) -> float:
-    """Draw the relative error of a map: as declared, or larger."""
-    stds, weights = zip(*stage.map_errors, strict=True)
-    return float(rng.choice(stds, p=weights))
+def map_errors(rng: np.random.Generator, stage: Stage, n_modes: int) -> FloatArray:
+    """Draw the relative errors of a map, as declared or larger, ``(n_parameters, n_modes)``."""
+    scales, weights = zip(*of_stage.MAP_ERRORS, strict=True)
+    own, common = stage.map_root(n_modes)
+    unit = rng.standard_normal((len(stage.parameters), n_modes))
+    error = own * unit + common * unit.sum(axis=1, keepdims=True)
+    return np.asarray(rng.choice(scales, p=weights) * error)
 
 
 def _modes(
@@ -363,10 +367,9 @@ def _modes(
     that the tracker reports. Returned as by `without_health`.
     """
     path, kind, steps = course
-    x, wrong_by = np.log(path), map_std(rng, stage)
-    level, *alone = stage.drifts(x, names)
-    for own in alone:
-        level = level + wrong_by * rng.standard_normal(len(names)) * own
+    level, *alone = stage.drifts(np.log(path), names)
+    for own, error in zip(alone, map_errors(rng, stage, len(names)), strict=True):
+        level = level + error * own
     moved, lone, walk = without_health(rng, stage, clock, len(names), kind, steps)
     known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
     return np.asarray(level + moved + known), lone, walk

@@ -38,8 +38,8 @@ VERDICT_WORDS = {"guide_preload": "preload", "mount_stiffness": "mount"}
 RESERVED_WORDS = ("healthy", "both", "step", "alarm", "no-alarm", "not-enough-data", "outside-map")
 
 # --- Error of the modal map ---------------------------------------------------------------------
-# Factors on the declared model_std, with prior probabilities: machines may differ from the one that
-# a map was made from by more than its maker knows. The modes of each machine weigh them.
+# Factors on the declared errors of a map, with prior probabilities: machines may differ from that
+# which it was made from by more than its maker knows. The modes of each machine weigh them.
 MAP_ERRORS = ((1.0, 0.75), (2.0, 0.25))
 
 # --- Identification, as the Cramér-Rao bound assumes it -----------------------------------------

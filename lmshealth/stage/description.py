@@ -143,10 +143,12 @@ class ParameterSpec(_Part, frozen=True):
 
 
 class MapSpec(_Part, frozen=True):
-    """File of the modal map and relative standard deviation of its sensitivities."""
+    """File of the modal map and relative standard deviations of its sensitivities."""
 
     file: Annotated[Name, Meta(examples=["my-stage.map.csv"])]
+    # Of each parameter and mode, and of each parameter what all modes have in common.
     model_std: Annotated[float, within(0, 1)] = 0.05
+    common_std: Annotated[float, within(0, 1)] = 0.0
 
 
 class Order(_Part, frozen=True):
@@ -334,11 +336,15 @@ class Stage:
         priors = tuple(parameter.prior for parameter in self.parameters)
         return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
-    @property
-    def map_errors(self) -> tuple[tuple[float, float], ...]:
-        """Possible relative errors of the map's sensitivities, with their prior probabilities."""
-        declared = self.description.map.model_std if self.description.map else 0.0
-        return tuple((scale * declared, weight) for scale, weight in constants.MAP_ERRORS)
+    def map_root(self, n_modes: int) -> tuple[float, float]:
+        """Return a and b of the root a I + b 1 1ᵀ of the covariance of the map's declared errors.
+
+        That covariance is model_std² I + common_std² 1 1ᵀ, of the relative errors of the
+        sensitivities of some modes to one parameter.
+        """
+        assert self.description.map is not None  # whoever asks has a map
+        own, common = self.description.map.model_std, self.description.map.common_std
+        return own, (float(np.hypot(own, np.sqrt(n_modes) * common)) - own) / n_modes
 
     def matches(self, metadata: Metadata) -> bool:
         """Return whether the description applies to a log."""

@@ -32,11 +32,12 @@ class Identifiability:
     modes: tuple[ModeSpec, ...]  # tracked modes on the map
     slopes: FloatArray  # d ln f / d ln parameter at the baseline, shape ``(n_modes, n_parameters)``
     prior: FloatArray  # prior variances of the ln parameters, shape ``(n_parameters,)``
-    # model_std, leave_out: relative standard deviation of the map's sensitivities, and error
-    # of ln f of its surrogate, shape ``(n_modes,)``.
+    # model_std, common_std, leave_out: relative standard deviations of the map's sensitivities, of
+    # each and in common, and error of ln f of its surrogate, shape ``(n_modes,)``.
     model_std: float
     leave_out: FloatArray
     n_baseline: int  # logs of the baseline
+    common_std: float = 0.0
 
     @property
     def least_duration(self) -> float:
@@ -69,15 +70,23 @@ class Identifiability:
         return replace(self, modes=kept, slopes=self.slopes[rows], leave_out=self.leave_out[rows])
 
     def precision(self, noise: FloatArray, *, exact_map: bool = False) -> FloatArray:
-        """Return the posterior precision of all ln parameters, Λ⁻¹ + Sᵀ (C + E)⁻¹ S.
+        """Return the posterior precision of all ln parameters, Λ⁻¹ + Sᵀ (C + E + c² S Λ Sᵀ)⁻¹ S.
 
         For variances of the drifts, ``(n_modes,)``; shape ``(n_parameters, n_parameters)``. The
-        error of the map grows with the drifts: E is that of parameters anywhere in their priors,
-        and 0 by an exact map, or for a change close to the baseline.
+        error of the map grows with the drifts: E, diagonal, and c² S Λ Sᵀ, in common, are those of
+        parameters anywhere in their priors, and 0 by an exact map, or for a change close to the
+        baseline.
         """
         error = self.model_std**2 * self.slopes**2 @ self.prior + self.leave_out**2
-        weighted = self.slopes / (noise + (0.0 if exact_map else error))[:, None]
-        return np.asarray(np.diag(1 / self.prior) + self.slopes.T @ weighted)
+        information = self.slopes.T @ (
+            self.slopes / (noise + (0.0 if exact_map else error))[:, None]
+        )
+        if not exact_map:
+            common = self.common_std**2 * np.diag(self.prior)
+            information = information @ np.linalg.inv(
+                np.eye(self.prior.size) + common @ information
+            )
+        return np.asarray(np.diag(1 / self.prior) + information)
 
     def std(self, noise: FloatArray, *, exact_map: bool = False) -> FloatArray:
         """Return the posterior standard deviations of the ln parameters, as `precision` does."""
@@ -112,6 +121,7 @@ def identifiability_of(stage: Stage) -> Identifiability:
         model_std=stage.description.map.model_std,
         leave_out=stage.modal_map.leave_out_error[rows],
         n_baseline=stage.description.baseline.logs,
+        common_std=stage.description.map.common_std,
     )
 
 

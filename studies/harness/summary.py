@@ -154,9 +154,11 @@ def section(record: Record, folder: Path) -> Iterator[str]:
 
 
 def _duration(made: dict[str, Any]) -> str:
-    """Format the run time, after an interruption with that of the kept trials."""
-    kept = made.get("kept_s", 0.0)
-    more = f", after {_time(kept)} before an interruption" if kept else ""
+    """Format the run time, with that of kept trials, and what confirms those of earlier code."""
+    kept, taken_over = made.get("kept_s", 0.0), made.get("taken_over", 0)
+    more = f", after {_time(kept)} before" if kept else ""
+    if taken_over:
+        more += f" ({made['repeated']} of {taken_over:,} trials of earlier code repeated and equal)"
     return _time(made["wall_s"]) + more
 
 

@@ -24,6 +24,7 @@ import numpy as np
 
 from lmshealth.calibration.ranks import judge_coverage
 from lmshealth.errors import BadQuestion
+from lmshealth.stage.constants import MAP_ERRORS
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.identifiability import identifiability_of, plan
 from models.dynamics.plant import GUIDE_MODES
@@ -153,8 +154,11 @@ def called(
     points = points[stage.modal_map.inside(points)]
     predicted = stage.drifts(points, modes)
     parts = []
-    for std, weight in stage.map_errors:
-        total = variance + std**2 * np.sum(predicted[1:] ** 2, axis=0)
+    assert stage.description.map is not None
+    # An error that all modes have in common scales a loss, and decides nothing about its sign.
+    own = stage.description.map.model_std
+    for scale, weight in MAP_ERRORS:
+        total = variance + (scale * own) ** 2 * np.sum(predicted[1:] ** 2, axis=0)
         misfit = np.sum((drift - predicted[0]) ** 2 / total + np.log(total), axis=1)
         parts.append(np.log(weight) - 0.5 * misfit)
     log_density = stage.prior.log_density(points) + np.logaddexp.reduce(parts, axis=0)

@@ -94,7 +94,8 @@ def two_ways(history: History, stage: Stage, walkers: int, looped: int) -> Walke
     value = np.where(known, grid.log_weight - 0.5 * grid.rest, -np.inf)
     point = grid[np.arange(grid.walk.size) == np.argmax(value)]
     walk, scale = float(point.walk[0]), float(point.noise_scale[0])
-    model_std = stage.map_errors[0][0]
+    assert stage.description.map is not None
+    model_std = stage.description.map.model_std
 
     def terms() -> Array:
         x, _ = likelihood.path(scenario, y)

@@ -14,7 +14,7 @@ import pytest
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth.calibration.check import quantities, ranks_of, true_quantities
-from lmshealth.calibration.lives import map_std
+from lmshealth.calibration.lives import map_errors
 from lmshealth.calibration.ranks import place
 from lmshealth.life import constants
 from lmshealth.life.fleet_prior import machine_evidence, needs_fleet_prior
@@ -63,7 +63,7 @@ def draw_history(rng: np.random.Generator, stage: Stage) -> tuple[History, float
     while not low < 1 - (loss := rng.normal(0, 2e-7) * now) < high:
         pass
     drift = true_drift(("guide_preload",), np.log(1 - loss * clock / now)[:, None])[:, :2]
-    drift = drift * (1 + map_std(rng, stage) * rng.standard_normal(2))
+    drift = drift * (1 + map_errors(rng, stage, 2)[0])
     temperature = 21 + 4 * rng.standard_normal(N_LOGS)
     drift += np.outer(temperature - 21, rng.normal(0, 1e-3, 2))
     steps = np.sqrt(np.diff(clock) / now)[:, None] * rng.standard_normal((N_LOGS - 1, 2))

@@ -380,10 +380,10 @@ def _lone_modes(
     total = sum(one.nuisances[1].size for one in scenarios)
     for one in scenarios:
         grid = one.density.grid
-        for own, map_std, k, x in one.density.by_nuisances(one.mixture_draws, one.nuisances):
+        for own, map_scale, k, x in one.density.by_nuisances(one.mixture_draws, one.nuisances):
             if grid.lone[k] != NO_MODE:
                 some = x[:: own.size // _N_LONE + 1]
-                mean, variance = likelihood.lone_drift(grid, k, map_std, some)
+                mean, variance = likelihood.lone_drift(grid, k, map_scale, some)
                 moments = 1.0, mean.mean(), np.mean(variance + mean**2)
                 sums[grid.lone[k]] += own.size / total * np.array(moments)
     found = []

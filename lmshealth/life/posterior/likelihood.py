@@ -21,6 +21,7 @@ from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData
 from lmshealth.life.posterior.importance_sampling import log_sum_exp
 from lmshealth.life.posterior.scenarios import Scenario
+from lmshealth.stage import constants as of_stage
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
 from lmshealth.tracking.covariates import regressors
@@ -263,7 +264,7 @@ class LifeLikelihood:
         At the points of a grid, for each possible error of the map.
         """
         chi_square, log_det = self.quadratic(grid, x)
-        log_prior = np.log([weight for _, weight in self.data.stage.map_errors])
+        log_prior = np.log([weight for _, weight in of_stage.MAP_ERRORS])
         log_weight = log_prior[:, None, None] + grid.log_weight[:, None]
         return np.asarray(log_weight - 0.5 * (chi_square + log_det))
 
@@ -277,9 +278,9 @@ class LifeLikelihood:
 
     def _quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows = self._residuals(grid, x)
-        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of map errors of 1, ``(n_rows, n_rows, 1, n_points, n)``.
+        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of declared map errors, ``(n_rows, n_rows, 1, n_points, n)``.
         gram = np.moveaxis(rows @ np.swapaxes(rows, 2, 3), (2, 3), (0, 1))[:, :, None]
-        scale = np.array([std for std, _ in self.data.stage.map_errors])[:, None, None]
+        scale = np.array([scale for scale, _ in of_stage.MAP_ERRORS])[:, None, None]
         scaled = np.multiply(gram, scale**2, order="C")  # lives last, for `_pivots`
         scaled[-1] = scaled[:, -1] = gram[-1] * scale
         scaled[-1, -1] = gram[-1, -1]
@@ -319,7 +320,7 @@ class LifeLikelihood:
                 lives = (x[:, None] + moved).reshape(-1, *x.shape[1:])
                 rows = self._residuals(grid[[point]], lives)[0]
                 rows = rows.reshape(own.size, k + 1, *rows.shape[1:])
-                r, errors = rows[:, 0, -1], stage.map_errors[0][0] * rows[:, 0, :-1]
+                r, errors = rows[:, 0, -1], rows[:, 0, :-1]
                 slopes = (rows[:, 1:, -1] - r[:, None]) / _SLOPE_STEP
                 a = np.concatenate([slopes, errors], axis=1)
                 prior = np.repeat([constants.STEP_PRIOR.std**-2, 1.0], [k, errors.shape[1]])
@@ -333,7 +334,7 @@ class LifeLikelihood:
         return y
 
     def conditional(
-        self, grid: Grid, k: int, map_std: float, x: FloatArray, cross: FloatArray
+        self, grid: Grid, k: int, map_scale: float, x: FloatArray, cross: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return the means of Gaussian quantities given a life and all data, and their information.
 
@@ -355,7 +356,7 @@ class LifeLikelihood:
         # A few lives at a time, for the memory.
         for one in np.array_split(x, x.shape[0] * b.size // _CACHED + 1):
             rows = self._residuals(point, one)[0]
-            r, v = rows[:, -1], map_std * rows[:, :-1]
+            r, v = rows[:, -1], map_scale * rows[:, :-1]
             m = np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2)
             explained = np.linalg.solve(m, v @ r[:, :, None])
             fitted = point.target[0] - r + (np.swapaxes(v, 1, 2) @ explained)[:, :, 0]
@@ -368,7 +369,7 @@ class LifeLikelihood:
         return means, information
 
     def deviation(
-        self, grid: Grid, k: int, map_std: float, x: FloatArray, moments: FloatArray
+        self, grid: Grid, k: int, map_scale: float, x: FloatArray, moments: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and covariance of ln health about its law, given a life and all data.
 
@@ -379,12 +380,12 @@ class LifeLikelihood:
         unit = float(grid.deviation[k]) ** 2 / data.now
         shared = unit * np.maximum(np.minimum.outer(moments, data.clock[data.log_of]), 0.0)
         cross = shared[:, None] * data.sensitivity[data.mode_of].T
-        mean, known = self.conditional(grid, k, map_std, x, cross)
+        mean, known = self.conditional(grid, k, map_scale, x, cross)
         variance = unit * np.maximum(moments, 0.0)[:, None, None]
         return mean, variance * np.diag(data.free) - known
 
     def lone_drift(
-        self, grid: Grid, k: int, map_std: float, x: FloatArray
+        self, grid: Grid, k: int, map_scale: float, x: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """Return mean and variance of the drift now of the mode that moves alone, ``(n,)`` each.
 
@@ -394,11 +395,11 @@ class LifeLikelihood:
         clock = data.clock[data.log_of]
         kernel = lone_kernel(np.array([data.now]), clock, data.now, data.steps)
         cross = variance * kernel * (data.mode_of == grid.lone[k])
-        mean, known = self.conditional(grid, k, map_std, x, cross[None])
+        mean, known = self.conditional(grid, k, map_scale, x, cross[None])
         return mean[:, 0, 0], np.maximum(variance - known[:, 0, 0, 0], 0.0)
 
     def _residuals(self, grid: Grid, x: FloatArray) -> FloatArray:
-        """Return the rows V of map errors of 1, and last the whitened residuals r.
+        """Return the rows V of the declared map errors, and last the whitened residuals r.
 
         Shape ``(n_points, n, n_errors + 1, n_rows)``, with an error per parameter and mode.
         """
@@ -413,6 +414,12 @@ class LifeLikelihood:
             white = white.reshape(n_points, n, n_paths, -1)
             rows[:, :, k * p : (k + 1) * p, filled] = white[:, :, 1:]
             rows[:, :, -1, filled] -= white[:, :, 0]
+        own, common = self.data.stage.map_root(n_modes)
+        errors = rows[:, :, :-1]
+        shared = common * errors.reshape(n_points, n, n_modes, p, n_rows).sum(axis=2)
+        errors *= own
+        for k in range(n_modes if common else 0):
+            errors[:, :, k * p : (k + 1) * p] += shared
         return rows
 
 
@@ -565,9 +572,9 @@ class LifeDensity:
         """
         free = self.likelihood.data.free
         off = np.zeros((y.shape[0], moments.size, free.size))
-        for own, map_std, k, x in self.by_nuisances(y, nuisances):
+        for own, map_scale, k, x in self.by_nuisances(y, nuisances):
             if self.grid.deviation[k] > 0:
-                mean, cov = self.likelihood.deviation(self.grid, k, map_std, x, moments)
+                mean, cov = self.likelihood.deviation(self.grid, k, map_scale, x, moments)
                 # A variance of 0 may be rounded to below 0.
                 least = 1e-15 * np.eye(cov.shape[-1])
                 unit = rng.standard_normal((own.size, *mean.shape[1:], 1))
@@ -579,14 +586,14 @@ class LifeDensity:
     ) -> Iterator[tuple[np.ndarray, float, int, FloatArray]]:
         """Yield the draws of each map error and grid point, for coordinates as `deviations`.
 
-        Their indices, the standard deviation of the map error, the index of the grid point, and ln
+        Their indices, the factor on the declared map error, the index of the grid point, and ln
         parameters at the nodes, of a single life where there are no coordinates.
         """
         x, _ = self.likelihood.path(self.scenario, y if self.scenario.n_dim else y[:1])
         for error, k in np.unique(np.column_stack(nuisances), axis=0).tolist():
             own = np.flatnonzero((nuisances[0] == error) & (nuisances[1] == k))
-            map_std = self.likelihood.data.stage.map_errors[error][0]
-            yield own, map_std, k, x[own] if self.scenario.n_dim else x
+            map_scale = of_stage.MAP_ERRORS[error][0]
+            yield own, map_scale, k, x[own] if self.scenario.n_dim else x
 
 
 def kept_weights(weight: FloatArray, loss: float) -> BoolArray:

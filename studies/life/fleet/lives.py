@@ -8,7 +8,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from lmshealth.calibration.lives import Part, make_history, map_std, part_of, shares, without_health
+from lmshealth.calibration.lives import (
+    Part,
+    make_history,
+    map_errors,
+    part_of,
+    shares,
+    without_health,
+)
 from lmshealth.life import constants
 from lmshealth.life.posterior.likelihood import scatter_prior
 from lmshealth.life.posterior.scenarios import DegradationPath, laws_of
@@ -147,7 +154,7 @@ def _modes(
 ) -> Array:
     """Ln f of the modes: health through a map that is wrong, and what moves without health."""
     # The mount keeps its stiffness: the error of the map is that of the preload alone.
-    error = map_std(rng, fleet) * rng.standard_normal(len(names))
+    error = map_errors(rng, fleet, len(names))[0]
     moved, *_ = without_health(rng, fleet, clock, len(names))
     known = np.log([mode.frequency_hz for mode in fleet.modes if mode.name in names])
     return np.asarray((1 + error) * fleet.drift(path, names) + moved + known)

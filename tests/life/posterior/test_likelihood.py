@@ -44,7 +44,7 @@ from tests.oracles import (
 )
 
 NAMES = ("guide_preload", "mount_stiffness")
-MODEL_STD = 0.3
+MODEL_STD, COMMON_STD = 0.3, 0.2
 NO_PRELOAD = PRELOAD.replace("law = { kind", "law = [{ kind").replace("} }\n", "} }, NONE]\n")
 NO_PRELOAD = NO_PRELOAD.replace("NONE", '{ kind = "none", weight = 3 }')
 
@@ -72,7 +72,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 def poor_map(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     """Make the same stage with a poor map."""
     tail = TEMPERATURE + LAWS_ALONE
-    return make_stage(tmp_path_factory.mktemp("poor"), model_std=MODEL_STD, tail=tail)
+    errors = {"model_std": MODEL_STD, "common_std": COMMON_STD}
+    return make_stage(tmp_path_factory.mktemp("poor"), tail=tail, **errors)
 
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
@@ -111,10 +112,10 @@ def healths(scenario: Scenario, y: FloatArray, clock: FloatArray) -> FloatArray:
     return np.array(columns).T
 
 
-def believed(model_std: float) -> LifeBelief:
-    """State what is believed of a life, with one relative error of the map."""
+def believed(model_std: float, common_std: float = 0.0) -> LifeBelief:
+    """State what is believed of a life, with relative errors of the map, of each mode and common."""
     slopes = np.array([SENSITIVITY[name][:2] for name in NAMES])
-    return LifeBelief(slopes=slopes, model_std=model_std, intercept_std=constants.INTERCEPT_STD)
+    return LifeBelief(slopes, model_std, constants.INTERCEPT_STD, common_std)
 
 
 def settings(lone_mode: float) -> list[LifeSetting]:
@@ -143,23 +144,22 @@ def drifts_of(
 
 
 def book_by_map_error(
-    history: History, density: LifeDensity, y: FloatArray, model_std: float
+    history: History, density: LifeDensity, y: FloatArray, *stds: float
 ) -> list[float]:
     """Log likelihood and prior of each error of the map, of one life, by the dense oracle."""
     drift, alone = drifts_of(density, y, history.clock()[history.baseline :])
     grid = settings(density.likelihood.data.stage.description.life.lone_mode)
+    beliefs = [believed(*(scale * std for std in stds)) for scale, _ in MAP_ERRORS]
     constant = density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
     return [
-        constant
-        + np.log(weight)
-        + life_log_likelihood(history, drift, alone, believed(scale * model_std), grid)
-        for scale, weight in MAP_ERRORS
+        constant + np.log(weight) + life_log_likelihood(history, drift, alone, belief, grid)
+        for belief, (_, weight) in zip(beliefs, MAP_ERRORS, strict=True)
     ]
 
 
-def book(history: History, density: LifeDensity, y: FloatArray, model_std: float) -> float:
+def book(history: History, density: LifeDensity, y: FloatArray, *stds: float) -> float:
     """Log likelihood of one set of coordinates by the dense oracle."""
-    return float(np.logaddexp.reduce(book_by_map_error(history, density, y, model_std)))
+    return float(np.logaddexp.reduce(book_by_map_error(history, density, y, *stds)))
 
 
 @pytest.fixture
@@ -175,18 +175,18 @@ def short_grid(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("short_grid")
-@pytest.mark.parametrize("model_std", [0.0, 0.05, 0.3])
+@pytest.mark.parametrize("stds", [(0.0, 0.0), (0.05, 0.0), (0.3, 0.0), (0.05, 0.2), (0.0, 0.2)])
 @pytest.mark.parametrize("baseline", [0, 3])
 def test_likelihood_is_the_dense_multivariate_normal(
-    tmp_path: Path, model_std: float, baseline: int
+    tmp_path: Path, stds: tuple[float, float], baseline: int
 ) -> None:
-    """Missing data, cross terms, unknown temperature, map error, deviation and grid: to 1e-9."""
-    stage = make_stage(tmp_path, model_std=model_std)
+    """Missing data, cross terms, unknown temperature, map errors, deviation and grid: to 1e-9."""
+    stage = make_stage(tmp_path, model_std=stds[0], common_std=stds[1])
     history = rough_history(np.random.default_rng(2), baseline=baseline)
     density = density_of(history, stage)
     y = coordinates(density, 4)
     found = density.log_probability(y) - density.scenario.log_prior(y)
-    known = np.array([book(history, density, point, model_std) for point in y])
+    known = np.array([book(history, density, point, *stds) for point in y])
     np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
 
 
@@ -229,7 +229,7 @@ def test_each_error_of_the_map_has_its_own_dense_normal(tmp_path: Path, model_st
 
 
 @pytest.mark.usefixtures("short_grid")
-@pytest.mark.parametrize("what", ["map error", "deviation", "lone mode"])
+@pytest.mark.parametrize("what", ["map error", "common error", "deviation", "lone mode"])
 def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Negative control: the oracle with another error differs by far more than rounding."""
     history = rough_history(np.random.default_rng(2))
@@ -240,8 +240,8 @@ def test_what_is_wrong_is_noticed(stage: Stage, what: str, monkeypatch: pytest.M
         monkeypatch.setattr(constants, "DEVIATION_STDS", (0.0, 0.151))
     if what == "lone mode":
         monkeypatch.setattr("tests.oracles.lone_drift", lambda t, u, now, _: 4e-4 * t * u / now**2)
-    model_std = 0.0501 if what == "map error" else 0.05
-    known = np.array([book(history, density, point, model_std) for point in y])
+    stds = {"map error": (0.0501, 0.0), "common error": (0.05, 0.002)}.get(what, (0.05, 0.0))
+    known = np.array([book(history, density, point, *stds) for point in y])
     assert np.abs(found - known).max() > 1e-5
 
 
@@ -553,7 +553,7 @@ def off_by_hand(
 ) -> tuple[FloatArray, FloatArray]:
     """Condition the dense Gaussian of health about wear and loosening on one life."""
     drift, alone = drifts_of(density, y, history.clock()[history.baseline :])
-    return life_deviation(history, drift, alone, believed(MODEL_STD), setting, moment)
+    return life_deviation(history, drift, alone, believed(MODEL_STD, COMMON_STD), setting, moment)
 
 
 def test_deviations_are_those_of_a_dense_gaussian(
@@ -566,7 +566,7 @@ def test_deviations_are_those_of_a_dense_gaussian(
     now = density.likelihood.data.now
     moments = np.array([0.0, 0.37 * now, now, 2.5 * now])
     x, _ = density.likelihood.path(density.scenario, y)
-    mean, cov = density.likelihood.deviation(density.grid, 0, MODEL_STD, x, moments)
+    mean, cov = density.likelihood.deviation(density.grid, 0, 1.0, x, moments)
     assert mean.shape == (3, 4, 2)
     for i, point in enumerate(y):
         for m, moment in enumerate(moments):
@@ -589,7 +589,7 @@ def test_a_wrong_deviation_is_noticed(poor_map: Stage, with_deviation: LifeSetti
     y = coordinates(density, 1)
     moments = np.array([density.likelihood.data.now])
     x, _ = density.likelihood.path(density.scenario, y)
-    mean, cov = density.likelihood.deviation(density.grid, 0, MODEL_STD, x, moments)
+    mean, cov = density.likelihood.deviation(density.grid, 0, 1.0, x, moments)
     wrong = replace(with_deviation, deviation=0.41)
     known = off_by_hand(density, history, y[0], wrong, density.likelihood.data.now)
     assert np.abs(mean[0, 0] / known[0] - 1).min() > 1e-3
@@ -609,8 +609,8 @@ def test_drifts_of_a_mode_that_moves_alone_are_those_of_a_dense_gaussian(
     x, _ = density.likelihood.path(density.scenario, y)
     for k in (1, 2):
         setting = replace(with_deviation, walk=5e-4, lone=k - 1)
-        mean, variance = density.likelihood.lone_drift(grid, k, MODEL_STD, x)
-        of_health, cov = density.likelihood.deviation(grid, k, MODEL_STD, x, moments)
+        mean, variance = density.likelihood.lone_drift(grid, k, 1.0, x)
+        of_health, cov = density.likelihood.deviation(grid, k, 1.0, x, moments)
         for i, point in enumerate(y):
             drift, alone = drifts_of(density, point, history.clock()[history.baseline :])
             given = (history, drift, alone, believed(MODEL_STD))
