@@ -165,8 +165,9 @@ def make_stage(
     tail: str = TEMPERATURE,
 ) -> Stage:
     """Write a stage with its map into a folder and load it."""
-    errors = {"model_std": model_std, "common_std": common_std}
-    text = stage_text(parameters, n_modes=n_modes, tail=tail, **errors)
+    text = stage_text(
+        parameters, n_modes=n_modes, model_std=model_std, common_std=common_std, tail=tail
+    )
     names = [re.findall(r'name = "(\w+)"', parameter)[0] for parameter in parameters]
     folder.mkdir(parents=True, exist_ok=True)
     if parameters:

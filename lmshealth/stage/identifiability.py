@@ -82,10 +82,8 @@ class Identifiability:
             self.slopes / (noise + (0.0 if exact_map else error))[:, None]
         )
         if not exact_map:
-            common = self.common_std**2 * np.diag(self.prior)
-            information = information @ np.linalg.inv(
-                np.eye(self.prior.size) + common @ information
-            )
+            lost = self.common_std**2 * self.prior[:, None] * information
+            information = information @ np.linalg.inv(np.eye(self.prior.size) + lost)
         return np.asarray(np.diag(1 / self.prior) + information)
 
     def std(self, noise: FloatArray, *, exact_map: bool = False) -> FloatArray:

@@ -162,21 +162,19 @@ class Trials:
         kept = _read(self._path, name)
         asked = list(dict.fromkeys(tasks))
         old = [task for task in asked if kept.get(json.dumps(task), {}).get("code", code) != code]
-        sample = _spread(old) if self._takes_over else old
-        # An interrupted sample is repeated whole: its values are kept once all are known.
-        again = [_row(name, task, code, *done)
-                 for task, done in zip(sample, _compute(work, sample, pool), strict=True)]  # fmt: skip
-        agree = all(alike(row["value"], kept[json.dumps(row["task"])]["value"]) for row in again)
-        for task in old:
-            if agree:
-                kept[json.dumps(task)]["code"] = code
-            else:
-                del kept[json.dumps(task)]
-        kept |= {json.dumps(row["task"]): row for row in again}
         if old:
+            sample = _spread(old) if self._takes_over else old
+            # An interrupted sample is repeated whole: its values are kept once all are known.
+            done = zip(sample, _compute(work, sample, pool), strict=True)
+            again = {json.dumps(task): _row(name, task, code, *found) for task, found in done}
+            if all(alike(row["value"], kept[key]["value"]) for key, row in again.items()):
+                kept |= {key: kept[key] | {"code": code} for key in map(json.dumps, old)}
+                self.repeated += len(sample)
+                self.taken_over += len(old)
+            else:
+                kept = {key: row for key, row in kept.items() if row["code"] == code}
+            kept |= again
             _rewrite(self._path, name, kept)
-        if agree:
-            self.repeated, self.taken_over = self.repeated + len(sample), self.taken_over + len(old)
         self.kept_s += sum(kept[key]["seconds"] for key in map(json.dumps, tasks) if key in kept)
         missing = [task for task in asked if json.dumps(task) not in kept]
         for task, done in zip(missing, _compute(work, missing, pool), strict=True):

@@ -93,8 +93,9 @@ def test_the_precision_is_that_of_drawn_drifts(
 ) -> None:
     """Estimates scatter as they should where sensitivities are wrong; not where that is left out.
 
-    Sensitivities are drawn 30 % wrong, and 20 % in all modes. The mean square of 40,000 errors in units of its expectation
-    has a standard deviation below 0.02: the errors have heavier tails than a Gaussian.
+    Sensitivities are drawn 30 % wrong, and 20 % in all modes. The mean square of 40,000 errors in
+    units of its expectation has a standard deviation below 0.02: the errors have heavier tails than
+    a Gaussian.
     """
     rng, n = np.random.default_rng(8), 40_000
     slopes, prior = information.slopes, information.prior
@@ -102,8 +103,7 @@ def test_the_precision_is_that_of_drawn_drifts(
     x = rng.normal(0, np.sqrt(prior), (n, 2))
     wrong = 1 + 0.3 * rng.normal(size=(n, 2, 2)) + 0.2 * rng.normal(size=(n, 1, 2))
     drifts = np.einsum("nij,ij,nj->ni", wrong, slopes, x) + rng.normal(0, np.sqrt(noise), (n, 2))
-    errors = {"model_std": model_std, "common_std": common_std}
-    model = replace(information, leave_out=np.zeros(2), **errors)
+    model = replace(information, leave_out=np.zeros(2), model_std=model_std, common_std=common_std)
     cov = np.linalg.inv(model.precision(noise))
     own = np.diag(noise + model_std**2 * slopes**2 @ prior)
     total = own + common_std**2 * slopes * prior @ slopes.T

@@ -72,8 +72,8 @@ def stage(tmp_path_factory: pytest.TempPathFactory) -> Stage:
 def poor_map(tmp_path_factory: pytest.TempPathFactory) -> Stage:
     """Make the same stage with a poor map."""
     tail = TEMPERATURE + LAWS_ALONE
-    errors = {"model_std": MODEL_STD, "common_std": COMMON_STD}
-    return make_stage(tmp_path_factory.mktemp("poor"), tail=tail, **errors)
+    folder = tmp_path_factory.mktemp("poor")
+    return make_stage(folder, model_std=MODEL_STD, common_std=COMMON_STD, tail=tail)
 
 
 def density_of(history: History, stage: Stage) -> LifeDensity:
@@ -113,7 +113,7 @@ def healths(scenario: Scenario, y: FloatArray, clock: FloatArray) -> FloatArray:
 
 
 def believed(model_std: float, common_std: float = 0.0) -> LifeBelief:
-    """State what is believed of a life, with relative errors of the map, of each mode and common."""
+    """State what is believed of a life, with errors of the map, of each mode and common."""
     slopes = np.array([SENSITIVITY[name][:2] for name in NAMES])
     return LifeBelief(slopes, model_std, constants.INTERCEPT_STD, common_std)
 
