@@ -1,4 +1,4 @@
-"""Language of pages and figures: one catalogue (gettext), numbers and dates of its locale (Babel).
+"""Language of pages and figures: one catalogue (gettext), which has the format of dates, too.
 
 A thread has one language at a time, English unless `in_language` sets another. English has the
 formats of the tables: ISO dates, a decimal point.
@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from datetime import date
 from functools import cache, lru_cache
 from importlib import resources
-from typing import IO, Literal, get_args
+from typing import Literal, get_args
 
 Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -52,6 +52,12 @@ def mark_either(one: str, many: str) -> tuple[str, str]:
     return one, many
 
 
+_MONTHS = (
+    *(mark("Jan"), mark("Feb"), mark("Mar"), mark("Apr"), mark("May"), mark("Jun")),
+    *(mark("Jul"), mark("Aug"), mark("Sep"), mark("Oct"), mark("Nov"), mark("Dec")),
+)
+
+
 def tr(message: str, /, **values: object) -> str:
     """Translate a message, and insert values by name."""
     found = _catalogue(language()).gettext(message) if message else ""
@@ -65,25 +71,17 @@ def tr_either(one: str, many: str, n: int) -> str:
 
 def tr_day(day: date) -> str:
     """Format a day of the calendar."""
-    if language() == "en":
-        return day.isoformat()[:10]
-    from babel.dates import format_date  # late: English needs no Babel
-
-    return format_date(day, locale=language())
+    return format(day, tr("%Y-%m-%d"))
 
 
 def tr_month(day: date) -> str:
     """Return the abbreviated month of a day."""
-    if language() == "en":
-        return f"{day:%b}"
-    from babel.dates import format_date
-
-    return format_date(day, "LLL", locale=language())
+    return tr(_MONTHS[day.month - 1])
 
 
 def decimal(number: str) -> str:
     """Write a number that Python has formatted with the decimal mark of the language."""
-    return number if language() == "en" else number.replace(".", _decimal_mark(language()))
+    return number if language() == "en" else number.replace(".", tr("0.1")[1])
 
 
 def sentence(text: str) -> str:
@@ -115,33 +113,18 @@ def label(text: str) -> str:
 def _catalogue(chosen: Language) -> gettext.NullTranslations:
     if chosen == "en":
         return gettext.NullTranslations()
-    with _file(chosen) as file:
-        return gettext.GNUTranslations(file)
-
-
-def _file(chosen: Language) -> IO[bytes]:
     folder = resources.files("lmshealth") / "report" / "locale" / chosen / "LC_MESSAGES"
-    return (folder / f"{DOMAIN}.mo").open("rb")
-
-
-@cache
-def _decimal_mark(chosen: Language) -> str:
-    from babel.numbers import get_decimal_symbol
-
-    return get_decimal_symbol(chosen)
+    with (folder / f"{DOMAIN}.mo").open("rb") as file:
+        return gettext.GNUTranslations(file)
 
 
 @cache
 def _templates(chosen: Language) -> list[tuple[str, str, str]]:
     """Return context, message and translation of all messages without a plural."""
-    from babel.messages.mofile import read_mo
-
-    with _file(chosen) as file:
-        return [
-            (one.context or "", one.id, one.string)
-            for one in read_mo(file)
-            if isinstance(one.id, str) and isinstance(one.string, str)
-        ]
+    # gettext lists its messages nowhere else; those with a plural are pairs, the header is empty.
+    known = vars(_catalogue(chosen))["_catalog"]
+    parts = [(own.rpartition("\4"), text) for own, text in known.items() if isinstance(own, str)]
+    return [(context, message, text) for (context, _, message), text in parts if message]
 
 
 @cache
