@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import timedelta
+from datetime import date, timedelta
 from itertools import pairwise, product
 from pathlib import Path
 from string import Formatter
@@ -14,6 +15,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from babel.dates import format_date
+from babel.numbers import format_decimal
 from jinja2 import Environment
 
 from lmshealth._private.serialize import unpack
@@ -27,7 +30,16 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures, text
-from lmshealth.report.language import LANGUAGES, in_language, is_known, label, sentence, tr
+from lmshealth.report.language import (
+    LANGUAGES,
+    _templates,
+    in_language,
+    is_known,
+    label,
+    sentence,
+    tr,
+    tr_month,
+)
 from lmshealth.report.pages import _WORDS, date_page, make_page, write_index
 from lmshealth.report.rendering import read
 from tests.assessments import Maker, blind, leaves, make, nothing, worn
@@ -131,6 +143,27 @@ def _plurals(expression: list[tuple[str, str]]) -> list[str]:
         for k, (_, value) in enumerate(expression[:-4])
         if value == "_n" and expression[k + 4][0] == "string"
     ]
+
+
+@pytest.mark.parametrize("language", TRANSLATED)
+def test_days_and_numbers_are_those_of_the_locale(language: Any) -> None:
+    """The catalogue has the forms that the Unicode locale data have (oracle: Babel)."""
+    with in_language(language):
+        for month in range(1, 13):
+            day = date(2026, month, 3)
+            assert text.day(day) == format_date(day, locale=language)
+            assert tr_month(day) == format_date(day, "LLL", locale=language)
+        assert text.fixed(12.5, 1) == format_decimal(12.5, locale=language)
+
+
+def test_pages_need_no_babel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has the locales of all countries, and is larger than many libraries together."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "babel"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    _templates.cache_clear()
+    test_a_sentence_has_the_formats_of_german()
+    with in_language("de"):
+        assert (text.day(date(2026, 3, 5)), tr_month(date(2026, 3, 5))) == ("05.03.2026", "Mär")
 
 
 @pytest.mark.parametrize("path", sorted(catalogue.TEMPLATES.glob("*.j2")), ids=lambda p: p.name)
