@@ -71,6 +71,7 @@ class RefusalCode(msgspec.Struct, frozen=True, array_like=True):
     what: str  # is refused: log, channel, mode, blow or row; ``warning`` where it is used
     cause: str
     cure: str
+    details: tuple[str, ...] = ()  # templates of sentences of its details that pages translate
 
 
 class _Specification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -24,6 +24,7 @@ _language: ContextVar[Language] = ContextVar("language", default="en")
 _MOST_TEXT = 3000  # characters of sentences that are looked up: a file may hold any text
 _PLACE = re.compile(r"\\\{(\w+)[^}]*\\\}")
 _NUMBER = re.compile(r"(?<![\w.])(\d+)\.(\d+)(?![\w.])")
+_BETWEEN = re.compile(r"([;:,]?) (and )?|$")  # parts of a detail of a refusal
 _DAY = re.compile(r"\b\d{4}-\d\d-\d\d\b")
 
 
@@ -89,7 +90,8 @@ def sentence(text: str) -> str:
 
     Results keep their sentences as text, which tables, stores and saved files have in English.
     """
-    return text if language() == "en" or not text else _sentences(language(), text) or text
+    known = None if language() == "en" or not text else _sentences(language(), text)
+    return text if known is None else known[1]
 
 
 def is_known(text: str) -> bool:
@@ -102,7 +104,7 @@ def label(text: str) -> str:
     chosen = language()
     if (known := tr(text)) != text:
         return known
-    for own, translation in _labels(chosen):
+    for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
             values = {name: _value(chosen, one) for name, one in found.groupdict().items()}
             return translation.format(**values)
@@ -128,21 +130,15 @@ def _templates(chosen: Language) -> list[tuple[str, str, str]]:
 
 
 @cache
-def _facts(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
-    """Return a pattern of each template of a sentence, and its translation."""
-    found = [own for own in _templates(chosen) if own[0] == FACT]
-    return [
-        (re.compile(_pattern(template) + r"(?=\s|$)"), translation)
-        for _, template, translation in found
+def _patterns(chosen: Language, wanted: str, end: str) -> list[tuple[re.Pattern[str], str]]:
+    """Return the templates of a context with their translations, most text of their own first."""
+    found = [
+        (template, own)
+        for context, template, own in _templates(chosen)
+        if context == wanted and (context or "{" in template)
     ]
-
-
-@cache
-def _labels(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
-    """Return the messages with values as `_facts`, those with most text of their own first."""
-    found = [own[1:] for own in _templates(chosen) if "{" in own[1]]
-    found.sort(key=lambda own: len(re.sub(r"{\w*}", "", own[0])), reverse=True)
-    return [(re.compile(_pattern(template)), translation) for template, translation in found]
+    found.sort(key=lambda one: len(re.sub(r"{[^}]*}", "", one[0])), reverse=True)
+    return [(re.compile(_pattern(template) + end), own) for template, own in found]
 
 
 def _pattern(template: str) -> str:
@@ -159,20 +155,30 @@ def _pattern(template: str) -> str:
 
 
 @lru_cache(maxsize=1000)
-def _sentences(chosen: Language, text: str) -> str | None:
-    """Translate a text that consists of known sentences; None for another."""
+def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
+    """Translate a text that consists of known sentences; None for another.
+
+    Of several ways to divide it the one is taken in which the templates have most text of their
+    own; how much, in characters, is returned with the translation.
+    """
     if len(text) > _MOST_TEXT:
         return None
-    matches = [
-        (found, translation) for own, translation in _facts(chosen) if (found := own.match(text))
-    ]
-    for found, translation in sorted(matches, key=lambda one: one[0].end()):
-        rest = text[found.end() :].strip()
-        further = _sentences(chosen, rest) if rest else ""
+    ways = []
+    for own, translation in _patterns(chosen, FACT, r"(?=[;:,]?\s|$)"):
+        found = own.match(text)
+        if found is None or (between := _BETWEEN.match(text, found.end())) is None:
+            continue
+        further = _sentences(chosen, text[between.end() :]) if found.end() < len(text) else (0, "")
         if further is not None:
-            values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
-            return f"{re.sub(r':[^{}]*}', '}', translation).format(**values)} {further}".rstrip()
-    return None
+            n = found.end() - sum(map(len, found.groups())) + further[0]
+            ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
+    if not ways:
+        return None
+    n, found, translation, joint, joined, rest = max(ways, key=lambda way: way[0])
+    values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
+    words = re.sub(r":[^{}]*}", "}", translation).format(**values)
+    joint += f"{tr('and')} " if joined else ""
+    return n, f"{words}{joint}{rest}".rstrip()
 
 
 def _value(
@@ -180,7 +186,7 @@ def _value(
 ) -> str:
     """Translate a value of a sentence: sentences, or names, numbers and days, and lists of them."""
     if (known := _sentences(chosen, value)) is not None:
-        return known
+        return known[1]
     if separators:
         separator, *further = separators
         parts = [_value(chosen, part, tuple(further)) for part in value.split(separator)]

@@ -102,7 +102,9 @@ def messages() -> Iterator[tuple[Any, str, str | None]]:
     for table in TABLES.values():
         if "page" in table.shown:
             yield from ((head, place, None) for head in view_columns(table.shown["page"]))
-    yield from ((code, place, None) for code in REFUSALS)
+    for code, refusal in REFUSALS.items():
+        yield code, place, None
+        yield from ((template, place, FACT) for template in refusal.details)
 
 
 if __name__ == "__main__":
