@@ -52,6 +52,7 @@ _WORDS = (
     *(mark("no log since maintenance"), mark("inspection overdue"), mark("regreasing")),
     mark("unconfirmed jump"),
     *(mark("mains"), mark("reset"), mark("and"), mark("worn"), mark("epochs, 90 %")),
+    *(mark("below"), mark("above")),
     mark("each epoch by itself"),
 )
 _COUNTED = {

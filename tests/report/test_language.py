@@ -14,11 +14,13 @@ from string import Formatter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from babel.dates import format_date
 from babel.numbers import format_decimal
 from jinja2 import Environment
 
+from lmshealth import identify, load_stage, read_log
 from lmshealth._private.serialize import unpack
 from lmshealth._private.tables import REFUSALS, fact
 from lmshealth.batch.assess import pack_assessment
@@ -352,3 +354,42 @@ def test_tables_are_the_same_in_every_language(
         {name: unpack(own, str) for name, own in one.tables.items()} for one in (first, second)
     ]
     assert tables[0] == tables[1]
+
+
+def test_templates_of_details_are_those_of_the_sources() -> None:
+    """The text between their values is in a string of the package; control: another one is not."""
+    sources = (ast.parse(file.read_text("utf-8")) for file in catalogue.PACKAGE.rglob("*.py"))
+    nodes = (node for source in sources for node in ast.walk(source))
+    known = "\n".join(str(one.value) for one in nodes if isinstance(one, ast.Constant))
+
+    def unknown(template: str) -> list[str]:
+        """Return what is in no string; a part after a colon or a comma may be of another one."""
+        parts = (re.split(r"[;:,] (?:and )?", own) for own in re.split(r"{\w+}", template))
+        return [part for own in parts for part in own if part.strip() not in known]
+
+    templates = [one for refusal in REFUSALS.values() for one in refusal.details]
+    assert [part for one in templates for part in unknown(one)] == []
+    assert unknown("all {n} samples are cheese; check it") == [" samples are cheese"]
+
+
+@pytest.mark.parametrize("language", TRANSLATED)
+def test_details_of_a_damaged_log_are_translated(language: Any, tmp_path: Path) -> None:
+    """Channels that are flat, clipped, full of gaps, copied or without sign, and modes not seen."""
+    rng = np.random.default_rng(1)
+    first, second = rng.standard_normal((2, 10_000))
+    gap, full = second.copy(), first.copy()
+    gap[100:140], full[rng.random(full.size) < 0.3] = np.nan, np.nan
+    channels = {"flat": 0 * first, "clipped": first.clip(-1, 1), "gap": gap, "full": full}
+    channels |= {"copy": 2 * first, "rectified": abs(first)}
+    table = pd.DataFrame({"time_s": np.arange(first.size) / 500, "delta_e_um": first})
+    for name, values in channels.items():
+        table[f"acc_{name}_m_s2"] = values
+    table.to_csv(tmp_path / "log.csv", index=False)
+    refused = identify(read_log(tmp_path / "log.csv"), load_stage("lms-y")).refused
+    reasons = {one.reason for one in refused}
+    assert reasons >= {"flat", "clipped", "gaps", "missing-samples", "dependent", "rectified"}
+    assert "not-excited" in reasons
+    with in_language(language):
+        assert [one.detail for one in refused if not is_known(one.detail)] == []
+        (flat,) = {one.detail for one in refused if one.reason == "flat"}
+        assert sentence(flat) == "alle 10000 Abtastwerte sind 0 (SI); prüfen Sie den Sensor"
