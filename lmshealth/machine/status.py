@@ -461,14 +461,16 @@ def judge_at(
 
 
 def on_day(summary: Summary, status: Status, today: date) -> Summary:
-    """Return a summary as of a day, by the status on that day: state, urgency and next step."""
+    """Return a summary as of a day, by the status on that day: state, urgency, step, days left."""
     service, found = summary.service, summary
     late = "late" if {"silent", "inspection-overdue"} & status.conditions.keys() else ""
     is_past = service.kind == "by" and service.by is not None and service.by < today
     if status.unknown_since:
         urgency = min(summary.urgency, (1, 0.0, 0.0, summary.identity))
         found = replace(summary, state="open", urgency=urgency, unknown=True)
-    return replace(found, today=today, step=summary.step.on("overdue" if is_past else late))
+    postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
+    step = summary.step.on("overdue" if is_past else late)
+    return replace(found, today=today, step=step, postponed=tuple(postponed))
 
 
 def compare(

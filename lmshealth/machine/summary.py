@@ -16,7 +16,13 @@ from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import ProbabilityBounds, Service, day_after, remaining_days
+from lmshealth.machine.service import (
+    ProbabilityBounds,
+    Service,
+    day_after,
+    probability_before,
+    remaining_days,
+)
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[
@@ -237,7 +243,9 @@ class Summary:
     service: Service
     step: NextStep
     deviates: bool = False  # whether the last log is left out: the verdict is that before it
-    # Day that it is of; `status.on_day` sets it, and what depends on it: urgency, state and step.
+    # Days of a postponed service, weeks late (or None), and bounds of the risk.
+    postponed: tuple[tuple[date, int | None, tuple[float, float]], ...] = ()
+    # Day that it is of; `status.on_day` sets it, and what depends on it.
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
 
@@ -282,7 +290,19 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         service=service,
         step=next_step(assessment, service),
         deviates=bool(assessment.left_out) and judgement.probability >= 0,
+        postponed=tuple(_postponed(prognosis, service)),
     )
+
+
+def _postponed(
+    prognosis: Prognosis | None, service: Service
+) -> Iterator[tuple[date, int | None, tuple[float, float]]]:
+    """Yield the days and risks of a postponed service as `Summary` has them."""
+    for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
+        assert prognosis is not None
+        if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
+            reached = probability_before(prognosis, day)
+            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
 
 
 def summarise_life(
