@@ -23,7 +23,6 @@ from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
-from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS

@@ -875,6 +875,12 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     tables = ["maintenance.csv", "manifest.csv"]
     assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
     assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+    (logs / "maintenance.csv").unlink()
+    (logs / "manifest.csv").write_text("file,temperatur_c,operator\nlog-01.h5,20,me\n")
+    misspelt = run(logs, [modes_only], out)
+    assert (misspelt.n_logs, misspelt.n_refused, misspelt.n_unread) == (2, 0, 0)
+    (note,) = misspelt.notes
+    assert note.startswith("manifest.csv: column temperatur_c is not read, unlike temperature_c")
 
 
 @pytest.mark.slow

@@ -379,7 +379,12 @@ def test_details_of_a_damaged_log_are_translated(language: Any, tmp_path: Path) 
     first, second = rng.standard_normal((2, 10_000))
     gap, full = second.copy(), first.copy()
     gap[100:140], full[rng.random(full.size) < 0.3] = np.nan, np.nan
-    channels = {"flat": np.zeros(first.size), "clipped": first.clip(-1, 1), "gap": gap, "full": full}
+    channels = {
+        "flat": np.zeros(first.size),
+        "clipped": first.clip(-1, 1),
+        "gap": gap,
+        "full": full,
+    }
     channels |= {"copy": 2 * first, "rectified": abs(first)}
     table = pd.DataFrame({"time_s": np.arange(first.size) / 500, "delta_e_um": first})
     for name, values in channels.items():
