@@ -243,7 +243,10 @@ CHANGES: dict[str, tuple[Severity, str]] = {
     "no-log-since-maintenance": ("note", "no log after the last work"),
     "unconfirmed-jump": ("note", "the last logs are far from those before them"),
     "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
-    "recovered": ("note", "a verdict, a silence, an alarm, a late log or a jump has ended"),
+    "recovered": (
+        "note",
+        "a verdict, silence, alarm, late log, jump or, by work, another state has ended",
+    ),
 }
 """Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
 kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
@@ -297,6 +300,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
     # Modes whose alarm, and conditions whose begin was a change since the baseline.
     announced: tuple[str, ...] = ()
+    works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed
     infers_health: bool  # whether the description has a parameter
     probability_limit_reached: float | None  # now; None where no limit is determined
@@ -402,6 +406,8 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         probability=finite_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
+        works=len(assessment.history.steps)
+        + sum(one.code == "no-log-since" for one in assessment.notices),
         warnings={one.code: one.severity for one in reversed(notices(assessment))},
         infers_health=bool(assessment.stage.parameters),
         probability_limit_reached=max(reached, default=None),
@@ -483,6 +489,8 @@ def compare(
     now = judge_at(before, now, moment, silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
     once = [code for code in now.conditions if code in _ONCE]
+    if _is_worked_on(before, now):  # what it has ended may begin again
+        known = tuple(code for code in known if code in (*once, *now.alarms))
     now = msgspec.structs.replace(now, announced=tuple(dict.fromkeys((*known, *now.alarms, *once))))
     changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
@@ -520,17 +528,29 @@ def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str,
     elif before and before.silent and not now.silent:
         yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
     earlier = before.conditions if before else {}
-    confirmed = {"unconfirmed-jump"} if now.alarms or _is_loss(verdict) else set()
     for code in _ENDING:
         if code in now.conditions and code not in earlier:
             yield code, "", _detail(code, now)
-        elif (
-            before
-            and code in earlier.keys() - now.conditions.keys() - confirmed
-            and now.recorded_at > before.recorded_at  # not by another day or description
-            and not before.silent
-        ):
-            yield "recovered", code, f"log of {now.recorded_at.date().isoformat()}"
+    if before:
+        yield from (("recovered", code, why) for code, why in _ended(before, now))
+
+
+def _ended(before: Status, now: Status) -> Iterator[tuple[str, str]]:
+    """Yield conditions that a later log has ended, or work that was entered, and which of both."""
+    ended = before.conditions.keys() - now.conditions.keys()
+    if now.alarms or _is_loss(_at_last_log(now)):  # they are the jump that was not confirmed
+        ended -= {"unconfirmed-jump"}
+    # Not by another day or description.
+    if now.recorded_at > before.recorded_at and not before.silent:
+        why = f"log of {now.recorded_at.date().isoformat()}"
+        yield from ((code, why) for code in _ENDING if code in ended)
+    elif _is_worked_on(before, now):
+        yield from ((code, "work was entered") for code in (*_ENDING, *_ONCE) if code in ended)
+
+
+def _is_worked_on(before: Status | None, now: Status) -> bool:
+    """Return whether work that is not yet in an earlier status was entered."""
+    return before is not None and before.works is not None and now.works != before.works
 
 
 def _is_loss(verdict: str) -> bool:
