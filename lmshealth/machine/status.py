@@ -151,7 +151,7 @@ def _of_channels(assessment: Assessment) -> Iterator[Notice]:
     for (reason, channel), rows in found.items():
         logs = len({row.log for row in rows})
         own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": logs}
-        what = fact("{channel}: {detail} (in {log}; {n} such logs).", **own)
+        what = fact("{channel}: {detail} (last in {log}; such logs: {n}).", **own)
         repaired = not WARNINGS[reason]
         to_do = fact("refused.csv lists all.")
         yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
@@ -164,7 +164,7 @@ def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
         return
     total = len(lost) + len(assessment.history.logs)
     what = fact(
-        "{n} of {total} logs of this machine are refused as a whole ({reasons}).",
+        "Of {total} logs of this machine, refused as a whole: {n} ({reasons}).",
         n=len(lost),
         total=total,
         reasons=", ".join(dict.fromkeys(lost.values())),

@@ -242,7 +242,8 @@ class Summary:
     life: Life | None
     service: Service
     step: NextStep
-    deviates: bool = False  # whether the last log is left out: the verdict is that before it
+    # Modes, or ``all``, in which the last log is left out: the verdict is that before it.
+    deviates: tuple[str, ...] = ()
     # Days of a postponed service, weeks late (or None), and bounds of the risk.
     postponed: tuple[tuple[date, int | None, tuple[float, float]], ...] = ()
     # Day that it is of; `status.on_day` sets it, and what depends on it.
@@ -289,9 +290,15 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
         step=next_step(assessment, service),
-        deviates=bool(assessment.left_out) and judgement.probability >= 0,
+        deviates=_deviating(assessment) if judgement.probability >= 0 else (),
         postponed=tuple(_postponed(prognosis, service)),
     )
+
+
+def _deviating(assessment: Assessment) -> tuple[str, ...]:
+    """Return the modes in which the last logs are left out as `Summary` has them."""
+    modes = assessment.track.modes if assessment.track else ()
+    return ("all",) if set(modes) == assessment.left_out.keys() else (*assessment.left_out,)
 
 
 def _postponed(

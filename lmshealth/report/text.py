@@ -352,8 +352,14 @@ def verdict_text(summary: Summary) -> str:
     words = texts.get(summary.verdict) or tr(
         "loss of {names}", names=joined(map(spell, summary.lost))
     )
-    before_last = tr("{verdict} before the last log, which deviates", verdict=words)
-    return before_last if summary.deviates else words
+    if not summary.deviates:
+        return words
+    if summary.deviates == ("all",):
+        return tr("{verdict} before the last log, which deviates", verdict=words)
+    names = joined(map(spell, summary.deviates))
+    return tr(
+        "{verdict} before the last log, which deviates in {names}", verdict=words, names=names
+    )
 
 
 def headline(summary: Summary) -> str:

@@ -902,7 +902,7 @@ def test_a_page_counts_the_logs_of_its_machine_that_were_refused(
     (logs / "manifest.csv").write_text("file,stage\n" + listed)
     run(logs, [modes_only], out)
     (notice,) = (row for row in rows(out / "warnings.csv") if row["code"] == "logs-refused")
-    assert notice["what"].startswith("3 of 5 logs of this machine are refused as a whole (")
+    assert notice["what"].startswith("Of 5 logs of this machine, refused as a whole: 3 (")
     assert notice["severity"] == "caution"
     assert "3 parts refused" in (out / "test-A.html").read_text()
     refused = sorted(row["log"] for row in rows(out / "refused.csv"))

@@ -208,7 +208,10 @@ def test_last_logs_that_are_left_out_are_counted(
     # Before a service is planned by the logs that are left, the jump is confirmed or refuted.
     before, after = (summarise(one, one.service()) for one in (good, bad))
     assert before.step.kind != after.step.kind == "check-drift"
-    assert headline(after) == f"{headline(before)} before the last log, which deviates"
+    assert headline(after) == f"{headline(before)} before the last log, which deviates in roll"
+    every = replace(bad.track, outliers=tuple((n - 1, mode) for mode in bad.track.modes))
+    whole = replace(bad, track=every)
+    assert headline(summarise(whole, whole.service())).endswith("last log, which deviates")
     assert "unconfirmed-jump" in make_status(bad, after).conditions
     # A second log alike leaves the jump unconfirmed; one bad log does not hide a service.
     later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))
@@ -216,5 +219,5 @@ def test_last_logs_that_are_left_out_are_counted(
     lost = replace(bad, judgement=replace(bad.judgement, verdict="preload"))
     summary = summarise(lost, lost.service())
     assert summary.step.kind == "check-loss" and service_on_day(summary).endswith("was repaired")
-    assert headline(summary) == "Loss of guide preload before the last log, which deviates"
-    assert "before the last log, which deviates (" in next(iter(changes(summary, summary)))
+    assert headline(summary) == "Loss of guide preload before the last log, which deviates in roll"
+    assert "before the last log, which deviates in roll (" in next(iter(changes(summary, summary)))
