@@ -222,7 +222,7 @@ def roughness(values: Samples) -> Roughness:
 def check_signal(values: Samples) -> Roughness:
     """Refuse a constant (``flat``) or ``clipped`` channel, ``(n_samples,)`` in SI units."""
     rough = roughness(values)
-    low, high = rough.low, rough.high
+    low, high = rough.low + 0.0, rough.high  # no −0
     if low == high:
         raise Unusable("flat", f"all {values.size} samples are {low:.6g} (SI); check the sensor")
     if high - low < constants.SMALLEST_RANGE:

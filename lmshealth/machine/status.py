@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtrc, gammaincinv
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
-from lmshealth._private.tables import fact, spell
+from lmshealth._private.tables import FLAGS, fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, MIN_FIT, SURPRISE
 from lmshealth.life.verdict import (
@@ -51,9 +51,9 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
         names = " and ".join(map(spell, dict.fromkeys(modes)))
-        what = fact("The last log has the flag {flag} at {names}.", flag=flag, names=names)
-        to_do = fact("Its meaning is in the column flags of modes.csv.")
-        yield Notice(flag, "caution", names, what, to_do)
+        own = {"flag": flag, "names": names, "meaning": FLAGS.get(flag) or fact("see modes.csv.")}
+        what = fact("The last log has the flag {flag} at {names}: {meaning}", **own)
+        yield Notice(flag, "caution", names, what)
 
 
 def _of_track(assessment: Assessment) -> Iterator[Notice]:
@@ -74,21 +74,21 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             "Record a log at once; check work, payload, sensor and servo tuning since then."
         )
         yield Notice("large-drift", "serious", mode, what, to_do)
-    for mode, n in assessment.left_out.items():
-        if mode in assessment.drifted:
-            continue
+    left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
+    for n in sorted(set(left.values())):
+        names = " and ".join(spell(mode) for mode, own in left.items() if own == n)
         one = fact(
-            "The last log is far from those before it at {mode}, and left out.", mode=spell(mode)
+            "The last log is far from those before it at {names}, and left out.", names=names
         )
         more = fact(
-            "The last {n} logs are far from those before them at {mode}, and left out: health is "
+            "The last {n} logs are far from those before them at {names}, and left out: health is "
             "that of then.",
             n=n,
-            mode=spell(mode),
+            names=names,
         )
         to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
         severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
-        yield Notice("last-logs-left-out", severity, mode, more if n > 1 else one, to_do)
+        yield Notice("last-logs-left-out", severity, names, more if n > 1 else one, to_do)
     if track is not None and track.suspected is not None:
         day = track.recorded_at[track.suspected.first].date().isoformat()
         what = fact(
@@ -475,7 +475,9 @@ def on_day(summary: Summary, status: Status, today: date) -> Summary:
         urgency = min(summary.urgency, (1, 0.0, 0.0, summary.identity))
         found = replace(summary, state="open", urgency=urgency, unknown=True)
     postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
-    step = summary.step.on("overdue" if is_past else late)
+    # Logs as rare as the step allows would let the machine become silent.
+    often = min(summary.step.log_every, status.silent_after_days or np.inf)
+    step = replace(summary.step.on("overdue" if is_past else late), log_every=often)
     return replace(found, today=today, step=step, postponed=tuple(postponed))
 
 

@@ -11,9 +11,10 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.tables import TABLES, Row, spell
+from lmshealth.life.constants import LONE_NAMED
 from lmshealth.life.fleet_prior import Calibration
 from lmshealth.life.prognosis import LawWeight, Prognosis
-from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words
+from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import (
@@ -124,7 +125,10 @@ def _class_of(assessment: Assessment) -> str:
     """Return the class of the verdict as `CASES` has it."""
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
-        return "alarm"
+        events = undeclared_events(assessment.track, assessment.history.baseline, "step")
+        lone = assessment.health.lone_modes if assessment.health else ()
+        known = {one.mode for one in lone if one.probability >= LONE_NAMED}
+        return "outside" if events and {one.mode for one in events} <= known else "alarm"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     found = known.get(verdict, "loss")
     if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):

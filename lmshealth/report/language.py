@@ -165,13 +165,14 @@ def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
         return None
     ways = []
     for own, translation in _patterns(chosen, FACT, r"(?=[;:,]?\s|$)"):
-        found = own.match(text)
-        if found is None or (between := _BETWEEN.match(text, found.end())) is None:
-            continue
-        further = _sentences(chosen, text[between.end() :]) if found.end() < len(text) else (0, "")
-        if further is not None:
-            n = found.end() - sum(map(len, found.groups())) + further[0]
-            ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
+        # A value at the end may have blanks.
+        for found in filter(None, (own.match(text), own.fullmatch(text))):
+            if (between := _BETWEEN.match(text, found.end())) is None:
+                continue
+            rest = text[between.end() :]
+            if (further := _sentences(chosen, rest) if rest else (0, "")) is not None:
+                n = found.end() - sum(map(len, found.groups())) + further[0]
+                ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
     if not ways:
         return None
     n, found, translation, joint, joined, rest = max(ways, key=lambda way: way[0])

@@ -380,7 +380,7 @@ def test_details_of_a_damaged_log_are_translated(language: Any, tmp_path: Path) 
     gap, full = second.copy(), first.copy()
     gap[100:140], full[rng.random(full.size) < 0.3] = np.nan, np.nan
     channels = {
-        "flat": np.zeros(first.size),
+        "flat": -np.zeros(first.size),
         "clipped": first.clip(-1, 1),
         "gap": gap,
         "full": full,
