@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
 from functools import partial
@@ -39,6 +39,12 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
+def _listed(modes: Iterable[str]) -> str:
+    """List names of modes: commas, and the last after "and"."""
+    *names, last = map(spell, modes)
+    return f"{', '.join(names)} and {last}" if names else last
+
+
 def _of_names(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about names of modes and flags of their last estimates."""
     if assessment.doubt and all(one.what != assessment.doubt for one in assessment.notices):
@@ -50,9 +56,9 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
         for flag in (one for one in own.split() if one not in WARNINGS.values()):
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
-        names = " and ".join(map(spell, dict.fromkeys(modes)))
-        own = {"flag": flag, "names": names, "meaning": FLAGS.get(flag) or fact("see modes.csv.")}
-        what = fact("The last log has the flag {flag} at {names}: {meaning}", **own)
+        names = _listed(dict.fromkeys(modes))
+        told = {"flag": flag, "names": names, "meaning": FLAGS.get(flag) or fact("see modes.csv.")}
+        what = fact("The last log has the flag {flag} at {names}: {meaning}", **told)
         yield Notice(flag, "caution", names, what)
 
 
@@ -76,7 +82,7 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         yield Notice("large-drift", "serious", mode, what, to_do)
     left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
     for n in sorted(set(left.values())):
-        names = " and ".join(spell(mode) for mode, own in left.items() if own == n)
+        names = _listed(mode for mode, own in left.items() if own == n)
         one = fact(
             "The last log is far from those before it at {names}, and left out.", names=names
         )

@@ -127,8 +127,8 @@ def _class_of(assessment: Assessment) -> str:
     if assessment.alarmed or verdict == "step":
         events = undeclared_events(assessment.track, assessment.history.baseline, "step")
         lone = assessment.health.lone_modes if assessment.health else ()
-        known = {one.mode for one in lone if one.probability >= LONE_NAMED}
-        return "outside" if events and {one.mode for one in events} <= known else "alarm"
+        alone = {one.mode for one in lone if one.probability >= LONE_NAMED}
+        return "outside" if events and {one.mode for one in events} <= alone else "alarm"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     found = known.get(verdict, "loss")
     if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):

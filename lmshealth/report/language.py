@@ -102,8 +102,8 @@ def is_known(text: str) -> bool:
 def label(text: str) -> str:
     """Translate a label of a figure that was drawn in English, with its numbers and names."""
     chosen = language()
-    if (known := tr(text)) != text:
-        return known
+    if chosen == "en" or (known := tr(text)) != text:
+        return text if chosen == "en" else known
     for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
             values = {name: _value(chosen, one) for name, one in found.groupdict().items()}

@@ -100,7 +100,8 @@ def test_a_limit_that_no_mode_shows_is_not_called_healthy(make: Maker) -> None:
 def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
     """A jump of the one mode that moved alone is none of guide and mount; one of others may be."""
     made = make()
-    assert made.health is not None and made.track is not None
+    track, health = made.track, made.health
+    assert health is not None and track is not None
     made = replace(made, judgement=replace(made.judgement, verdict="step"))
     lone = (LoneMode("yaw", 0.02, 0.001, 0.99),)
     for modes, known, step in (
@@ -110,8 +111,8 @@ def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
         ((), lone, "inspect"),
     ):
         events = tuple(replace(EVENT, mode=mode) for mode in modes)
-        track = replace(made.track, events=events)
-        one = replace(made, track=track, health=replace(made.health, lone_modes=known))
+        track, health = replace(track, events=events), replace(health, lone_modes=known)
+        one = replace(made, track=track, health=health)
         assert next_step(one, one.service()).kind == step
 
 

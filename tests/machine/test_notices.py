@@ -210,11 +210,12 @@ def test_last_logs_that_are_left_out_are_counted(
     before, after = (summarise(one, one.service()) for one in (good, bad))
     assert before.step.kind != after.step.kind == "check-drift"
     assert headline(after) == f"{headline(before)} before the last log, which deviates in roll"
+    assert bad.track is not None
     every = replace(bad.track, outliers=tuple((n - 1, mode) for mode in bad.track.modes))
     whole = replace(bad, track=every)
     assert headline(summarise(whole, whole.service())).endswith("last log, which deviates")
     (whole_told,) = (one for one in notices(whole) if one.code == "last-logs-left-out")
-    assert whole_told.where == "pitch and roll and yaw"
+    assert whole_told.where == "pitch, roll and yaw"
     assert "unconfirmed-jump" in make_status(bad, after).conditions
     # A second log alike leaves the jump unconfirmed; one bad log does not hide a service.
     later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))

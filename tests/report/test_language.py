@@ -245,7 +245,10 @@ def test_a_sentence_has_the_formats_of_german() -> None:
         assert (text.count(1, "log"), text.count(2, "week")) == ("1 Aufzeichnung", "2 Wochen")
         assert label("limit 60 %") == "Grenzwert 60 %"
         assert label("guide preload in % of baseline") == "Vorspannung der Führung in %"
-    assert tr("Fleet") == "Fleet"
+        assert label("114.06 Hz") == "114,06 Hz"
+    assert (tr("Fleet"), label("114.06 Hz"), text.capitalize("114.06 Hz")) == (
+        *("Fleet", "114.06 Hz", "114.06 Hz"),
+    )
 
 
 def test_the_words_of_the_script_are_there() -> None:
