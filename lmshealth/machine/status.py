@@ -83,14 +83,12 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
     left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
     for n in sorted(set(left.values())):
         names = _listed(mode for mode, own in left.items() if own == n)
-        one = fact(
-            "The last log is far from those before it at {names}, and left out.", names=names
-        )
+        told = {"n": n, "names": names}
+        one = fact("The last log is far from those before it at {names}, and left out.", **told)
         more = fact(
             "The last {n} logs are far from those before them at {names}, and left out: health is "
             "that of then.",
-            n=n,
-            names=names,
+            **told,
         )
         to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
         severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
@@ -106,15 +104,9 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         yield Notice("step-suspected", "caution", "", what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
-        widened = track.widening[-1]
-        narrow = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
-        wide = fact(
-            "The logs do not vary as the filter of the modes expects (p = {p}); its intervals are "
-            "{factor:.1f} times as wide.",
-            p=p,
-            factor=widened,
-        )
-        what = wide if widened > 1 else narrow
+        what = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
+        if (factor := track.widening[-1]) > 1:
+            what += " " + fact("Its intervals are {factor:.1f} times as wide.", factor=factor)
         to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
         yield Notice("filter-inconsistent", "caution", "", what, to_do)
 
