@@ -36,9 +36,10 @@ service it now, service it after its date, confirm a service date by further log
 of a sound or of a worn machine, or nothing within the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``repair``
-# (perhaps: a loss, and a last log that is left out), ``open`` (none), ``healthy`` or ``loss``. A
-# day is ``overdue`` after that of the service, else ``late`` where a log is. "" is any.
+# step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
+# left out, without a loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open``
+# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
+# where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),
