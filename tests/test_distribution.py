@@ -7,45 +7,23 @@ import sys
 import tomllib
 import zipfile
 from collections.abc import Callable
-from importlib.metadata import Distribution, PackageNotFoundError, distribution
+from importlib.metadata import Distribution, distribution, distributions
 from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 
+from studies.cost.installation import needed, normal
+
 ROOT = Path(__file__).parents[1]
 # Extras that people install to use the package; `peers` and `dev` stay with who develops it.
 EXTRAS = ("models", "formats", "pdf", "postgres", "notify", "distributed")
-CORE = ("numpy", "scipy", "pandas", "emcee", "filterpy")
 PERMISSIVE = re.compile(
     r"0BSD|Apache|BSD|CC0|HPND|ISC|MIT|PSF|Python[- ](2|Software)|Unlicense|Zlib|MPL|Mozilla"
 )
 STRONG_COPYLEFT = re.compile(r"(?<![A-Z])A?GPL")
 # Libraries that are imported and not changed, in extras only.
 WEAK_COPYLEFT = {"nptdms", "psycopg", "psycopg-binary", "pyphen"}
-
-
-def normal(name: str) -> str:
-    """Return the normalised name of a distribution."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
-def needed(name: str, extras: frozenset[str], found: dict[str, Distribution]) -> None:
-    """Collect the installed distributions that one needs, with those that these need."""
-    own = distribution(name)
-    for text in own.requires or ():
-        requirement = Requirement(text)
-        marker = requirement.marker
-        if marker and not any(marker.evaluate({"extra": e}) for e in (*extras, "")):
-            continue
-        other = normal(requirement.name)
-        if other == "lmshealth" or other in found:
-            continue
-        try:
-            found[other] = distribution(requirement.name)
-        except PackageNotFoundError:
-            continue  # an extra that is not installed
-        needed(requirement.name, frozenset(requirement.extras), found)
 
 
 def _first(one: Distribution, field: str) -> str:
@@ -72,10 +50,10 @@ def refused(licences: dict[str, str]) -> dict[str, str]:
 
 def test_licences_of_dependencies() -> None:
     """All dependencies have a permissive licence, or are named; a strong copyleft is refused."""
-    found: dict[str, Distribution] = {}
-    needed("lmshealth", frozenset(EXTRAS), found)
-    assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= set(found)
-    licences = {name: licence(one) for name, one in found.items()}
+    there = {normal(one.name): one for one in distributions()}
+    found = needed(there, "lmshealth", {*EXTRAS}) - {"lmshealth"}
+    assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= found
+    licences = {name: licence(there[name]) for name in found}
     unstated = {"partd"}  # its licence is a file: BSD-3-Clause
     assert not refused({k: v for k, v in licences.items() if k not in unstated})
     strange = {"other": "GPL-3.0-or-later", "both": "MIT AND AGPL-3.0", "none": ""}
@@ -84,26 +62,8 @@ def test_licences_of_dependencies() -> None:
 
 def test_core_has_no_copyleft() -> None:
     """Without extras nothing is under any copyleft but MPL."""
-    found: dict[str, Distribution] = {}
-    needed("lmshealth", frozenset(), found)
-    assert not WEAK_COPYLEFT & set(found)
-
-
-def size(found: dict[str, Distribution]) -> int:
-    """Return the bytes of the files of distributions, without compiled byte code."""
-    files = [Path(str(one.locate_file(file))) for one in found.values() for file in one.files or ()]
-    return sum(file.stat().st_size for file in files if file.suffix != ".pyc" and file.exists())
-
-
-def test_a_plain_installation_is_little_beyond_the_libraries_that_it_builds_on() -> None:
-    """NumPy, SciPy, pandas, emcee, filterpy with what these need are most of it."""
-    found: dict[str, Distribution] = {}
-    needed("lmshealth", frozenset(), found)
-    core = {normal(name): distribution(name) for name in CORE}
-    for name in CORE:
-        needed(name, frozenset(), core)
-    assert core.keys() < found.keys()
-    assert 0 < size(core) < size(found) < 1.4 * size(core)
+    there = {normal(one.name): one for one in distributions()}
+    assert not WEAK_COPYLEFT & needed(there, "lmshealth")
 
 
 def wrong_versions(version: str, changelog: str, tags: list[str]) -> list[str]:

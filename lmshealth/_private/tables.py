@@ -71,6 +71,7 @@ class RefusalCode(msgspec.Struct, frozen=True, array_like=True):
     what: str  # is refused: log, channel, mode, blow or row; ``warning`` where it is used
     cause: str
     cure: str
+    details: tuple[str, ...] = ()  # templates of sentences of its details that pages translate
 
 
 class _Specification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -90,6 +91,8 @@ TABLES: Mapping[str, Table] = {**_READ.run, **_READ.command}
 """All tables, those of the answers of commands by their key there."""
 REFUSALS: Mapping[str, RefusalCode] = _READ.refusals
 """Every code in the column ``reason`` of ``refused.csv``."""
+FLAGS: Mapping[str, str] = _READ.run["modes"].values["flags"]
+"""Meaning of the flags of a mode."""
 MOMENTS = sorted(
     {name for one in TABLES.values() for name, unit in one.units.items() if unit == "moment"}
 )

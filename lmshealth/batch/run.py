@@ -37,7 +37,7 @@ from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
-from lmshealth.io.manifest import NOT_LOGS
+from lmshealth.io.manifest import MISSPELT, NOT_LOGS
 from lmshealth.io.refusal import visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_at, make_status, on_day
@@ -271,7 +271,7 @@ def run(
         statuses=statuses,
         changes=tuple(changes),
         unsent=unsent,
-        notes=tuple(notes),
+        notes=(*counted.notes, *notes),
     )
 
 
@@ -342,17 +342,19 @@ def _prepare(out: Path) -> None:
 def _counted(
     result: RunResult, ingested: Ingested, refused: Sequence[Refusal], excluded: set[str]
 ) -> tuple[RunResult, set[str]]:
-    """Add the counts of logs to a result; return the logs that were refused as a whole too."""
+    """Add counts and notes to a result; return the logs that were refused as a whole too."""
     copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
     others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
     lost = (others - copies | excluded) & ingested.logs
+    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
     counted = replace(
         result,
         n_logs=len(ingested.logs - copies),
         n_refused=len(lost),
         n_remembered=ingested.n_cached,
         n_unlisted=len(unlisted),
-        n_unread=sum(PurePosixPath(refusal.log).name in NOT_LOGS for refusal in refused),
+        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
+        notes=(*result.notes, *misspelt),
     )
     return counted, lost
 

@@ -222,7 +222,7 @@ def roughness(values: Samples) -> Roughness:
 def check_signal(values: Samples) -> Roughness:
     """Refuse a constant (``flat``) or ``clipped`` channel, ``(n_samples,)`` in SI units."""
     rough = roughness(values)
-    low, high = rough.low, rough.high
+    low, high = rough.low + 0.0, rough.high  # no −0
     if low == high:
         raise Unusable("flat", f"all {values.size} samples are {low:.6g} (SI); check the sensor")
     if high - low < constants.SMALLEST_RANGE:
@@ -367,8 +367,8 @@ def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Sam
     if whole > span:
         undone, n = _without_turns(values, model, whole)
         if n:
-            found = f"{n} samples are off by the {2**bits} steps of {bits} bits of a counter"
-            return undone, f"{found} that overflows: undone"
+            steps = f"{2**bits} steps of {bits} bits of a counter that overflows"
+            return undone, f"{n} samples are off by the {steps}: undone"
     _refuse_unknown(values, jumps, model, span)
     return values, ""
 
@@ -550,8 +550,9 @@ def check_sign(values: Samples, rough: Roughness) -> None:
         from_zero = at_zero and skew > constants.MAGNITUDE_SKEW
         if (edge or from_zero) and _reaches(values, own is x, low, float(q[3])):
             end = f"below {rough.low:.4g}" if own is x else f"above {rough.high:.4g}"
-            detail = f"no sample is {end} (SI), as of a magnitude, which shows modes at sums and "
-            raise Unusable("rectified", f"{detail}doubles of their frequencies; record its sign")
+            found = f"no sample is {end} (SI), as of a magnitude"
+            modes = "which shows modes at sums and doubles of their frequencies"
+            raise Unusable("rectified", f"{found}, {modes}; record its sign")
 
 
 def _reaches(values: Samples, is_lower: bool, low: float, middle: float) -> bool:

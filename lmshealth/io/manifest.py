@@ -7,10 +7,12 @@ refuses the table. Both are named by their line.
 import csv
 import io
 import os
+import re
 import stat
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -28,6 +30,8 @@ if TYPE_CHECKING:
 
 
 _MOST_LISTED = 3
+MISSPELT = "unlike-key"  # reason of a column of a manifest that is probably misspelt
+_LIKE = 0.75  # likeness of words (difflib) from which one is taken for a misspelt other
 
 
 class Row(NamedTuple):
@@ -334,8 +338,9 @@ def _trouble(path: Path, root: Path, *, follow_links: bool = False) -> tuple[str
 
 def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> Iterator[Refusal]:
     """Add the rows of one table to a manifest; yield those that name no log of the folder."""
-    own: dict[Path, dict[str, str]] = {}
+    own, names = dict[Path, dict[str, str]](), set[str]()
     for where, cells, trouble in read_sheet(path, ("file",)):
+        names.update(cells)
         place = f"{where} of {name_of(path, root)}"
         file = cells["file"].replace("\\", "/")
         if not file or "\0" in file:
@@ -356,5 +361,16 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
             yield Refusal(name_of(log, _absolute(root)), "missing-file", f"{place} names no file")
     if any(row.keys() >= {"stage", "recorded_at"} for row in own.values()):
         manifest.registers.add(_absolute(path.parent))
+    for name, key in _misspelt(names):
+        detail = f"column {shown(name)} is not read, unlike {key}; rename it if that is meant"
+        yield Refusal(name_of(path, root), MISSPELT, detail)
     for log, row in own.items():
         manifest.rows[log] = manifest.rows.get(log, {}) | row
+
+
+def _misspelt(names: set[str]) -> Iterator[tuple[str, str]]:
+    """Yield the columns that are almost a key of the metadata without a column, and that key."""
+    keys = [key for key in metadata_keys() if key not in names]
+    for name in sorted(names.difference(metadata_keys(), ("file", ""))):
+        if near := get_close_matches(re.sub(r"\W+", "_", name.casefold()), keys, 1, _LIKE):
+            yield name, near[0]

@@ -135,17 +135,11 @@ def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None
             "The stage description has no [[parameter]]: the modes are tracked, and no health "
             "parameter is inferred."
         )
+    told = {"n": n_logs, "needed": needed}
+    if 1 == n_logs < needed:
+        return fact("1 usable log since the baseline began; it needs {needed}.", **told)
     if n_logs < needed:
-        one = fact("1 usable log since the baseline began; it needs {needed}.", needed=needed)
-        return (
-            one
-            if n_logs == 1
-            else fact(
-                "{n} usable logs since the baseline began; it needs {needed}.",
-                n=n_logs,
-                needed=needed,
-            )
-        )
+        return fact("{n} usable logs since the baseline began; it needs {needed}.", **told)
     if health is None:
         return fact("The logs do not contain enough information for the health parameters.")
     if not health.explained:

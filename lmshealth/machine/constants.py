@@ -37,6 +37,10 @@ shares a cause with no other."""
 RISEN = 1.05
 """Share of its baseline that no wear reaches: a parameter above it with 95 % is reported."""
 
+POSTPONED_WEEKS, POSTPONED_SHOWN = (0, 1, 2, 4, 8, 13, 26, 52, 104), 5
+"""Weeks by which a service may be late, of which a page has the risk, and how many of those that
+are not past yet it shows."""
+
 JSON_SCHEMA = 2
 """Version of the JSON documents that state one: status files, answers of `run`, `watch`, `stage`,
 and what alerts get. It changes when a key or a value changes its meaning or is removed."""

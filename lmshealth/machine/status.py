@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
 from functools import partial
@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import chdtrc, gammaincinv
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
-from lmshealth._private.tables import fact, spell
+from lmshealth._private.tables import FLAGS, fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, MIN_FIT, SURPRISE
 from lmshealth.life.verdict import (
@@ -39,6 +39,12 @@ def notices(assessment: Assessment) -> tuple[Notice, ...]:
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
 
 
+def _listed(modes: Iterable[str]) -> str:
+    """List names of modes: commas, and the last after "and"."""
+    *names, last = map(spell, modes)
+    return f"{', '.join(names)} and {last}" if names else last
+
+
 def _of_names(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about names of modes and flags of their last estimates."""
     if assessment.doubt and all(one.what != assessment.doubt for one in assessment.notices):
@@ -50,10 +56,10 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
         for flag in (one for one in own.split() if one not in WARNINGS.values()):
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
-        names = " and ".join(map(spell, dict.fromkeys(modes)))
-        what = fact("The last log has the flag {flag} at {names}.", flag=flag, names=names)
-        to_do = fact("Its meaning is in the column flags of modes.csv.")
-        yield Notice(flag, "caution", names, what, to_do)
+        names = _listed(dict.fromkeys(modes))
+        told = {"flag": flag, "names": names, "meaning": FLAGS.get(flag) or fact("see modes.csv.")}
+        what = fact("The last log has the flag {flag} at {names}: {meaning}", **told)
+        yield Notice(flag, "caution", names, what)
 
 
 def _of_track(assessment: Assessment) -> Iterator[Notice]:
@@ -74,21 +80,19 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
             "Record a log at once; check work, payload, sensor and servo tuning since then."
         )
         yield Notice("large-drift", "serious", mode, what, to_do)
-    for mode, n in assessment.left_out.items():
-        if mode in assessment.drifted:
-            continue
-        one = fact(
-            "The last log is far from those before it at {mode}, and left out.", mode=spell(mode)
-        )
+    left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
+    for n in sorted(set(left.values())):
+        names = _listed(mode for mode, own in left.items() if own == n)
+        told = {"n": n, "names": names}
+        one = fact("The last log is far from those before it at {names}, and left out.", **told)
         more = fact(
-            "The last {n} logs are far from those before them at {mode}, and left out: health is "
+            "The last {n} logs are far from those before them at {names}, and left out: health is "
             "that of then.",
-            n=n,
-            mode=spell(mode),
+            **told,
         )
         to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
         severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
-        yield Notice("last-logs-left-out", severity, mode, more if n > 1 else one, to_do)
+        yield Notice("last-logs-left-out", severity, names, more if n > 1 else one, to_do)
     if track is not None and track.suspected is not None:
         day = track.recorded_at[track.suspected.first].date().isoformat()
         what = fact(
@@ -100,15 +104,9 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         yield Notice("step-suspected", "caution", "", what, to_do)
     if track is not None and not track.consistency().holds:
         p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
-        widened = track.widening[-1]
-        narrow = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
-        wide = fact(
-            "The logs do not vary as the filter of the modes expects (p = {p}); its intervals are "
-            "{factor:.1f} times as wide.",
-            p=p,
-            factor=widened,
-        )
-        what = wide if widened > 1 else narrow
+        what = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
+        if (factor := track.widening[-1]) > 1:
+            what += " " + fact("Its intervals are {factor:.1f} times as wide.", factor=factor)
         to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
         yield Notice("filter-inconsistent", "caution", "", what, to_do)
 
@@ -151,7 +149,7 @@ def _of_channels(assessment: Assessment) -> Iterator[Notice]:
     for (reason, channel), rows in found.items():
         logs = len({row.log for row in rows})
         own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": logs}
-        what = fact("{channel}: {detail} (in {log}; {n} such logs).", **own)
+        what = fact("{channel}: {detail} (last in {log}; such logs: {n}).", **own)
         repaired = not WARNINGS[reason]
         to_do = fact("refused.csv lists all.")
         yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
@@ -164,7 +162,7 @@ def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
         return
     total = len(lost) + len(assessment.history.logs)
     what = fact(
-        "{n} of {total} logs of this machine are refused as a whole ({reasons}).",
+        "Of {total} logs of this machine, refused as a whole: {n} ({reasons}).",
         n=len(lost),
         total=total,
         reasons=", ".join(dict.fromkeys(lost.values())),
@@ -243,7 +241,10 @@ CHANGES: dict[str, tuple[Severity, str]] = {
     "no-log-since-maintenance": ("note", "no log after the last work"),
     "unconfirmed-jump": ("note", "the last logs are far from those before them"),
     "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
-    "recovered": ("note", "a verdict, a silence, an alarm, a late log or a jump has ended"),
+    "recovered": (
+        "note",
+        "a verdict, silence, alarm, late log, jump or, by work, another state has ended",
+    ),
 }
 """Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
 kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
@@ -297,6 +298,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
     # Modes whose alarm, and conditions whose begin was a change since the baseline.
     announced: tuple[str, ...] = ()
+    works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed
     infers_health: bool  # whether the description has a parameter
     probability_limit_reached: float | None  # now; None where no limit is determined
@@ -402,6 +404,8 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         probability=finite_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
+        works=len(assessment.history.steps)
+        + sum(one.code == "no-log-since" for one in assessment.notices),
         warnings={one.code: one.severity for one in reversed(notices(assessment))},
         infers_health=bool(assessment.stage.parameters),
         probability_limit_reached=max(reached, default=None),
@@ -461,14 +465,18 @@ def judge_at(
 
 
 def on_day(summary: Summary, status: Status, today: date) -> Summary:
-    """Return a summary as of a day, by the status on that day: state, urgency and next step."""
+    """Return a summary as of a day, by the status on that day: state, urgency, step, days left."""
     service, found = summary.service, summary
     late = "late" if {"silent", "inspection-overdue"} & status.conditions.keys() else ""
     is_past = service.kind == "by" and service.by is not None and service.by < today
     if status.unknown_since:
         urgency = min(summary.urgency, (1, 0.0, 0.0, summary.identity))
         found = replace(summary, state="open", urgency=urgency, unknown=True)
-    return replace(found, today=today, step=summary.step.on("overdue" if is_past else late))
+    postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
+    # Logs as rare as the step allows would let the machine become silent.
+    often = min(summary.step.log_every, status.silent_after_days or np.inf)
+    step = replace(summary.step.on("overdue" if is_past else late), log_every=often)
+    return replace(found, today=today, step=step, postponed=tuple(postponed))
 
 
 def compare(
@@ -481,6 +489,8 @@ def compare(
     now = judge_at(before, now, moment, silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
     once = [code for code in now.conditions if code in _ONCE]
+    if _is_worked_on(before, now):  # what it has ended may begin again
+        known = tuple(code for code in known if code in (*once, *now.alarms))
     now = msgspec.structs.replace(now, announced=tuple(dict.fromkeys((*known, *now.alarms, *once))))
     changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
@@ -518,17 +528,29 @@ def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str,
     elif before and before.silent and not now.silent:
         yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
     earlier = before.conditions if before else {}
-    confirmed = {"unconfirmed-jump"} if now.alarms or _is_loss(verdict) else set()
     for code in _ENDING:
         if code in now.conditions and code not in earlier:
             yield code, "", _detail(code, now)
-        elif (
-            before
-            and code in earlier.keys() - now.conditions.keys() - confirmed
-            and now.recorded_at > before.recorded_at  # not by another day or description
-            and not before.silent
-        ):
-            yield "recovered", code, f"log of {now.recorded_at.date().isoformat()}"
+    if before:
+        yield from (("recovered", code, why) for code, why in _ended(before, now))
+
+
+def _ended(before: Status, now: Status) -> Iterator[tuple[str, str]]:
+    """Yield conditions that a later log has ended, or work that was entered, and which of both."""
+    ended = before.conditions.keys() - now.conditions.keys()
+    if now.alarms or _is_loss(_at_last_log(now)):  # they are the jump that was not confirmed
+        ended -= {"unconfirmed-jump"}
+    # Not by another day or description.
+    if now.recorded_at > before.recorded_at and not before.silent:
+        why = f"log of {now.recorded_at.date().isoformat()}"
+        yield from ((code, why) for code in _ENDING if code in ended)
+    elif _is_worked_on(before, now):
+        yield from ((code, "work was entered") for code in (*_ENDING, *_ONCE) if code in ended)
+
+
+def _is_worked_on(before: Status | None, now: Status) -> bool:
+    """Return whether work that is not yet in an earlier status was entered."""
+    return before is not None and before.works is not None and now.works != before.works
 
 
 def _is_loss(verdict: str) -> bool:

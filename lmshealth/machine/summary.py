@@ -11,12 +11,19 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.tables import TABLES, Row, spell
+from lmshealth.life.constants import LONE_NAMED
 from lmshealth.life.fleet_prior import Calibration
 from lmshealth.life.prognosis import LawWeight, Prognosis
-from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words
+from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import ProbabilityBounds, Service, day_after, remaining_days
+from lmshealth.machine.service import (
+    ProbabilityBounds,
+    Service,
+    day_after,
+    probability_before,
+    remaining_days,
+)
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[
@@ -29,9 +36,10 @@ service it now, service it after its date, confirm a service date by further log
 of a sound or of a worn machine, or nothing within the horizon."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside``, ``drift`` (large, or a last log that is left out, without a loss), ``repair``
-# (perhaps: a loss, and a last log that is left out), ``open`` (none), ``healthy`` or ``loss``. A
-# day is ``overdue`` after that of the service, else ``late`` where a log is. "" is any.
+# step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
+# left out, without a loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open``
+# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
+# where a log is. "" is any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),
@@ -118,7 +126,10 @@ def _class_of(assessment: Assessment) -> str:
     """Return the class of the verdict as `CASES` has it."""
     verdict = assessment.judgement.verdict
     if assessment.alarmed or verdict == "step":
-        return "alarm"
+        events = undeclared_events(assessment.track, assessment.history.baseline, "step")
+        lone = assessment.health.lone_modes if assessment.health else ()
+        alone = {one.mode for one in lone if one.probability >= LONE_NAMED}
+        return "outside" if events and {one.mode for one in events} <= alone else "alarm"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     found = known.get(verdict, "loss")
     if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):
@@ -236,8 +247,11 @@ class Summary:
     life: Life | None
     service: Service
     step: NextStep
-    deviates: bool = False  # whether the last log is left out: the verdict is that before it
-    # Day that it is of; `status.on_day` sets it, and what depends on it: urgency, state and step.
+    # Modes, or ``all``, in which the last log is left out: the verdict is that before it.
+    deviates: tuple[str, ...] = ()
+    # Days of a postponed service, weeks late (or None), and bounds of the risk.
+    postponed: tuple[tuple[date, int | None, tuple[float, float]], ...] = ()
+    # Day that it is of; `status.on_day` sets it, and what depends on it.
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
 
@@ -281,8 +295,26 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
         step=next_step(assessment, service),
-        deviates=bool(assessment.left_out) and judgement.probability >= 0,
+        deviates=_deviating(assessment) if judgement.probability >= 0 else (),
+        postponed=tuple(_postponed(prognosis, service)),
     )
+
+
+def _deviating(assessment: Assessment) -> tuple[str, ...]:
+    """Return the modes in which the last logs are left out as `Summary` has them."""
+    modes = assessment.track.modes if assessment.track else ()
+    return ("all",) if set(modes) == assessment.left_out.keys() else (*assessment.left_out,)
+
+
+def _postponed(
+    prognosis: Prognosis | None, service: Service
+) -> Iterator[tuple[date, int | None, tuple[float, float]]]:
+    """Yield the days and risks of a postponed service as `Summary` has them."""
+    for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
+        assert prognosis is not None
+        if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
+            reached = probability_before(prognosis, day)
+            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
 
 
 def summarise_life(

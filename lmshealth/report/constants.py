@@ -26,8 +26,6 @@ MANY_MACHINES = 10
 REFUSED_SHOWN, REFUSED_UNFOLDED = 50, 12
 # Bins of the histogram of remaining travel in km, between passed and beyond the horizon.
 LIFE_EDGES = (100.0, 200.0, 500.0, 1000.0, 2000.0, 5000.0, 10000.0)
-# Weeks by which a service may be late, of which the page has the risk.
-POSTPONED_WEEKS = (0, 1, 2, 4, 8)
 # Months of the calendar of services.
 CALENDAR_MONTHS = 12
 # Points per figure, of logs spaced evenly up to the last: more would cover each other.

@@ -1,4 +1,4 @@
-"""Language of pages and figures: one catalogue (gettext), numbers and dates of its locale (Babel).
+"""Language of pages and figures: one catalogue (gettext), which has the format of dates, too.
 
 A thread has one language at a time, English unless `in_language` sets another. English has the
 formats of the tables: ISO dates, a decimal point.
@@ -12,7 +12,7 @@ from contextvars import ContextVar
 from datetime import date
 from functools import cache, lru_cache
 from importlib import resources
-from typing import IO, Literal, get_args
+from typing import Literal, get_args
 
 Language = Literal["en", "de"]
 LANGUAGES: tuple[Language, ...] = get_args(Language)
@@ -24,6 +24,7 @@ _language: ContextVar[Language] = ContextVar("language", default="en")
 _MOST_TEXT = 3000  # characters of sentences that are looked up: a file may hold any text
 _PLACE = re.compile(r"\\\{(\w+)[^}]*\\\}")
 _NUMBER = re.compile(r"(?<![\w.])(\d+)\.(\d+)(?![\w.])")
+_BETWEEN = re.compile(r"([;:,]?) (and )?|$")  # parts of a detail of a refusal
 _DAY = re.compile(r"\b\d{4}-\d\d-\d\d\b")
 
 
@@ -52,6 +53,12 @@ def mark_either(one: str, many: str) -> tuple[str, str]:
     return one, many
 
 
+_MONTHS = (
+    *(mark("Jan"), mark("Feb"), mark("Mar"), mark("Apr"), mark("May"), mark("Jun")),
+    *(mark("Jul"), mark("Aug"), mark("Sep"), mark("Oct"), mark("Nov"), mark("Dec")),
+)
+
+
 def tr(message: str, /, **values: object) -> str:
     """Translate a message, and insert values by name."""
     found = _catalogue(language()).gettext(message) if message else ""
@@ -65,25 +72,17 @@ def tr_either(one: str, many: str, n: int) -> str:
 
 def tr_day(day: date) -> str:
     """Format a day of the calendar."""
-    if language() == "en":
-        return day.isoformat()[:10]
-    from babel.dates import format_date  # late: English needs no Babel
-
-    return format_date(day, locale=language())
+    return format(day, tr("%Y-%m-%d"))
 
 
 def tr_month(day: date) -> str:
     """Return the abbreviated month of a day."""
-    if language() == "en":
-        return f"{day:%b}"
-    from babel.dates import format_date
-
-    return format_date(day, "LLL", locale=language())
+    return tr(_MONTHS[day.month - 1])
 
 
 def decimal(number: str) -> str:
     """Write a number that Python has formatted with the decimal mark of the language."""
-    return number if language() == "en" else number.replace(".", _decimal_mark(language()))
+    return number if language() == "en" else number.replace(".", tr("0.1")[1])
 
 
 def sentence(text: str) -> str:
@@ -91,7 +90,8 @@ def sentence(text: str) -> str:
 
     Results keep their sentences as text, which tables, stores and saved files have in English.
     """
-    return text if language() == "en" or not text else _sentences(language(), text) or text
+    known = None if language() == "en" or not text else _sentences(language(), text)
+    return text if known is None else known[1]
 
 
 def is_known(text: str) -> bool:
@@ -102,9 +102,9 @@ def is_known(text: str) -> bool:
 def label(text: str) -> str:
     """Translate a label of a figure that was drawn in English, with its numbers and names."""
     chosen = language()
-    if (known := tr(text)) != text:
-        return known
-    for own, translation in _labels(chosen):
+    if chosen == "en" or (known := tr(text)) != text:
+        return text if chosen == "en" else known
+    for own, translation in _patterns(chosen, "", ""):
         if found := own.fullmatch(text):
             values = {name: _value(chosen, one) for name, one in found.groupdict().items()}
             return translation.format(**values)
@@ -115,51 +115,30 @@ def label(text: str) -> str:
 def _catalogue(chosen: Language) -> gettext.NullTranslations:
     if chosen == "en":
         return gettext.NullTranslations()
-    with _file(chosen) as file:
-        return gettext.GNUTranslations(file)
-
-
-def _file(chosen: Language) -> IO[bytes]:
     folder = resources.files("lmshealth") / "report" / "locale" / chosen / "LC_MESSAGES"
-    return (folder / f"{DOMAIN}.mo").open("rb")
-
-
-@cache
-def _decimal_mark(chosen: Language) -> str:
-    from babel.numbers import get_decimal_symbol
-
-    return get_decimal_symbol(chosen)
+    with (folder / f"{DOMAIN}.mo").open("rb") as file:
+        return gettext.GNUTranslations(file)
 
 
 @cache
 def _templates(chosen: Language) -> list[tuple[str, str, str]]:
     """Return context, message and translation of all messages without a plural."""
-    from babel.messages.mofile import read_mo
-
-    with _file(chosen) as file:
-        return [
-            (one.context or "", one.id, one.string)
-            for one in read_mo(file)
-            if isinstance(one.id, str) and isinstance(one.string, str)
-        ]
+    # gettext lists its messages nowhere else; those with a plural are pairs, the header is empty.
+    known = vars(_catalogue(chosen))["_catalog"]
+    parts = [(own.rpartition("\4"), text) for own, text in known.items() if isinstance(own, str)]
+    return [(context, message, text) for (context, _, message), text in parts if message]
 
 
 @cache
-def _facts(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
-    """Return a pattern of each template of a sentence, and its translation."""
-    found = [own for own in _templates(chosen) if own[0] == FACT]
-    return [
-        (re.compile(_pattern(template) + r"(?=\s|$)"), translation)
-        for _, template, translation in found
+def _patterns(chosen: Language, wanted: str, end: str) -> list[tuple[re.Pattern[str], str]]:
+    """Return the templates of a context with their translations, most text of their own first."""
+    found = [
+        (template, own)
+        for context, template, own in _templates(chosen)
+        if context == wanted and (context or "{" in template)
     ]
-
-
-@cache
-def _labels(chosen: Language) -> list[tuple[re.Pattern[str], str]]:
-    """Return the messages with values as `_facts`, those with most text of their own first."""
-    found = [own[1:] for own in _templates(chosen) if "{" in own[1]]
-    found.sort(key=lambda own: len(re.sub(r"{\w*}", "", own[0])), reverse=True)
-    return [(re.compile(_pattern(template)), translation) for template, translation in found]
+    found.sort(key=lambda one: len(re.sub(r"{[^}]*}", "", one[0])), reverse=True)
+    return [(re.compile(_pattern(template) + end), own) for template, own in found]
 
 
 def _pattern(template: str) -> str:
@@ -176,20 +155,31 @@ def _pattern(template: str) -> str:
 
 
 @lru_cache(maxsize=1000)
-def _sentences(chosen: Language, text: str) -> str | None:
-    """Translate a text that consists of known sentences; None for another."""
+def _sentences(chosen: Language, text: str) -> tuple[int, str] | None:
+    """Translate a text that consists of known sentences; None for another.
+
+    Of several ways to divide it the one is taken in which the templates have most text of their
+    own; how much, in characters, is returned with the translation.
+    """
     if len(text) > _MOST_TEXT:
         return None
-    matches = [
-        (found, translation) for own, translation in _facts(chosen) if (found := own.match(text))
-    ]
-    for found, translation in sorted(matches, key=lambda one: one[0].end()):
-        rest = text[found.end() :].strip()
-        further = _sentences(chosen, rest) if rest else ""
-        if further is not None:
-            values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
-            return f"{re.sub(r':[^{}]*}', '}', translation).format(**values)} {further}".rstrip()
-    return None
+    ways = []
+    for own, translation in _patterns(chosen, FACT, r"(?=[;:,]?\s|$)"):
+        # A value at the end may have blanks.
+        for found in filter(None, (own.match(text), own.fullmatch(text))):
+            if (between := _BETWEEN.match(text, found.end())) is None:
+                continue
+            rest = text[between.end() :]
+            if (further := _sentences(chosen, rest) if rest else (0, "")) is not None:
+                n = found.end() - sum(map(len, found.groups())) + further[0]
+                ways.append((n, found, translation, f"{between[1] or ''} ", between[2], further[1]))
+    if not ways:
+        return None
+    n, found, translation, joint, joined, rest = max(ways, key=lambda way: way[0])
+    values = {name: _value(chosen, value) for name, value in found.groupdict().items()}
+    words = re.sub(r":[^{}]*}", "}", translation).format(**values)
+    joint += f"{tr('and')} " if joined else ""
+    return n, f"{words}{joint}{rest}".rstrip()
 
 
 def _value(
@@ -197,7 +187,7 @@ def _value(
 ) -> str:
     """Translate a value of a sentence: sentences, or names, numbers and days, and lists of them."""
     if (known := _sentences(chosen, value)) is not None:
-        return known
+        return known[1]
     if separators:
         separator, *further = separators
         parts = [_value(chosen, part, tuple(further)) for part in value.split(separator)]

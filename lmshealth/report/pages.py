@@ -23,11 +23,10 @@ from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
 from lmshealth.life.health import Health
 from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
-from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
-from lmshealth.machine.service import Service, day_after, probability_before
+from lmshealth.machine.service import Service
 from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
 from lmshealth.machine.summary import Summary, first_limit, limit_of
 from lmshealth.report import constants, figures
@@ -82,7 +81,6 @@ def make_page(
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
-        "postponed": list(_postponed(assessment.prognosis, service)),
         "first_limit": first_limit(assessment.prognosis),
         "before": before,
         "mark": _MARK,
@@ -169,17 +167,6 @@ def _outside_map(assessment: Assessment) -> Iterator[dict[str, Any]]:
         since = before[-1] + 1 if before.size else 0
         when = track.recorded_at[since] if since < len(track.logs) else None
         yield {"lone": lone, "since": when, "mac": mac.get(lone.mode)}
-
-
-def _postponed(
-    prognosis: Prognosis | None, service: Service
-) -> Iterator[tuple[date, int | None, tuple[float, float]]]:
-    """Yield days of a postponed service, weeks late (or None), and bounds of the risk."""
-    for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
-        assert prognosis is not None and service.by is not None
-        if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
-            reached = probability_before(prognosis, day)
-            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
 
 
 def _track_content(assessment: Assessment) -> dict[str, Any]:

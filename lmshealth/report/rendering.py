@@ -59,7 +59,7 @@ def _environment() -> Any:
     pages.install_gettext_callables(_translated, _counted)  # type: ignore[attr-defined]
     pages.filters |= dict(inspect.getmembers(text, inspect.isfunction))
     pages.filters |= {"place": place, "sha256": sha256, "translated_svg": translated_svg}
-    pages.filters |= {"sentence": language.sentence, "is_known": language.is_known}
+    pages.filters |= {name: getattr(language, name) for name in ("sentence", "is_known", "label")}
     pages.globals |= {"covariate": text.covariate, "constants": constants, "tables": TABLES}
     pages.globals |= {"language": language.language, "_n": _counted}
     return pages

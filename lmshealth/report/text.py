@@ -18,7 +18,6 @@ from lmshealth.machine.constants import LEVELS
 from lmshealth.report import constants
 from lmshealth.report.language import (
     decimal,
-    language,
     mark,
     mark_either,
     sentence,
@@ -52,6 +51,7 @@ _WORDS = (
     *(mark("no log since maintenance"), mark("inspection overdue"), mark("regreasing")),
     mark("unconfirmed jump"),
     *(mark("mains"), mark("reset"), mark("and"), mark("worn"), mark("epochs, 90 %")),
+    *(mark("below"), mark("above")),
     mark("each epoch by itself"),
 )
 _COUNTED = {
@@ -73,8 +73,8 @@ def spell(name: str) -> str:
 
 
 def capitalize(text: str) -> str:
-    """Begin a text with a capital letter; in English the others become small."""
-    return text.capitalize() if language() == "en" else text[:1].upper() + text[1:]
+    """Begin a text with a capital letter."""
+    return text[:1].upper() + text[1:]
 
 
 def joined(parts: Iterable[str]) -> str:
@@ -351,8 +351,14 @@ def verdict_text(summary: Summary) -> str:
     words = texts.get(summary.verdict) or tr(
         "loss of {names}", names=joined(map(spell, summary.lost))
     )
-    before_last = tr("{verdict} before the last log, which deviates", verdict=words)
-    return before_last if summary.deviates else words
+    if not summary.deviates:
+        return words
+    if summary.deviates == ("all",):
+        return tr("{verdict} before the last log, which deviates", verdict=words)
+    names = joined(map(spell, summary.deviates))
+    return tr(
+        "{verdict} before the last log, which deviates in {names}", verdict=words, names=names
+    )
 
 
 def headline(summary: Summary) -> str:
@@ -490,6 +496,8 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
     logs = count(abs(more), "log")
     if more:
         logs = tr("{logs} more", logs=logs) if more > 0 else tr("{logs} fewer", logs=logs)
+    elif before.recorded_at == now.recorded_at and before.service.by != now.service.by:
+        logs = tr("No further log: this follows from the fleet, or from work that was entered")
     else:
         logs = tr("Same number of logs")
     yield logs + (tr(", {distance} further.", distance=km(travel)) if travel > 0 else ".")
@@ -517,7 +525,7 @@ def _life_change(before: Summary, now: Summary) -> str:
         ]
         for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
     )
-    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life else ""
+    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
     return tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
 
 

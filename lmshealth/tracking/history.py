@@ -457,8 +457,8 @@ def doubt_of_clock(history: History, refused: Sequence[Refusal]) -> str:
     if history.contradictions <= constants.FEW_CONTRADICTIONS and not are_many(n, total):
         return ""
     return fact(
-        "{n} of {total} logs contradict the others by odometer or date, as after a reset: "
-        "which of them are right is not known, so that no health is published.",
+        "In {n} of {total} logs odometer or date contradicts the others, as after a reset: which "
+        "of them are right is not known, so that no health is published.",
         n=n,
         total=total,
     )
@@ -470,7 +470,7 @@ def contradiction_notices(history: History, refused: Sequence[Refusal]) -> list[
     notices = []
     if rates:
         what = fact(
-            "{n} logs have another sample rate, which their frequencies follow: they are left out.",
+            "Logs with another sample rate, which their frequencies follow: {n}, left out.",
             n=len(rates),
         )
         to_do = fact(
@@ -484,7 +484,7 @@ def contradiction_notices(history: History, refused: Sequence[Refusal]) -> list[
     if doubt := doubt_of_clock(history, refused):
         return [*notices, Notice("logs-contradict", "serious", times[-1], doubt, to_do)]
     what = fact(
-        "{n} of {total} logs contradict the others by odometer or date, and are left out.",
+        "In {n} of {total} logs odometer or date contradicts the others: left out.",
         n=len(times),
         total=len(times) + len(history.logs),
     )

@@ -152,7 +152,7 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
         elif before:
             what = fact(
                 "{work} on {day} opened a new baseline: fractions are relative to the state after "
-                "it, and {n} earlier logs only inform the effects of temperature, load and loop.",
+                "it, and earlier logs ({n}) only inform the effects of temperature, load and loop.",
                 **done,
                 n=before,
             )

@@ -27,13 +27,6 @@ def cpu_s(work: Callable[[], object]) -> float:
     return time.process_time() - start
 
 
-def wall_s(work: Callable[[], object]) -> float:
-    """Return the time of one call in s."""
-    start = time.perf_counter()
-    work()
-    return time.perf_counter() - start
-
-
 def in_turns(
     works: Mapping[str, Callable[[], object]],
     turns: int,

@@ -875,6 +875,12 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     tables = ["maintenance.csv", "manifest.csv"]
     assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
     assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+    (logs / "maintenance.csv").unlink()
+    (logs / "manifest.csv").write_text("file,temperatur_c,operator\nlog-01.h5,20,me\n")
+    misspelt = run(logs, [modes_only], out)
+    assert (misspelt.n_logs, misspelt.n_refused, misspelt.n_unread) == (2, 0, 0)
+    (note,) = misspelt.notes
+    assert note.startswith("manifest.csv: column temperatur_c is not read, unlike temperature_c")
 
 
 @pytest.mark.slow
@@ -896,7 +902,7 @@ def test_a_page_counts_the_logs_of_its_machine_that_were_refused(
     (logs / "manifest.csv").write_text("file,stage\n" + listed)
     run(logs, [modes_only], out)
     (notice,) = (row for row in rows(out / "warnings.csv") if row["code"] == "logs-refused")
-    assert notice["what"].startswith("3 of 5 logs of this machine are refused as a whole (")
+    assert notice["what"].startswith("Of 5 logs of this machine, refused as a whole: 3 (")
     assert notice["severity"] == "caution"
     assert "3 parts refused" in (out / "test-A.html").read_text()
     refused = sorted(row["log"] for row in rows(out / "refused.csv"))

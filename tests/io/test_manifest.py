@@ -5,7 +5,7 @@ import os
 import pytest
 
 from lmshealth.errors import BadLog, BadTable
-from lmshealth.io.manifest import find_logs, name_of, read_manifest
+from lmshealth.io.manifest import MISSPELT, find_logs, name_of, read_manifest
 from lmshealth.io.reading import read_log
 
 HEADER = "file,stage,travel_km,baseline\n"
@@ -60,6 +60,20 @@ def test_manifest_overrides(make, tmp_path):
     log = read_log(path, overrides=manifest.overrides(path))
     assert (log.metadata.stage, log.metadata.travel, log.metadata.baseline) == ("near", 1e3, True)
     assert manifest.refused == () and manifest.overrides(tmp_path / "other.csv") == {}
+
+
+def test_a_misspelt_column_is_noticed(make, tmp_path):
+    """It is quoted with the nearest key; columns of the user's own, and known ones, are not."""
+    make("log.csv")
+    names = "file,stage,Travel KM,temperatur_c,payload,payload_kg,remark,operator,shift"
+    (tmp_path / "manifest.csv").write_text(f"{names}\nlog.csv,A,1,20,x,3,y,z,2\n")
+    manifest = read_manifest(tmp_path)
+    assert [(one.log, one.reason) for one in manifest.refused] == [("manifest.csv", MISSPELT)] * 2
+    assert [one.detail for one in manifest.refused] == [
+        "column Travel KM is not read, unlike travel_km; rename it if that is meant",
+        "column temperatur_c is not read, unlike temperature_c; rename it if that is meant",
+    ]
+    assert manifest.overrides(tmp_path / "log.csv") == {"stage": "A", "payload_kg": "3"}
 
 
 def test_no_manifest(tmp_path):

@@ -7,15 +7,21 @@ from datetime import date
 from itertools import product
 from typing import get_args
 
+import msgspec
 import numpy as np
 import pytest
 
+from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine import constants
+from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
 from lmshealth.report import text
+from lmshealth.tracking.filters.change_detection import Event
 from tests.assessments import Maker, make
 
 __all__ = ["make"]
+
+EVENT = Event("step", 12, "yaw", "", 0.02, 0.001, 9.0, declared=False, found_at=14)
 
 
 @pytest.mark.parametrize(
@@ -89,6 +95,36 @@ def test_a_limit_that_no_mode_shows_is_not_called_healthy(make: Maker) -> None:
         shown = text.headline(summary), text.service_on_day(summary), text.next_step(summary.step)
         assert ["modes show" in words for words in shown] == [bool(names)] * 3
         assert ("mount stiffness not known" in shown[0]) == bool(names)
+
+
+def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
+    """A jump of the one mode that moved alone is none of guide and mount; one of others may be."""
+    made = make()
+    track, health = made.track, made.health
+    assert health is not None and track is not None
+    made = replace(made, judgement=replace(made.judgement, verdict="step"))
+    lone = (LoneMode("yaw", 0.02, 0.001, 0.99),)
+    for modes, known, step in (
+        (("yaw",), lone, "find-cause"),
+        (("yaw",), (replace(lone[0], probability=0.1),), "inspect"),
+        (("yaw", "roll"), lone, "inspect"),
+        ((), lone, "inspect"),
+    ):
+        events = tuple(replace(EVENT, mode=mode) for mode in modes)
+        track, health = replace(track, events=events), replace(health, lone_modes=known)
+        one = replace(made, track=track, health=health)
+        assert next_step(one, one.service()).kind == step
+
+
+def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:
+    """Who records as often as the step states has no machine without a log for long."""
+    made = make(wear_km=30000)
+    summary = summarise(made, made.service())
+    rare = replace(summary, step=replace(summary.step, kind="later", log_every=63.0))
+    status, today = make_status(made, rare), summary.recorded_at.date()
+    for days, words in ((45.0, "every 6 weeks"), (200.0, "every 9 weeks"), (None, "every 9 weeks")):
+        of_day = on_day(rare, msgspec.structs.replace(status, silent_after_days=days), today)
+        assert words in text.next_step(replace(of_day.step, kind="later"))
 
 
 def test_a_healthy_young_machine_orders_no_service(

@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 from msgspec import structs
 
-from lmshealth._private.tables import TABLES
+from lmshealth._private.tables import FLAGS, TABLES
 from lmshealth.io.log import Refusal
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine.assessment import assess
 from lmshealth.machine.status import make_status, notices
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
+from lmshealth.report.language import in_language, sentence
 from lmshealth.report.tables import machine_tables
 from lmshealth.report.text import changes, headline, service_on_day
 from lmshealth.stage.description import load_stage
@@ -208,7 +209,13 @@ def test_last_logs_that_are_left_out_are_counted(
     # Before a service is planned by the logs that are left, the jump is confirmed or refuted.
     before, after = (summarise(one, one.service()) for one in (good, bad))
     assert before.step.kind != after.step.kind == "check-drift"
-    assert headline(after) == f"{headline(before)} before the last log, which deviates"
+    assert headline(after) == f"{headline(before)} before the last log, which deviates in roll"
+    assert bad.track is not None
+    every = replace(bad.track, outliers=tuple((n - 1, mode) for mode in bad.track.modes))
+    whole = replace(bad, track=every)
+    assert headline(summarise(whole, whole.service())).endswith("last log, which deviates")
+    (whole_told,) = (one for one in notices(whole) if one.code == "last-logs-left-out")
+    assert whole_told.where == "pitch, roll and yaw"
     assert "unconfirmed-jump" in make_status(bad, after).conditions
     # A second log alike leaves the jump unconfirmed; one bad log does not hide a service.
     later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))
@@ -216,5 +223,17 @@ def test_last_logs_that_are_left_out_are_counted(
     lost = replace(bad, judgement=replace(bad.judgement, verdict="preload"))
     summary = summarise(lost, lost.service())
     assert summary.step.kind == "check-loss" and service_on_day(summary).endswith("was repaired")
-    assert headline(summary) == "Loss of guide preload before the last log, which deviates"
-    assert "before the last log, which deviates (" in next(iter(changes(summary, summary)))
+    assert headline(summary) == "Loss of guide preload before the last log, which deviates in roll"
+    assert "before the last log, which deviates in roll (" in next(iter(changes(summary, summary)))
+
+
+def test_a_flag_of_the_last_log_is_noticed_with_its_meaning(make: Maker) -> None:
+    """For all modes that have it in one notice; its meaning is that of the table of flags."""
+    latest = make_reading("last", 40, 1e6, {"roll": 4.8, "pitch": 4.9, "yaw": 5.0})
+    modes = replace(latest.modes, flags=("unsteady", "", "unsteady"))
+    of_log = replace(make(), latest=replace(latest, modes=modes))
+    (notice,) = (one for one in notices(of_log) if one.code == "unsteady")
+    names = f"{modes.names[0]} and {modes.names[2]}"
+    assert notice.what == f"The last log has the flag unsteady at {names}: {FLAGS['unsteady']}"
+    with in_language("de"):
+        assert sentence(notice.what).endswith("was die Standardabweichungen enthalten.")

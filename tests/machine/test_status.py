@@ -219,6 +219,27 @@ def test_what_moves_with_each_log_is_announced_once_per_baseline() -> None:
     assert [one.what for one in compare(found, late, moment, None)[1]] == ["inspection-overdue"]
 
 
+@pytest.mark.parametrize("code", ["unconfirmed-jump", "inspection-overdue", "limit-reached"])
+def test_what_work_ends_without_a_new_log_is_announced(code: str) -> None:
+    """Of statuses that know of work; it may begin again, and ends once. Control: another day."""
+    moment = LAST + timedelta(days=5)
+    jump: dict[str, Any] = {"warnings": {"last-logs-left-out": "caution"}}
+    late: dict[str, Any] = {"inspect_by": TODAY - timedelta(days=1)}
+    given = {"unconfirmed-jump": jump, "inspection-overdue": late}
+    bad = status(works=1, **given.get(code, {"probability_limit_reached": 0.7}))
+    found, changes = compare(status(works=1), bad, moment, None)
+    assert [one.what for one in changes] == [code]
+    assert compare(found, status(works=1), moment, None)[1] == []
+    assert (
+        compare(msgspec.structs.replace(found, works=None), status(works=2), moment, None)[1] == []
+    )
+    served, changes = compare(found, status(works=2), moment, None)
+    assert [str(one) for one in changes] == [f"M7-Y: recovered {code} → work was entered"]
+    assert compare(served, status(works=2), moment, None)[1] == []
+    again = msgspec.structs.replace(bad, works=2)
+    assert [one.what for one in compare(served, again, moment, None)[1]] == [code]
+
+
 def test_the_table_of_changes_is_that_of_the_readme(root: Path) -> None:
     """Kinds, severities and meanings stand in one place, and the README has them."""
     text = (root / "lmshealth/report/README.md").read_text(encoding="utf-8")

@@ -102,6 +102,11 @@ def test_unchanged_values_are_marked_as_such() -> None:
         "Service date: still 2027-03-03.",
         "Same number of logs.",
     ]
+    past = THEN | {"remaining": (-2e6, -1e6, -1e5)}
+    assert sentences(past, past)[2] == "Remaining life, median: still already passed."
+    # The prior of the fleet moves a date without a log of the machine.
+    of_fleet = sentences(THEN | {"service_by": date(2027, 9, 3)})
+    assert of_fleet[-1].startswith("No further log: this follows from the fleet")
     coupling = THEN | {"verdict": "mount+coupling_stiffness"}
     loss = "Verdict: healthy (93 %) → loss of mount stiffness and coupling stiffness (93 %)."
     assert sentences(coupling)[0] == loss

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 import ast
 import re
+import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from datetime import timedelta
+from datetime import date, timedelta
 from itertools import pairwise, product
 from pathlib import Path
 from string import Formatter
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
+from babel.dates import format_date
+from babel.numbers import format_decimal
 from jinja2 import Environment
 
+from lmshealth import identify, load_stage, read_log
 from lmshealth._private.serialize import unpack
 from lmshealth._private.tables import REFUSALS, fact
 from lmshealth.batch.assess import pack_assessment
@@ -27,7 +32,16 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures, text
-from lmshealth.report.language import LANGUAGES, in_language, is_known, label, sentence, tr
+from lmshealth.report.language import (
+    LANGUAGES,
+    _templates,
+    in_language,
+    is_known,
+    label,
+    sentence,
+    tr,
+    tr_month,
+)
 from lmshealth.report.pages import _WORDS, date_page, make_page, write_index
 from lmshealth.report.rendering import read
 from tests.assessments import Maker, blind, leaves, make, nothing, worn
@@ -133,6 +147,27 @@ def _plurals(expression: list[tuple[str, str]]) -> list[str]:
     ]
 
 
+@pytest.mark.parametrize("language", TRANSLATED)
+def test_days_and_numbers_are_those_of_the_locale(language: Any) -> None:
+    """The catalogue has the forms that the Unicode locale data have (oracle: Babel)."""
+    with in_language(language):
+        for month in range(1, 13):
+            day = date(2026, month, 3)
+            assert text.day(day) == format_date(day, locale=language)
+            assert tr_month(day) == format_date(day, "LLL", locale=language)
+        assert text.fixed(12.5, 1) == format_decimal(12.5, locale=language)
+
+
+def test_pages_need_no_babel(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has the locales of all countries, and is larger than many libraries together."""
+    for name in [name for name in sys.modules if name.split(".")[0] == "babel"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    _templates.cache_clear()
+    test_a_sentence_has_the_formats_of_german()
+    with in_language("de"):
+        assert (text.day(date(2026, 3, 5)), tr_month(date(2026, 3, 5))) == ("05.03.2026", "Mär")
+
+
 @pytest.mark.parametrize("path", sorted(catalogue.TEMPLATES.glob("*.j2")), ids=lambda p: p.name)
 def test_a_template_has_no_unmarked_words(path: Path) -> None:
     """All words are messages."""
@@ -210,7 +245,10 @@ def test_a_sentence_has_the_formats_of_german() -> None:
         assert (text.count(1, "log"), text.count(2, "week")) == ("1 Aufzeichnung", "2 Wochen")
         assert label("limit 60 %") == "Grenzwert 60 %"
         assert label("guide preload in % of baseline") == "Vorspannung der Führung in %"
-    assert tr("Fleet") == "Fleet"
+        assert label("114.06 Hz") == "114,06 Hz"
+    assert (tr("Fleet"), label("114.06 Hz"), text.capitalize("114.06 Hz")) == (
+        *("Fleet", "114.06 Hz", "114.06 Hz"),
+    )
 
 
 def test_the_words_of_the_script_are_there() -> None:
@@ -319,3 +357,47 @@ def test_tables_are_the_same_in_every_language(
         {name: unpack(own, str) for name, own in one.tables.items()} for one in (first, second)
     ]
     assert tables[0] == tables[1]
+
+
+def test_templates_of_details_are_those_of_the_sources() -> None:
+    """The text between their values is in a string of the package; control: another one is not."""
+    sources = (ast.parse(file.read_text("utf-8")) for file in catalogue.PACKAGE.rglob("*.py"))
+    nodes = (node for source in sources for node in ast.walk(source))
+    known = "\n".join(str(one.value) for one in nodes if isinstance(one, ast.Constant))
+
+    def unknown(template: str) -> list[str]:
+        """Return what is in no string; a part after a colon or a comma may be of another one."""
+        parts = (re.split(r"[;:,] (?:and )?", own) for own in re.split(r"{\w+}", template))
+        return [part for own in parts for part in own if part.strip() not in known]
+
+    templates = [one for refusal in REFUSALS.values() for one in refusal.details]
+    assert [part for one in templates for part in unknown(one)] == []
+    assert unknown("all {n} samples are cheese; check it") == [" samples are cheese"]
+
+
+@pytest.mark.parametrize("language", TRANSLATED)
+def test_details_of_a_damaged_log_are_translated(language: Any, tmp_path: Path) -> None:
+    """Channels that are flat, clipped, full of gaps, copied or without sign, and modes not seen."""
+    rng = np.random.default_rng(1)
+    first, second = rng.standard_normal((2, 10_000))
+    gap, full = second.copy(), first.copy()
+    gap[100:140], full[rng.random(full.size) < 0.3] = np.nan, np.nan
+    channels = {
+        "flat": -np.zeros(first.size),
+        "clipped": first.clip(-1, 1),
+        "gap": gap,
+        "full": full,
+    }
+    channels |= {"copy": 2 * first, "rectified": abs(first)}
+    table = pd.DataFrame({"time_s": np.arange(first.size) / 500, "delta_e_um": first})
+    for name, values in channels.items():
+        table[f"acc_{name}_m_s2"] = values
+    table.to_csv(tmp_path / "log.csv", index=False)
+    refused = identify(read_log(tmp_path / "log.csv"), load_stage("lms-y")).refused
+    reasons = {one.reason for one in refused}
+    assert reasons >= {"flat", "clipped", "gaps", "missing-samples", "dependent", "rectified"}
+    assert "not-excited" in reasons
+    with in_language(language):
+        assert [one.detail for one in refused if not is_known(one.detail)] == []
+        (flat,) = {one.detail for one in refused if one.reason == "flat"}
+        assert sentence(flat) == "alle 10000 Abtastwerte sind 0 (SI); prüfen Sie den Sensor"

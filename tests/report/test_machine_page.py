@@ -374,6 +374,28 @@ def test_a_page_needs_no_other_one(make: Maker, tmp_path: Path) -> None:
     assert again.read_bytes() == index.read_bytes()
 
 
+@pytest.mark.usefixtures("blank")
+def test_days_of_a_postponed_service_are_not_past(make: Maker, tmp_path: Path) -> None:
+    """An overdue service has the days that are left, with the risks that they had before."""
+
+    def rows(today: date | None) -> dict[str, str]:
+        """Return probabilities by day of service."""
+        (path, _) = write_report(tmp_path, [make()], (), today=today)
+        text = words(Page(path))
+        return dict(re.findall(r"(\d{4}-\d\d-\d\d) \d+ weeks? (\D*[\d.]+ %)", text))
+
+    by = make().service().by
+    assert by is not None
+    before, after = rows(by), rows(by + timedelta(days=20))
+    assert [date.fromisoformat(one) - by for one in before] == [
+        timedelta(weeks=weeks) for weeks in (1, 2, 4, 8)
+    ]
+    assert [date.fromisoformat(one) - by for one in after] == [
+        timedelta(weeks=weeks) for weeks in (4, 8, 13, 26, 52)
+    ]
+    assert all(after[one] == before[one] for one in before.keys() & after.keys())
+
+
 @pytest.mark.slow
 def test_the_service_is_decided_once_per_page(make: Maker, monkeypatch: pytest.MonkeyPatch) -> None:
     """The first screen, what is new, the pictures and the row of the index share one decision."""

@@ -111,7 +111,7 @@ def test_after_a_reset_of_the_odometer_no_log_is_known_to_be_right(
     (notice,) = contradiction_notices(history, refused)
     severity, code = ("serious", "contradict") if doubt else ("caution", "left-out")
     assert (notice.severity, notice.code) == (severity, f"logs-{code}")
-    assert notice.what.startswith(f"{len(refused)} of {n_logs} logs")
+    assert notice.what.startswith(f"In {len(refused)} of {n_logs} logs odometer")
     assert doubt_of_clock(history, refused) == (notice.what if doubt else "")
 
 

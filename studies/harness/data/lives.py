@@ -31,7 +31,6 @@ SECONDS = 20.0
 DAMAGED = ("preload-wear", "mount-loosening", "both", "sudden-loosening", "crash")
 HEALTHY = ("healthy", "temperature-only", "payload-change", "servo-retuning", "regreasing")
 COVARIATES = ("temperature_c", "payload_kg")
-LOSS = 0.05  # of preload, spread over a life
 RAW = "raw_lives"  # name of the file that keeps them
 _FIELDS = ("ln_frequency", "ln_damping", "cov", "loop_error")
 _SIZES_SEED = 7

@@ -24,7 +24,6 @@ from lmshealth.tracking.constants import (
 from lmshealth.tracking.filters import filter_bank
 from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
-from studies.harness.data.histories import keep_series
 
 Array = NDArray[np.float64]
 QUANTITIES = ("ln f", "ln ζ", "drift")
@@ -189,7 +188,15 @@ def _covariance(rng: np.random.Generator, n: int, n_sources: int) -> Array:
 
 def alone(history: History, source: str) -> History:
     """Return the history that one source alone makes."""
-    return keep_series(history, [i for i, s in enumerate(history.series) if s.source == source])
+    columns = [i for i, one in enumerate(history.series) if one.source == source]
+    both = np.r_[columns, np.add(columns, len(history.series))]
+    return replace(
+        history,
+        series=tuple(history.series[i] for i in columns),
+        ln_frequency=history.ln_frequency[:, columns],
+        ln_damping=history.ln_damping[:, columns],
+        cov=history.cov[:, both[:, None], both],
+    )
 
 
 def without_common_errors(history: History) -> History:
