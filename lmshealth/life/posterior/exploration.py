@@ -28,8 +28,6 @@ _N_UPDATE, _N_START = 3000, 300
 _NO_RETURN, _SIMPLER = 13.0, 6.0
 # Log odds beyond those of a dropped scenario at which no more is spent on one.
 _HOPELESS = 6.0
-# Share of the posterior of the grid points that draws are placed without.
-_PLACING_LOSS = 0.05
 # Effective draws below which an evidence may miss most of its integral.
 _LEAST_ESS = 20.0
 
@@ -78,8 +76,7 @@ class _Exploration:
     def __init__(
         self, likelihood: LifeLikelihood, seed: np.random.SeedSequence, before: LifeStart | None
     ) -> None:
-        self.likelihood, self.before = likelihood, before
-        self.grid = self.few = likelihood.grid  # for evidences, and to place draws
+        self.likelihood, self.grid, self.before = likelihood, likelihood.grid, before
         self.scenarios = likelihood.data.scenarios
         seeds = seed.spawn(len(self.scenarios))
         self.generators = [np.random.default_rng(own) for own in seeds]
@@ -103,8 +100,7 @@ class _Exploration:
             return
         start = self._start(scenario, rng)
         least = self.best() - constants.MAX_LOG_ODDS - _HOPELESS - float(np.log(scenario.weight))
-        rough = replace(density, grid=self.few).log_probability
-        draws = importance_sample(density.log_probability, start, rng, _N_ROUGH, least, rough)
+        draws = importance_sample(density.log_probability, start, rng, _N_ROUGH, least)
         self.found[k] = density, draws
         value = log_probability(self.found[k])
         parts = scenario.split(draws.resampled(rng, _N_ROUGH))
@@ -130,7 +126,7 @@ class _Exploration:
             known = np.hstack([rng.permutation(part) for part in parts])
             start = np.concatenate([known, start[: _N_START // 4]])
         if scenario.steps:
-            start = self.likelihood.steps_given_laws(self.few, scenario, start, rng)
+            start = self.likelihood.steps_given_laws(self.grid, scenario, start, rng)
         return np.concatenate([earlier, start])
 
     def narrow(self, anchors: Sequence[int]) -> None:
@@ -141,16 +137,14 @@ class _Exploration:
         whole = self.grid
         least = (whole.noise_scale.min(), whole.deviation.min())
         self.grid = whole[(whole.noise_scale == least[0]) & (whole.deviation == least[1])]
-        self.few = self.grid
         self.add(anchors)
-        kept = few = np.zeros(whole.walk.size, dtype=bool)
+        kept = np.zeros(whole.walk.size, dtype=bool)
         for k in self.likely():
             density, draws = self.found[k]
             some = draws.resampled(self.generators[k], _N_ROUGH // 2)
             weight = replace(density, grid=whole).weights(some)
-            kept = kept | kept_weights(weight, constants.MAX_GRID_LOSS)
-            few = few | kept_weights(weight, _PLACING_LOSS)
-        self.grid, self.few = whole[kept], whole[few]
+            kept |= kept_weights(weight, constants.MAX_GRID_LOSS)
+        self.grid = whole[kept]
         self.found.clear()
         self.add(anchors)
 

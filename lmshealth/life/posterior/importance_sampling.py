@@ -78,20 +78,17 @@ def importance_sample(
     rng: np.random.Generator,
     n: int,
     least: float = -np.inf,
-    rough: LogProbability | None = None,
 ) -> WeightedDraws:
     """Draw from a density by importance sampling from a mixture adapted in rounds [Cappe2008].
 
     The start are points that cover the support of the density, ``(n_start, n_dim)``; n is the
     number of draws of the last round. Adaptation ends early where no draw contributes as much as
-    `least` to the log integral; it is to the density `rough`, if there is one, which costs less.
-    `NotConverged` is raised if no point has a density above 0.
+    `least` to the log integral. `NotConverged` is raised if no point has a density above 0.
     """
-    adapted_to = rough or log_probability
     points, proposal, before = start, np.zeros(start.shape[0]), np.inf
     few = max(200, n // 4)
     for k in range(_MAX_ROUNDS):
-        log_weight = adapted_to(points) - proposal
+        log_weight = log_probability(points) - proposal
         draws = _weighted(points, log_weight)
         is_settled = draws.ess >= _SETTLED and abs(draws.log_evidence - before) < _SAME
         is_good = points is not start and (draws.ess >= _GOOD_SHARE * few or is_settled)
