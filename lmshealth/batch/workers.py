@@ -5,6 +5,7 @@ module imports little, because the processes import it before the batch begins; 
 with the tasks.
 """
 
+import atexit
 import gc
 import logging
 import multiprocessing
@@ -249,7 +250,8 @@ def _interrupts_blocked() -> Iterator[None]:
 
 def _initialise(parent_exit: Connection) -> None:
     """Set up a worker process: no interrupts, one thread for linear algebra, exit with parent."""
-    gc.set_threshold(50_000)  # as `lmshealth.cli.main`
+    gc.set_threshold(50_000)  # as `lmshealth.cli.main`, also the next
+    atexit.register(gc.freeze)
     ignore_interrupts()
     if hasattr(signal, "pthread_sigmask"):
         signal.pthread_sigmask(signal.SIG_UNBLOCK, INTERRUPTS)

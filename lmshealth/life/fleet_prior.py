@@ -9,7 +9,7 @@ from itertools import pairwise
 
 import msgspec
 import numpy as np
-from scipy.special import bdtrc, betainc, logsumexp, softmax
+from scipy.special import bdtrc, betainc, softmax
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import fingerprint
@@ -130,12 +130,13 @@ def pace_likelihood(z: FloatArray, weight: FloatArray) -> FloatArray:
 
     Of the standardised pace under the description ``(n,)``, with normalised weights ``(n,)``.
     """
-    return np.column_stack(
-        [
-            logsumexp(0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v, axis=1, b=weight) - 0.5 * np.log(v)
-            for v in _VARIANCE
-        ]
-    )
+    z, weight, columns = z[weight > 0], weight[weight > 0], []
+    for v in _VARIANCE:
+        ratio = 0.5 * z**2 - 0.5 * (z - _MEAN) ** 2 / v
+        largest = ratio.max(axis=1)
+        mean = np.exp(ratio - largest[:, None]) @ weight
+        columns.append(largest + np.log(mean) - 0.5 * np.log(v))
+    return np.column_stack(columns)
 
 
 def needs_fleet_prior(evidence: MachineEvidence) -> bool:

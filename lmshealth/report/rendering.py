@@ -8,7 +8,7 @@ import re
 import warnings
 from base64 import b64encode
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout
+from contextlib import contextmanager, redirect_stdout, suppress
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
@@ -45,12 +45,24 @@ def place(value: float, length: float) -> float:
 
 @cache
 def _environment() -> Any:
-    """Load the templates once per process: parsing takes longer than rendering."""
+    """Load the templates, which are compiled once: parsing takes longer than rendering."""
     import jinja2
 
+    class Compiled(jinja2.FileSystemBytecodeCache):
+        """Compiled templates in a folder of temporary files that only the user may write to."""
+
+        def dump_bytecode(self, bucket: Any) -> None:
+            with suppress(OSError):  # a full disk
+                super().dump_bytecode(bucket)
+
+    try:
+        compiled: Any = Compiled()
+    except (OSError, RuntimeError):  # no such folder
+        compiled = None
     pages = jinja2.Environment(
         loader=jinja2.PackageLoader("lmshealth.report", "templates"),
         autoescape=True,
+        bytecode_cache=compiled,
         undefined=jinja2.StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 _FIRST_STEPS = 100
 _MIN_WALKERS, _WALKERS_PER_DIMENSION = 16, 2
 _MOST_TRIES = 16  # proposals for a walker in a step
+_STEPS_AHEAD = 10  # whose proposals are computed at once
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -43,32 +44,39 @@ class Sample(ReadOnly):
         return np.swapaxes(self.draws, 0, 1).reshape(-1, self.draws.shape[-1])
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(slots=True, eq=False)
 class _Resampling:
     """Move of emcee: every walker is drawn anew among proposals and itself, by their weights.
 
     Iterated sampling importance resampling [Andrieu2018]: a step of many proposals, computed at
-    once, leaves less autocorrelation than as many steps of one.
+    once, leaves less autocorrelation than as many steps of one. As no proposal depends on a walker,
+    those of several steps are computed at once too: `ahead`, each with its log density and weight.
     """
 
     proposal: Proposal
     n_tries: int
+    ahead: list[tuple[FloatArray, FloatArray, FloatArray]] = field(default_factory=list)
 
     def propose(self, model: Any, state: emcee.State) -> tuple[emcee.State, np.ndarray]:
         """Return the next state, and which walkers moved."""
         shape, rng = state.coords.shape, model.random
-        points = self.proposal.draw(rng, self.n_tries * shape[0])
-        log_density = model.compute_log_prob_fn(points)[0]
-        all_points = np.concatenate([state.coords, points]).reshape(-1, *shape)
-        density = np.concatenate([state.log_prob, log_density]).reshape(-1, shape[0])
-        log_weight = density - self.proposal.log_density(all_points.reshape(-1, shape[1])).reshape(
-            density.shape
-        )
+        if not self.ahead:
+            points = self.proposal.draw(rng, _STEPS_AHEAD * self.n_tries * shape[0])
+            log_density = model.compute_log_prob_fn(points)[0]
+            weight = log_density - self.proposal.log_density(points)
+            each = _STEPS_AHEAD, self.n_tries, shape[0]
+            parts = points.reshape(*each, -1), log_density.reshape(each), weight.reshape(each)
+            self.ahead += zip(*parts, strict=True)
+        points, log_density, weight = self.ahead.pop()
+        own = state.log_prob - self.proposal.log_density(state.coords)
         # The largest of log weights with Gumbel noise is a draw by the weights.
-        chosen = (log_weight + rng.gumbel(size=density.shape)).argmax(axis=0)
-        walkers = np.arange(shape[0])
-        drawn = all_points[chosen, walkers], density[chosen, walkers]
-        return type(state)(drawn[0], log_prob=drawn[1]), chosen > 0
+        log_weight = np.concatenate([own[None], weight])
+        chosen = (log_weight + rng.gumbel(size=log_weight.shape)).argmax(axis=0)
+        moved = chosen > 0
+        at = chosen[moved] - 1, np.flatnonzero(moved)
+        coords, density = state.coords.copy(), state.log_prob.copy()
+        coords[moved], density[moved] = points[at], log_density[at]
+        return type(state)(coords, log_prob=density), moved
 
 
 def thin(draws: FloatArray, n: int) -> FloatArray:
