@@ -63,7 +63,7 @@ def unsteadiness(
     expected: Sequence[ComplexArray],
     f: float,
     zeta: float,
-    shape: FloatArray,
+    shape: FloatArray | ComplexArray,
 ) -> Unsteadiness:
     """Compute the unsteadiness of the force of a mode from its kurtosis; 1 for a steady force.
 
