@@ -540,7 +540,7 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
         excitation=np.sqrt(strength * np.pi * f / (4 * zeta)),
         flags=flags,
         shape_channels=channels,
-        shapes=_unit_shapes(data.unit * np.asarray(seen, dtype=np.complex128)),
+        shapes=_unit_shapes(data.unit * seen),
         lines=(),
         refused=(),
     ).widened("unsteady", cov * np.outer(wider, wider))
@@ -603,13 +603,13 @@ def _averaged(
     return replace(averaged, flags=tuple(f"{flag} coloured".strip() for flag in modes.flags))
 
 
-def _unit_shapes(shapes: ComplexArray) -> FloatArray:
+def _unit_shapes(shapes: ComplexArray | FloatArray) -> FloatArray:
     """Scale shapes, ``(n_modes, n_channels)``, to unit norm, the largest component positive.
 
     Of what is not in phase with that the real part remains.
     """
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    return np.asarray(_in_phase(shapes.T).real.T)
+    return np.asarray(_in_phase(shapes.T.astype(np.complex128)).real.T)
 
 
 def _fitted(data: ClusterData, expected: ComplexArray) -> FittedSpectrum:
