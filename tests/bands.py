@@ -84,17 +84,26 @@ def covariance(target: Likelihood, p: np.ndarray, frequency: np.ndarray) -> np.n
     m, n = target.layout.n_modes, target.layout.n_channels
     e, d, b = p[3 * m : 3 * (m + n)].reshape(n, 3).T
     u = np.log(frequency / target.centre) / target.spread
-    root, at = np.eye(m + n), 3 * (m + n)
+    root, at = np.eye(m + n, dtype=complex), 3 * (m + n)
+    turned = bool(target.layout.quadrature)
     for i in range(m + n):
         for j in range(i + 1 if i < m else i):
             if n == 1 and i < m and i - j > 1:  # one channel: neighbours alone share forces
                 continue
             root[i, j] = target.scale[i] * p[at]
             at += 1
-    shapes = np.ones((n, m))
+    for i, j in product(range(m), range(m)):
+        if turned and j < i and (n > 1 or i - j == 1):
+            root[i, j] += 1j * target.scale[i] * p[at]
+            at += 1
+    shapes = np.ones((n, m), dtype=complex)
     for i, c in product(range(m), range(n)):
         if c != i % n:
             shapes[c, i] = p[at]
+            at += 1
+    for i, c in product(range(m), range(n)):
+        if turned and c != i % n:
+            shapes[c, i] += 1j * p[at]
             at += 1
     assert at == p.size
     return channel_covariance(

@@ -92,6 +92,9 @@ SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # the level of few of many directions is known from the others: 0.03 would be too sure.
 PRIOR_LN_F, PRIOR_LN_ZETA, PRIOR_FORCE, PRIOR_SHAPE = 0.2, 2.0, 30.0, 30.0
 PRIOR_FLOORS = (5.0, 2.0, 1.0), (0.3, 2.0, 1.0)
+# Of what is not in phase, over what is: of forces that reach modes with a delay, and of shapes. By
+# how many standard deviations of chance it must gain to be included in a search, and in a fit.
+PRIOR_QUADRATURE, QUADRATURE_SIGMAS = (3.0, 0.3), (4.0, 2.0)
 # Standard deviations of priors that are marginalised over these widths, of which the fit uses the
 # last: the share of a floor that is coherent with the modes and with other floors (in units of the
 # floor), its bend, and the static response of a mode, over its receptance, less that of the band.

@@ -15,7 +15,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Executor, ProcessPoolExecutor
 from contextlib import AbstractContextManager, nullcontext, suppress
 from datetime import UTC, datetime
@@ -165,8 +165,8 @@ class Trials:
         if old:
             sample = _spread(old) if self._takes_over else old
             # An interrupted sample is repeated whole: its values are kept once all are known.
-            done = zip(sample, _compute(work, sample, pool), strict=True)
-            again = {json.dumps(task): _row(name, task, code, *found) for task, found in done}
+            pairs = zip(sample, _compute(work, sample, pool), strict=True)
+            again = {json.dumps(task): _row(name, task, code, *done) for task, done in pairs}
             if all(alike(row["value"], kept[key]["value"]) for key, row in again.items()):
                 kept |= {key: kept[key] | {"code": code} for key in map(json.dumps, old)}
                 self.repeated += len(sample)
@@ -204,7 +204,7 @@ def _timed(work: Work, task: tuple[Any, ...]) -> tuple[Any, float]:
     return value, round(time.perf_counter() - start, 2)
 
 
-def _spread(tasks: Sequence[tuple[Any, ...]]) -> Sequence[tuple[Any, ...]]:
+def _spread(tasks: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
     """Return the trials of a sample, evenly spread over all."""
     n = max(_LEAST_REPEATED, len(tasks) // _REPEATED)
     return tasks[:: max(len(tasks) // n, 1)]

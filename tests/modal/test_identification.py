@@ -577,6 +577,31 @@ def test_neighbours_of_a_group_are_fitted_with_it_but_published_once(
         assert np.abs(deviations(found, name, mode.frequency, mode.damping)).max() < 4
 
 
+@pytest.mark.parametrize("real", [False, True])
+def test_shapes_out_of_phase_leave_modes_at_their_truth(
+    real: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Channels that differ by up to 6° in phase: all within 4σ. Control: real shapes, far off."""
+    turned = np.exp(1j * rng(1).uniform(-0.1, 0.1, (3, 4)))
+    shapes = np.array([(1, -0.3, 0.2, 0.6), (0.25, 1, -0.4, 0.5), (0.3, 0.5, 1, -0.3)]) * turned
+    modes = [
+        Mode(f, zeta, 1.0, tuple(shape))
+        for (f, zeta), shape in zip([(126, 0.015), (137, 0.015), (155, 0.018)], shapes, strict=True)
+    ]
+    if real:
+        monkeypatch.setattr(cluster_fit.constants, "QUADRATURE_SIGMAS", (np.inf, np.inf))
+    off = []
+    for seed in range(4):
+        found = identify(acceleration_log(rng(seed), modes, 60.0, RATE, 0.5), make_stage(LMS_Y))
+        for (name, _, _), mode in zip(LMS_Y, modes, strict=True):
+            if name in found.names:
+                off.append(np.abs(deviations(found, name, mode.frequency, mode.damping)).max())
+    if real:
+        assert max(off) > 10
+    else:
+        assert len(off) == 12 and max(off) < 4
+
+
 @pytest.mark.parametrize("late", [1, 0])
 def test_a_channel_that_is_late_is_left_out_by_name(late: int) -> None:
     """Its phase is that of no mode: others give the modes as without it; the control keeps it."""

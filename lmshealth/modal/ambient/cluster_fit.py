@@ -33,6 +33,8 @@ from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
 
 # So many channels are fitted as they are; of more, directions that leave so much of each mode.
 _FEW, _SEEN = 4, 0.9
+# Part of a shape in quadrature that adds a direction.
+_TURNED = 0.05
 # Ordinates at which directions are compared, at most.
 _MOST_COMPARED = 200
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
@@ -88,6 +90,11 @@ class _Optimum:
     misfit: float
     near: FloatArray  # resonances in Hz that its bins are fine at
     bandwidth: float  # that these bins resolve, in Hz
+
+    @property
+    def n_counted(self) -> int:
+        """Number of unknowns without those in quadrature, which have priors."""
+        return self.p.size - len(self.likelihood.layout.quadrature)
 
     @property
     def poles(self) -> FloatArray:
@@ -187,7 +194,7 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
         for i in doubtful:
             less = solved(targets[:i] + targets[i + 1 :])
             # Twice the log evidence (BIC) for the mode.
-            extra = optimum.p.size - less.p.size
+            extra = optimum.n_counted - less.n_counted
             evidence = 2 * (less.misfit - optimum.misfit) - extra * np.log(n_ordinates)
             if lost or evidence < least:
                 worst, least = less, evidence
@@ -277,16 +284,19 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
     in units of the noise, in which nothing else distinguishes directions. There are as many as
     leave each mode its share of φ* (1 + G G*)⁻¹ φ in the mean of the ordinates.
     """
-    shapes = _in_phase(moved).real
-    phi = shapes / np.linalg.norm(shapes, axis=0)
+    shapes = _in_phase(moved)
+    shapes = shapes / np.linalg.norm(shapes.real, axis=0)
+    phi = shapes.real
+    turned = shapes.imag[:, np.linalg.norm(shapes.imag, axis=0) > _TURNED]
     foreign = [
         s.foreign[:: 1 + s.frequency.size // _MOST_COMPARED]
         for s in spectra.spectra
         if s.foreign is not None
     ]
     if not foreign:
-        return np.asarray(np.linalg.svd(phi, full_matrices=False)[0])
-    columns = [phi]
+        u, s, _ = np.linalg.svd(np.column_stack([phi, turned]), full_matrices=False)
+        return np.asarray(u[:, (s > _TURNED) | (np.arange(s.size) < phi.shape[1])])
+    columns = [phi, turned]
     for g in foreign:
         best = phi - g @ _share(g, phi)
         best = best / np.linalg.norm(best, axis=1, keepdims=True)
@@ -441,7 +451,35 @@ def _solve(
         narrowest=_COLLAPSED / data.duration,
     )
     p = likelihood.minimise(start)
+    if not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
+        likelihood = likelihood.with_quadrature()
+        lay = likelihood.layout
+        begin = lay.shapes.start + lay.shape_in_phase
+        start = likelihood.start.copy()
+        start[begin : lay.shapes.stop] = [own.imag[c, i] / scale[i] for c, i in layout.shape]
+        p = min(
+            (likelihood.minimise(one) for one in (start, layout.extended(p))), key=likelihood.value
+        )
     return _Optimum(targets, likelihood, p, likelihood.data_value(p), near, bandwidth)
+
+
+def _is_out_of_phase(likelihood: Likelihood, p: FloatArray) -> bool:
+    """Return whether parts of forces or shapes in quadrature gain more than by chance.
+
+    By one Newton step of these alone, twice whose gain is χ² of as many degrees of freedom at most.
+    With all other unknowns, of which the data hardly determine some, there may be no maximum.
+    """
+    more = likelihood.with_quadrature()
+    own, n = more.layout.quadrature, len(more.layout.quadrature)
+    if not n:
+        return False
+    gradient, hessian = more.derivatives(likelihood.layout.extended(p))
+    try:
+        root = np.linalg.cholesky(hessian[np.ix_(own, own)])
+    except np.linalg.LinAlgError:
+        return True
+    gain = float(np.sum(np.linalg.solve(root, gradient[own]) ** 2))
+    return bool(gain > n + constants.QUADRATURE_SIGMAS[1] * np.sqrt(2 * n))
 
 
 def _expected(data: ClusterData, optimum: _Optimum) -> list[ComplexArray]:
@@ -478,13 +516,13 @@ def _conclude(data: ClusterData, optimum: _Optimum, expected: list[ComplexArray]
     dispersion = _dispersion(*residual, f, zeta)
     channels, shapes = data.whole.channels, likelihood.shapes(p).T
     seen = shapes @ data.basis.T  # in units of the noise, (n_modes, n_channels)
-    clear = ratio if data.basis.shape[1] == data.unit.size else seen.T**2
+    clear = ratio if data.basis.shape[1] == data.unit.size else np.abs(seen.T)
     observed = data.spectra.spectra, data.masks, expected
     unsteady = [unsteadiness(*observed, *one) for one in zip(f, zeta, shapes, strict=True)]
     # Squares of the ordinates near a mode are correlated where its excitation is not steady.
     wider = np.sqrt([one.expected for one in unsteady] * 2)
-    strength = likelihood.strength(p).sum(axis=0) / np.sum(shapes**2, axis=1)
-    strength = strength * (seen**2 @ data.unit**2)
+    strength = likelihood.strength(p).sum(axis=0) / np.sum(np.abs(shapes) ** 2, axis=1)
+    strength = strength * (np.abs(seen) ** 2 @ data.unit**2)
     each = zip(f.tolist(), zeta.tolist(), dispersion.tolist(), strict=True)
     flags = tuple(
         _flags(*one, duration, unsteady=force.is_clear)
@@ -565,11 +603,13 @@ def _averaged(
     return replace(averaged, flags=tuple(f"{flag} coloured".strip() for flag in modes.flags))
 
 
-def _unit_shapes(shapes: FloatArray) -> FloatArray:
-    """Scale shapes, ``(n_modes, n_channels)``, to unit norm, the largest component positive."""
+def _unit_shapes(shapes: ComplexArray | FloatArray) -> FloatArray:
+    """Scale shapes, ``(n_modes, n_channels)``, to unit norm, the largest component positive.
+
+    Of what is not in phase with that the real part remains.
+    """
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    largest = np.take_along_axis(shapes, np.abs(shapes).argmax(axis=1, keepdims=True), axis=1)
-    return np.asarray(shapes * np.sign(largest))
+    return np.asarray(_in_phase(shapes.T.astype(np.complex128)).real.T)
 
 
 def _fitted(data: ClusterData, expected: ComplexArray) -> FittedSpectrum:

@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal.ambient.whittle import receptance, response
+
+T = TypeVar("T", np.float64, np.complex128)
 
 # Gain in log likelihood below which a mode is left as it is, and most shorter steps.
 _LEAST_GAIN, _HALVINGS = 0.3, 5
@@ -18,6 +22,8 @@ _LEAST_GAIN, _HALVINGS = 0.3, 5
 _MEDIAN_SQUARE = 0.455
 # Mean of the residual over the floor below which a channel has less noise than any floor.
 _LITTLE = 0.5
+# Standard deviations of the priors of the part of a shape in quadrature, over its norm.
+_QUADRATURE = 0.3
 # In units of the median density of a channel. Channels of hardly any noise would else be judged by
 # the errors of the model, and the selection of modes by the rounding of the processor.
 LEAST_FLOOR = 1e-4
@@ -62,20 +68,24 @@ def floor_ratio(data: BandData, g: ComplexArray) -> FloatArray:
 
 @dataclass(frozen=True, eq=False)
 class JointModel:
-    """Modes with real shapes and correlated forces, and independent floors.
+    """Modes with correlated forces, and independent floors.
 
-    E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Modes are refined one after the other
-    by Fisher's scoring with the others fixed, so that the cost of a sweep is linear in their
-    number. It selects modes; published estimates come from the likelihood of `whittle`.
+    E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Shapes φ and correlations R are real
+    unless the model is ``turned``: channels that do not move in phase make φ complex, a force that
+    reaches modes with a delay R. Parts in quadrature have priors, and count as no unknowns. Modes
+    are refined one after the other by Fisher's scoring with the others fixed, so that the cost of a
+    sweep is linear in their number. It selects modes; published estimates come from the likelihood
+    of `whittle`.
     """
 
     data: BandData
     floor: FloatArray  # coefficients of the basis, (n_channels, n_basis)
     f: FloatArray  # in Hz, (n_modes,)
     zeta: FloatArray
-    phi: FloatArray  # root of the PSD of the modal force in each channel, (n_channels, n_modes)
-    rho: FloatArray  # static response beside that of all modes, as phi
-    r: FloatArray  # correlations of the forces, (n_modes, n_modes)
+    phi: ComplexArray  # root of the PSD of the modal force in each channel, (n_channels, n_modes)
+    rho: ComplexArray  # static response beside that of all modes, as phi
+    r: ComplexArray  # correlations of the forces, (n_modes, n_modes)
+    turned: bool = False  # whether shapes and correlations have parts in quadrature
     static: float = 0.0  # c: -1 where the base moves and absolute acceleration is measured
 
     def subset(self, kept: BoolArray) -> JointModel:
@@ -89,11 +99,16 @@ class JointModel:
             r=self.r[np.ix_(kept, kept)],
         )
 
+    def in_phase(self) -> JointModel:
+        """Return the model without the parts of shapes and correlations in quadrature."""
+        phi, rho, r = (part.real.astype(np.complex128) for part in (self.phi, self.rho, self.r))
+        return replace(self, phi=phi, rho=rho, r=r)
+
     def without(self, i: int) -> JointModel:
         """Return the model without one mode."""
         return self.subset(np.arange(self.f.size) != i)
 
-    def with_mode(self, f: float, zeta: float, phi: FloatArray) -> JointModel:
+    def with_mode(self, f: float, zeta: float, phi: ComplexArray) -> JointModel:
         """Return the model with one mode more, the last one."""
         return replace(
             self,
@@ -101,7 +116,7 @@ class JointModel:
             zeta=np.append(self.zeta, zeta),
             phi=np.column_stack([self.phi, phi]),
             rho=np.column_stack([self.rho, np.zeros_like(phi)]),
-            r=block_diag(self.r, np.eye(1)),
+            r=block_diag(self.r, np.eye(1)).astype(np.complex128),
         )
 
     def with_static(self, static: float) -> JointModel:
@@ -110,7 +125,10 @@ class JointModel:
 
     def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
-        floor, phi, rho = (own[list(kept)] for own in (self.floor, self.phi, self.rho))
+        floor, (phi, rho) = (
+            self.floor[list(kept)],
+            (own[list(kept)] for own in (self.phi, self.rho)),
+        )
         return replace(self, data=self.data.of_channels(kept), floor=floor, phi=phi, rho=rho)
 
     def on(self, data: BandData) -> JointModel:
@@ -135,9 +153,9 @@ class JointModel:
         seen = data.matrix[:, n:, :n]
         if data.foreign is not None:
             seen = seen - data.foreign[:, n:, :n]
-        normal = np.einsum("kia,kja->ij", weighted, unit.conj()).real
-        right = np.einsum("kia,kca->ic", weighted, seen.conj()).real
-        phi = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), right).T
+        normal = np.einsum("kia,kja->ij", weighted, unit.conj())
+        right = np.einsum("kia,kca->ic", weighted, seen.conj())
+        phi = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), right).conj().T
         floor = np.full((more, self.floor.shape[1]), 0.5)
         return replace(
             self,
@@ -155,7 +173,7 @@ class JointModel:
         further = ((0, 0), (0, other.f.size - self.f.size))
         phi, rho = (np.pad(rows[n_common:], further) for rows in (self.phi, self.rho))
 
-        def rows(own: FloatArray, between: FloatArray) -> FloatArray:
+        def rows(own: NDArray[T], between: NDArray[T]) -> NDArray[T]:
             return np.concatenate([own[:n_common], between, own[n_common:]])
 
         return replace(
@@ -224,7 +242,10 @@ class JointModel:
         log_det = 2 * np.log(np.diagonal(root, axis1=1, axis2=2).real).sum(axis=1)
         # tr E⁻¹ W of Hermitian matrices
         trace = np.sum(self._inverse.conj() * self.data.matrix, axis=(1, 2)).real
-        prior = np.sum(self.rho**2 * self._weak[:, None]) + np.sum(np.tril(self.r, -1) ** 2)
+        prior = np.sum(np.abs(self.rho) ** 2 * self._weak[:, None])
+        prior += np.sum(np.abs(np.tril(self.r, -1)) ** 2)
+        off = np.sum(self.phi.imag**2, axis=0) * self._quadrature
+        prior += np.sum(off)
         return float(self.data.count @ (log_det + trace) + 0.5 * prior)
 
     @cached_property
@@ -235,6 +256,29 @@ class JointModel:
     def _weak(self) -> FloatArray:
         """Precision of the prior of the static responses."""
         return np.asarray(1 / np.mean(self.floor, axis=1))
+
+    def quadrature_sigmas(self) -> float:
+        """Return by how much parts in quadrature would gain, in standard deviations of chance.
+
+        Of each mode alone by one step of Fisher's scoring, twice whose gain is χ².
+        """
+        n, gain, freedom = len(self.phi), 0.0, 0
+        for i in range(self.f.size):
+            h = response(self.f[i], self.zeta[i], self.data.frequency) + self.static
+            pairs = [(self._b @ self.r[:, i], 1j * h[:, None, None] * np.eye(n))]
+            if i:  # each correlation once
+                pairs.append((self._b[:, :, i], -1j * self._b[:, :, :i]))
+            for v, u in pairs:
+                gradient, fisher = self._score(v, u)
+                gain -= float(gradient @ _solve(gradient, fisher, np.zeros(gradient.size)))
+                freedom += gradient.size
+        return (gain - freedom) / np.sqrt(2 * freedom) if freedom else 0.0
+
+    @property
+    def _quadrature(self) -> FloatArray:
+        """Precision of the prior of the part of each shape in quadrature, ``(n_modes,)``."""
+        power = np.sum(np.abs(self.phi) ** 2, axis=0)
+        return np.asarray(1 / (_QUADRATURE**2 * power + 1e-300))
 
     def nearest(self, f: float) -> list[int]:
         """Return the three modes nearest to a frequency in units of their bandwidths."""
@@ -278,9 +322,14 @@ class JointModel:
             ],
             axis=2,
         )
+        prior = np.concatenate([np.zeros(2 + n), self._weak])
+        pull = np.concatenate([np.zeros(2 + n), self._weak * self.rho[:, i].real])
+        if self.turned:
+            u = np.concatenate([u, 1j * u[:, :, 2 : 2 + n]], axis=2)
+            prior = np.append(prior, np.full(n, self._quadrature[i]))
+            pull = np.append(pull, self._quadrature[i] * self.phi[:, i].imag)
         gradient, fisher = self._score(self._b @ self.r[:, i], u)
-        gradient[2 + n :] += self._weak * self.rho[:, i]
-        step = _solve(gradient, fisher, np.concatenate([np.zeros(2 + n), self._weak]))
+        step = _solve(gradient + pull, fisher, prior)
         # At most a bandwidth, and a factor of two of the damping, in one step.
         most = np.array([1.5 * self.zeta[i], 0.7])
         step *= min(1.0, *(most / np.abs(step[:2]).clip(1e-12)))
@@ -288,8 +337,9 @@ class JointModel:
 
         def moved(step: FloatArray) -> JointModel:
             f, zeta = self.f * np.exp(step[0] * own), self.zeta * np.exp(step[1] * own)
-            phi, rho = (np.outer(part, own) for part in np.split(step[2:], 2))
-            return replace(self, f=f, zeta=zeta, phi=self.phi + phi, rho=self.rho + rho)
+            phi, rho, *off = (np.outer(part, own) for part in step[2:].reshape(-1, n))
+            phi = self.phi + phi + sum(1j * part for part in off)
+            return replace(self, f=f, zeta=zeta, phi=phi, rho=self.rho + rho)
 
         better = self._first_better(moved, step)
         return better._with_better_forces(i) if m > 1 else better
@@ -298,14 +348,20 @@ class JointModel:
         """Improve the correlations of the force of a mode."""
         others = np.arange(self.f.size) != i
         now = self.r[i, others]
-        gradient, fisher = self._score(self._b[:, :, i], self._b[:, :, others])
+        unit = np.array([1.0, 1j] if self.turned else [1.0])
+        # E changes with r_ij as b_i b_j*, so that of its imaginary part u is turned back.
+        u = np.concatenate([one.conj() * self._b[:, :, others] for one in unit], axis=2)
+        gradient, fisher = self._score(self._b[:, :, i], u)
+        parts = np.concatenate([now.real, now.imag] if self.turned else [now.real])
 
         def moved(step: FloatArray) -> JointModel:
             r = self.r.copy()
-            r[i, others] = r[others, i] = np.clip(now + step, -0.999, 0.999)
+            r[i, others] = unit @ (parts + step).reshape(unit.size, -1)
+            r[i, others] *= np.minimum(1.0, 0.999 / np.abs(r[i, others]).clip(1e-12))
+            r[others, i] = r[i, others].conj()
             return replace(self, r=r) if np.linalg.eigvalsh(r)[0] > 1e-4 else self
 
-        return self._first_better(moved, _solve(gradient + now, fisher, np.ones(now.size)))
+        return self._first_better(moved, _solve(gradient + parts, fisher, np.ones(parts.size)))
 
     def _first_better(
         self, moved: Callable[[FloatArray], JointModel], step: FloatArray

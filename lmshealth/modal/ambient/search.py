@@ -132,6 +132,10 @@ def search(
         fewer = {first[k] for k in range(len(first)) if k not in kept}
         spectra = spectra.select([c for c in range(len(spectra.channels)) if c not in fewer])
         first = _informative(spectra, low, high)
+    if model.quadrature_sigmas() > constants.QUADRATURE_SIGMAS[0]:
+        model, harmonics, after, poles = _explain(
+            searched, low, high, suspected, hints, turned=True
+        )
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
     model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
@@ -152,7 +156,7 @@ def search(
             float(model.zeta[i]),
             max(0.02, 4 * float(model.zeta[i])),
             narrow=bool(narrow[i]),
-            amplitude=(model.phi[:, i] * model.data.scale).astype(np.complex128),
+            amplitude=model.phi[:, i] * model.data.scale,
         )
         for number, i in enumerate((i for i in np.argsort(model.f) if wide[i]), start=1)
     )
@@ -186,7 +190,7 @@ def _of_all_channels(
     Returns also the harmonics in all channels that the modes explain, and the spectra of these
     without the harmonics.
     """
-    poles = zip(model.f.tolist(), model.zeta.tolist(), model.phi.T + 0j, strict=True)
+    poles = zip(model.f.tolist(), model.zeta.tolist(), model.phi.T, strict=True)
     candidates = [Candidate(*pole, 1.0) for pole in poles]
     n, order = len(first), list(first)
     others = [c for c in range(len(spectra.channels)) if c not in first]
@@ -232,6 +236,8 @@ def _explain(
     high: float,
     suspected: Sequence[float],
     hints: tuple[Target, ...],
+    *,
+    turned: bool = False,
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -242,7 +248,7 @@ def _explain(
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
-        start = _start(_bin(spectra, candidates, low, high), candidates)
+        start = _start(_bin(spectra, candidates, low, high), candidates, turned)
         # Floors and strengths of a start are those of c = 0: refined models are compared.
         refined = [replace(start, static=c).refined(6) for c in _STATICS]
         best = min(refined, key=lambda one: one.misfit)
@@ -275,8 +281,9 @@ def _without_splits(model: JointModel, most: int) -> JointModel:
     shapes, of which none is the mode.
     """
     while model.f.size > most:
-        width, power = model.f * model.zeta, np.sum(model.phi**2, axis=0)
-        alike = (model.phi.T @ model.phi) ** 2 > constants.ALIKE_MAC * np.outer(power, power)
+        width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
+        alike = np.abs(model.phi.conj().T @ model.phi) ** 2
+        alike = alike > constants.ALIKE_MAC * np.outer(power, power)
         limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
         apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
         np.fill_diagonal(apart, np.inf)
@@ -355,7 +362,7 @@ def _grow(
     for gain, f, zeta, phi in _excesses(model)[:2]:
         if gain < (constants.LEAST_HINTED if any(is_near(hint, f) for hint in hints) else least):
             break
-        more = model.with_mode(f, zeta, phi)
+        more = model.with_mode(f, zeta, phi if model.turned else phi.real.astype(np.complex128))
         more = more.refined(3, more.nearest(f))
         enough = _evidence(more, model) >= constants.EVIDENCE_MARGIN
         if enough and more.zeta[-1] < constants.MOST_DAMPING:
@@ -363,7 +370,7 @@ def _grow(
     return None
 
 
-def _excesses(model: JointModel) -> list[tuple[float, float, float, FloatArray]]:
+def _excesses(model: JointModel) -> list[tuple[float, float, float, ComplexArray]]:
     """Return gain, frequency, damping and amplitude of the largest residual of each window.
 
     Of the mean of n ordinates the eigenvalue λ gains n (λ - 1 - ln λ) in log likelihood.
@@ -385,7 +392,7 @@ def _excesses(model: JointModel) -> list[tuple[float, float, float, FloatArray]]
         gain = weight * (largest - 1 - np.log(largest))
         k = int(gain.argmax())
         phi = root[k] @ vector[k, :, -1]
-        phi = np.real(phi * np.exp(-0.5j * np.angle(np.sum(phi * phi))))
+        phi = np.asarray(phi * np.exp(-0.5j * np.angle(np.sum(phi * phi))), np.complex128)
         strength = 2 * half * np.sqrt(largest[k] - 1)
         found.append((float(gain[k]), float(data.frequency[k]), half, strength * phi))
     return sorted(found, key=lambda excess: -excess[0])
@@ -457,10 +464,11 @@ def neighbourhood(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tup
     return targets[first:last]
 
 
-def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
+def _start(data: BandData, candidates: list[Candidate], turned: bool) -> JointModel:
     """Add candidates one by one, by their gain with all else fixed.
 
-    Poles and shapes stay fixed, the covariance S of the forces and the floors are updated.
+    Poles and shapes stay fixed, the covariance S of the forces and the floors are updated. A model
+    that is ``turned`` has parts in quadrature.
     """
     f = np.array([c.frequency for c in candidates])
     zeta = np.array([c.damping_ratio for c in candidates])
@@ -485,10 +493,12 @@ def _start(data: BandData, candidates: list[Candidate]) -> JointModel:
         s, floor = _update(data, b[:, :, chosen], block_diag(s, strength[best]), floor, 8)
     turn = np.exp(-0.5j * np.angle(np.sum(phi[chosen] ** 2, axis=1)))
     root = np.sqrt(np.diagonal(s).real)
-    r = np.real(s * np.outer(turn.conj(), turn)) / np.outer(root, root)
+    r = s * np.outer(turn.conj(), turn) / np.outer(root, root)
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
-    real = np.real(phi[chosen] * turn[:, None]).T * (root / peak[chosen])
-    return JointModel(data, floor, f[chosen], zeta[chosen], real, np.zeros_like(real), r)
+    shapes = (phi[chosen] * turn[:, None]).T * (root / peak[chosen])
+    poles = f[chosen], zeta[chosen]
+    model = JointModel(data, floor, *poles, shapes, np.zeros_like(shapes), r, turned)
+    return model if turned else model.in_phase()
 
 
 def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:

@@ -132,11 +132,11 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
     """Return by how many standard deviations the amplitude is too constant for noise."""
     f0 = model.f[i]
     shape = model.phi / np.linalg.norm(model.phi, axis=0)
-    own = (np.abs(model.f / f0 - 1) < _CLOSE) & ((shape.T @ shape[:, i]) ** 2 > _ALIKE)
+    own = (np.abs(model.f / f0 - 1) < _CLOSE) & (np.abs(shape.conj().T @ shape[:, i]) ** 2 > _ALIKE)
     rest = model.subset(~own)
     expected = rest.expected
     near = np.abs(model.data.frequency / f0 - 1) < max(0.01, model.zeta[i])
-    phi = _direction(model, expected, near) if near.any() else shape[:, i].astype(complex)
+    phi = _direction(model, expected, near) if near.any() else shape[:, i]
     gain = np.linalg.inv(expected) @ phi
     precision = np.real(gain @ phi.conj())
     weight = gain / precision[:, None]  # passes the direction unchanged, with the least of the rest

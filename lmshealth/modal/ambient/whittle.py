@@ -2,7 +2,7 @@
 
 The ordinates of all channels at one frequency are complex normal with the matrix
 
-    E(f) = Φ D(f) Φᵀ,   D_ij = S_ij h_i h_j*,   S = L Lᵀ,   Φ = [shapes, 1],
+    E(f) = Φ D(f) Φ*,   D_ij = S_ij h_i h_j*,   S = L L*,   Φ = [shapes, 1],
 
 over modes and noise floors. Means W of n ordinates suffice where E is constant between them:
 
@@ -11,7 +11,8 @@ over modes and noise floors. Means W of n ordinates suffice where E is constant 
 Unknowns, in this order: ln f (m), ln ζ (m), static responses (m), e_c, d_c and b_c of each floor,
 L row by row up to its diagonal (which is one for the floors), the shapes but for the reference
 channel of each mode, and the heights of bumps of the log spectrum of the modal forces, of which
-there are none at first.
+there are none at first. All are in phase at first; then the forces of different modes and the
+shapes have parts in quadrature, which follow those in phase.
 README.md of this folder derives the model; `marginalise` integrates the nuisance parameters.
 """
 
@@ -43,6 +44,9 @@ class Layout:
     n_channels: int
     force: tuple[tuple[int, int], ...]  # row and column of each unknown of L
     shape: tuple[tuple[int, int], ...]  # channel and mode of each unknown of the shapes
+    # force_in_phase, shape_in_phase: how many of these, the first ones, are; the others are not.
+    force_in_phase: int
+    shape_in_phase: int
     n_bumps: int = 0  # of the log spectrum of the modal forces; their heights are the last unknowns
 
     @cached_property
@@ -72,6 +76,38 @@ class Layout:
         """Unknowns of L that make floors coherent with modes."""
         m, first = self.n_modes, self.forces.start
         return [first + a for a, (i, j) in enumerate(self.force) if i >= m > j]
+
+    @cached_property
+    def quadrature(self) -> list[int]:
+        """Unknowns of forces and shapes that are not in phase."""
+        forces = range(self.forces.start + self.force_in_phase, self.forces.stop)
+        return [*forces, *range(self.shapes.start + self.shape_in_phase, self.shapes.stop)]
+
+    @cached_property
+    def units(self) -> tuple[ComplexArray | FloatArray, ComplexArray | FloatArray]:
+        """Unit of each unknown of `force` and of `shape`: 1, or i where it is not in phase."""
+        if not self.quadrature:
+            return np.ones(len(self.force)), np.ones(len(self.shape))
+        force, shape = np.arange(len(self.force)), np.arange(len(self.shape))
+        return (
+            np.where(force < self.force_in_phase, 1, 1j),
+            np.where(shape < self.shape_in_phase, 1, 1j),
+        )
+
+    def extended(self, p: FloatArray) -> FloatArray:
+        """Return unknowns of this layout as those of one with quadrature, all of it zero."""
+        more = [np.zeros(len(own)) for own in (self.off_diagonal, self.shape)]
+        upto, shapes, rest = np.split(p, [self.forces.stop, self.shapes.stop])
+        return np.concatenate([upto, more[0], shapes, more[1], rest])
+
+    def with_quadrature(self) -> Layout:
+        """Return the layout with the parts in quadrature of modal forces and of shapes."""
+        return replace(self, force=self.force + self.off_diagonal, shape=self.shape * 2)
+
+    @cached_property
+    def off_diagonal(self) -> tuple[tuple[int, int], ...]:
+        """Row and column of the unknowns of L that forces of different modes have."""
+        return tuple((i, j) for i, j in self.force if j < i < self.n_modes)
 
     @cached_property
     def common(self) -> list[int]:
@@ -124,7 +160,8 @@ def lay_out(reference: Sequence[int], n_channels: int) -> Layout:
     modes = [(i, j) for i in range(m) for j in range(i + 1) if n_channels > 1 or i - j < 2]
     floors = [(m + c, j) for c in range(n_channels) for j in range(m + c)]
     shape = [(c, i) for i in range(m) for c in range(n_channels) if c != reference[i]]
-    return Layout(m, n_channels, (*modes, *floors), tuple(shape))
+    force = *modes, *floors
+    return Layout(m, n_channels, force, tuple(shape), len(force), len(shape))
 
 
 # Index of the second derivatives of h by the indices of the first ones.
@@ -200,16 +237,24 @@ class Likelihood:
         forces = np.full(len(lay.force), constants.PRIOR_FORCE)
         forces[np.array(lay.shared, dtype=int) - lay.forces.start] = constants.WIDTHS_SHARED[-1]
         forces[np.array(lay.common, dtype=int) - lay.forces.start] = constants.WIDTHS_COMMON[-1]
+        forces[lay.force_in_phase :] = constants.PRIOR_QUADRATURE[0]
+        shapes = np.full(len(lay.shape), constants.PRIOR_SHAPE)
+        shapes[lay.shape_in_phase :] = constants.PRIOR_QUADRATURE[1]
         return np.concatenate(
             [
                 np.repeat([constants.PRIOR_LN_F, constants.PRIOR_LN_ZETA], lay.n_modes),
                 np.full(lay.n_modes, constants.WIDTHS_STATIC[-1]),
                 np.tile(constants.PRIOR_FLOORS[self.known_floors], lay.n_channels),
                 forces,
-                np.full(len(lay.shape), constants.PRIOR_SHAPE),
+                shapes,
                 np.full(lay.n_bumps, self.bump_std),
             ]
         )
+
+    def with_quadrature(self) -> Likelihood:
+        """Return the likelihood with the parts in quadrature of modal forces and of shapes."""
+        layout = self.layout.with_quadrature()
+        return replace(self, layout=layout, start=self.layout.extended(self.start))
 
     def coloured(self, bumps: FloatArray, std: float) -> Likelihood:
         """Return the likelihood with bumps, ``(2, n_bumps)``, and the prior std of heights."""
@@ -258,11 +303,13 @@ class Likelihood:
                 self._latest[key] = [_Point(self, p, block) for block in self.blocks]
         return self._latest[key]
 
-    def shapes(self, p: FloatArray) -> FloatArray:
+    def shapes(self, p: FloatArray) -> ComplexArray | FloatArray:
         """Shapes of the modes, shape ``(n_channels, n_modes)``."""
-        phi = np.ones((self.layout.n_channels, self.layout.n_modes))
-        if self.layout.shape:
-            phi[self.layout.places[2]] = p[self.layout.shapes]
+        lay = self.layout
+        phi: FloatArray = np.ones((lay.n_channels, lay.n_modes), dtype=lay.units[1].dtype)
+        if lay.shape:
+            phi[lay.places[2]] = 0.0
+            np.add.at(phi, lay.places[2], lay.units[1] * p[lay.shapes])
         return phi
 
     def strength(self, p: FloatArray) -> FloatArray:
@@ -355,12 +402,12 @@ class _Point:
         self._block, self._scale = block, likelihood.scale
         self._layout = lay = likelihood.layout
         m, n = lay.n_modes, lay.n_components
-        self._root = np.zeros((n, n))
+        self._root = np.zeros((n, n), dtype=lay.units[0].dtype)
         self._root[range(m, n), range(m, n)] = 1.0
         driven, force = lay.places[1]
-        self._root[driven, force] = self._scale[driven] * p[lay.forces]
+        np.add.at(self._root, (driven, force), lay.units[0] * self._scale[driven] * p[lay.forces])
         self._phi = np.concatenate([likelihood.shapes(p), np.eye(lay.n_channels)], axis=1)
-        self._s = np.asarray(self._root @ self._root.T)
+        self._s = np.asarray(self._root @ self._root.conj().T)
         f, zeta = np.exp(p[: 2 * m].reshape(2, m, 1))
         modes = receptance(f, zeta, block.grid)
         modes[0] += p[2 * m : 3 * m, None]
@@ -380,13 +427,13 @@ class _Point:
     def strength(self) -> FloatArray:
         """PSD of each modal force in each channel, shape ``(channels, modes)``."""
         m = self._layout.n_modes
-        return np.asarray(self._phi[:, :m] ** 2 * np.diag(self._s)[:m])
+        return np.asarray(np.abs(self._phi[:, :m]) ** 2 * np.diag(self._s)[:m].real)
 
     @property
     def floor(self) -> FloatArray:
         """PSD of the part of each floor incoherent with modes, shape ``(channels, grid)``."""
         m = self._layout.n_modes
-        own = np.sum(self._root[m:, m:] ** 2, axis=1)
+        own = np.sum(np.abs(self._root[m:, m:]) ** 2, axis=1)
         return np.asarray(np.abs(self._h[0, m:]) ** 2 * own[:, None])
 
     @cached_property
@@ -399,7 +446,8 @@ class _Point:
     @cached_property
     def expected(self) -> ComplexArray:
         """E, shape ``(n, channels, channels)``."""
-        expected = np.moveaxis(_congruent(self._phi.T, self._modal), -1, 0).copy()
+        half = np.tensordot(self._phi, self._modal, axes=(1, 0))
+        expected = np.tensordot(half, self._phi.conj(), axes=(1, 1)).transpose(1, 0, 2).copy()
         return expected if self._block.foreign is None else expected + self._block.foreign
 
     @cached_property
@@ -444,7 +492,7 @@ class _Point:
     def _slopes(self) -> tuple[NDArray[np.intp], ComplexArray]:
         """Rows of the slopes of E in the basis of Φ's columns and the channels.
 
-        Returns the index of b in the basis and the row w of each unknown, E_a = b (Φ w)ᵀ + adjoint,
+        Returns the index of b in the basis and the row w of each unknown, E_a = b (Φ̄ w)ᵀ + adjoint,
         shapes ``(unknowns,)`` and ``(unknowns, components, n)``.
         """
         lay, h, s = self._layout, self._h, self._s
@@ -452,7 +500,8 @@ class _Point:
         by_pole = s[pole, :, None] * h[slope, pole][:, None] * h[0].conj()
         pairs = self._block.smear(h[0][:, None] * h[0].conj())
         row = [pole, driven, lay.n_modes + channel]
-        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven], self._modal[mode]]
+        by_shape = lay.units[1][:, None, None] * self._modal[mode]
+        w = [self._block.smear(by_pole), self._change[..., None] * pairs[driven], by_shape]
         if lay.n_bumps:
             w[:2] = [part * self._gain[i] for part, i in zip(w[:2], row[:2], strict=True)]
             row.append(np.arange(lay.n_modes))
@@ -460,10 +509,14 @@ class _Point:
         return np.concatenate(row), np.concatenate(w)
 
     @cached_property
-    def _change(self) -> FloatArray:
-        """Change of the row and column of S that belong to each force, ``(forces, components)``."""
+    def _change(self) -> ComplexArray:
+        """Change of the row of S that belongs to each force, ``(forces, components)``.
+
+        That of the column is its adjoint.
+        """
         driven, force = self._layout.places[1]
-        return np.asarray(self._scale[driven, None] * self._root.T[force])
+        unit = self._layout.units[0] * self._scale[driven]
+        return np.asarray(unit[:, None] * self._root.conj().T[force])
 
     def _curvature(self, g: ComplexArray) -> FloatArray:
         """Σ tr G E_ab over all pairs of unknowns, the counts in G."""
@@ -471,8 +524,8 @@ class _Point:
         size = lay.bumps.start
         curvature = np.zeros((lay.size, lay.size))
         g = np.ascontiguousarray(np.moveaxis(g, 0, -1))
-        # Φᵀ G, (components, channels, n), and the transpose of Φᵀ G Φ
-        pull = np.tensordot(self._phi.T, g, axes=(1, 0))
+        # Φ* G, (components, channels, n), and the transpose of Φ* G Φ
+        pull = np.tensordot(self._phi.conj().T, g, axes=(1, 0))
         turned = np.tensordot(self._phi.T, pull, axes=(1, 1))
         if lay.n_bumps:
             (pole, _), (driven, _), (_, mode) = lay.places
@@ -511,17 +564,17 @@ class _Point:
         """Add the part of two forces, and of a force and an unknown of h."""
         lay, h = self._layout, self._h
         driven, force = lay.places[1]
-        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj()).real
-        overlap *= np.outer(self._scale, self._scale)
-        same = force[:, None] == force
-        curvature[lay.forces, lay.forces] += 2 * same * overlap[driven[:, None], driven]
+        overlap = np.einsum("ijk,ik,jk->ij", turned, h[0], h[0].conj())
+        unit = lay.units[0] * self._scale[driven]
+        same = (force[:, None] == force) * np.outer(unit, unit.conj())
+        curvature[lay.forces, lay.forces] += 2 * (same * overlap[driven[:, None], driven]).real
         component, slope = lay.places[0]
-        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj()).real
+        mixed = np.einsum("ajk,ak,jk->aj", turned[component], h[slope, component], h[0].conj())
         # S changes in row and column.
         term = (driven[:, None] == component) * (self._change @ mixed.T)
-        term += self._change[:, component] * mixed[:, driven].T
-        curvature[lay.forces, : lay.n_poles] += 2 * term
-        curvature[: lay.n_poles, lay.forces] += 2 * term.T
+        term += self._change.conj()[:, component] * mixed[:, driven].T
+        curvature[lay.forces, : lay.n_poles] += 2 * term.real
+        curvature[: lay.n_poles, lay.forces] += 2 * term.real.T
 
     def _by_shapes(self, curvature: FloatArray, g: ComplexArray, pull: ComplexArray) -> None:
         """Add the part of two shapes, and of a shape and an unknown of D."""
@@ -529,19 +582,15 @@ class _Point:
         channel, mode = lay.places[2]
         row, inner = (own[:first] for own in self._slopes)
         own = np.tensordot(self._modal, g, axes=(2, 2))  # (i, j, d, c)
-        own = own[mode[:, None], mode, channel, channel[:, None]]
+        unit = lay.units[1]
+        own = own[mode[:, None], mode, channel, channel[:, None]] * np.outer(unit, unit.conj())
         curvature[lay.shapes, lay.shapes] += 2 * own.real
         along = np.einsum("ajk,jck->ac", inner, pull)
         across = inner.conj() @ pull[row].swapaxes(1, 2)  # (a, i, c)
         term = across[:, mode, channel] + np.where(row[:, None] == mode, along[:, channel], 0)
+        term = unit * term
         curvature[:first, lay.shapes] += 2 * term.real
         curvature[lay.shapes, :first] += 2 * term.real.T
-
-
-def _congruent(basis: FloatArray, matrix: ComplexArray) -> ComplexArray:
-    """Bᵀ M B at each frequency, which is the last axis."""
-    half = np.tensordot(basis.T, matrix, axes=(1, 0))
-    return np.asarray(np.tensordot(half, basis, axes=(1, 0)).swapaxes(1, 2))
 
 
 class _Packing:

@@ -76,10 +76,10 @@ def test_a_constant_amplitude_distinguishes_a_harmonic_from_a_mode(harmonic: boo
     noise = rng.standard_normal((sine.size, 3, 2)) @ [1, 1j] / np.sqrt(2)
     transforms = noise + sine[:, None] * np.array([1.0, -0.5, 0.3])
     data = band_of(transforms)
-    phi = np.array([[3.0], [-1.5], [0.9]])
-    floor = np.ones((3, 1))
+    phi = np.array([[3.0], [-1.5], [0.9]], dtype=complex)
+    floor, r = np.ones((3, 1)), np.eye(1, dtype=complex)
     poles = np.array([20.0]), np.array([0.01])
-    model = JointModel(data, floor, *poles, phi, np.zeros_like(phi), np.eye(1)).refined(6)
+    model = JointModel(data, floor, *poles, phi, np.zeros_like(phi), r).refined(6)
     free = np.ones(FREQUENCY.size, dtype=bool)
     recording = CrossSpectrum(FREQUENCY, transforms[None].copy(), SECONDS, np.nan, free)
     found = find_harmonic(model, recording)
@@ -92,10 +92,11 @@ def test_the_score_of_the_joint_model_is_the_derivative_of_its_misfit() -> None:
     """The gradient by the force in one channel equals a difference of the misfit; sweeps gain."""
     rng = np.random.default_rng(8)
     data = band_of(rng.standard_normal((11_999, 2, 2)) @ [1, 1j])
-    poles, r = (np.array([20.0, 25.0]), np.array([0.03, 0.02])), np.array([[1.0, 0.3], [0.3, 1.0]])
+    poles = np.array([20.0, 25.0]), np.array([0.03, 0.02])
+    r = np.array([[1.0, 0.3], [0.3, 1.0]], dtype=complex)
 
     def model(first: float) -> JointModel:
-        phi = np.array([[0.3 + first, 0.1], [0.2, -0.4]])
+        phi = np.array([[0.3 + first, 0.1], [0.2, -0.4]], dtype=complex)
         return JointModel(data, np.full((2, 1), 2.0), *poles, phi, np.zeros_like(phi), r)
 
     before = model(0.0)

@@ -45,10 +45,14 @@ LAYOUTS = list(product(range(4), range(1, 5)))
 # What is expected of the ordinates
 
 
+@pytest.mark.parametrize("turned", [False, True])
 @pytest.mark.parametrize(("m", "n"), LAYOUTS)
-def test_covariance_is_that_of_forces_through_resonances_and_floors(m: int, n: int) -> None:
+def test_covariance_is_that_of_forces_through_resonances_and_floors(
+    m: int, n: int, turned: bool
+) -> None:
     """E is what the equation of motion makes of white forces, in phase and size, entry by entry."""
     target = noisy(m, n, 8.0)
+    target = target.with_quadrature() if turned else target
     p = other_point(target)
     (found,) = target.expected(p)
     truth = covariance(target, p, frequencies(8.0))
@@ -169,7 +173,18 @@ def test_derivatives_by_heights_are_those_of_the_value(m: int, n: int, duration:
     check_derivatives(m, n, duration, BUMPS)
 
 
-def check_derivatives(m: int, n: int, duration: float, bumps: np.ndarray) -> None:
+@pytest.mark.parametrize("duration", [1.0, 20.0])
+@pytest.mark.parametrize(("m", "n"), [(2, 1), (1, 3), (3, 2)])
+def test_derivatives_by_parts_in_quadrature_are_those_of_the_value(
+    m: int, n: int, duration: float
+) -> None:
+    """The same with forces that reach modes with a delay, and shapes out of phase."""
+    check_derivatives(m, n, duration, BUMPS, turned=True)
+
+
+def check_derivatives(
+    m: int, n: int, duration: float, bumps: np.ndarray, *, turned: bool = False
+) -> None:
     """Compare with central differences."""
     target = noisy(m, n, duration, count=3)
     (block,) = target.blocks
@@ -178,7 +193,7 @@ def check_derivatives(m: int, n: int, duration: float, bumps: np.ndarray) -> Non
         cut = slice(200, 1400, 13)
         block = MeanOrdinates(block.frequency[cut], block.matrix[cut], 1.0 + block.count[cut], None)
         target = replace(target, blocks=(block,))
-    target = target.coloured(bumps, 0.5)
+    target = (target.with_quadrature() if turned else target).coloured(bumps, 0.5)
     p = other_point(target, m + 1)
     gradient, hessian = target.derivatives(p)
     # In units in which all unknowns weigh alike, along some directions that mix them all.
