@@ -8,9 +8,6 @@ Method
     package with all that it requires; its core are the libraries that a program of this kind
     builds on, with what these require. pip and setuptools, which the environment has before, do
     not count.
-Answer
-    As pip installs it is 484 MB, of which the core is 400 MB and 135 MB are byte code; without
-    byte code 349 MB. Beyond the core SQLAlchemy, xarray (of ArviZ) and h5py are the largest.
 Run time
     A minute, most of it the installation.
 """

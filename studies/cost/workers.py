@@ -9,10 +9,6 @@ Method
     hashing and identification. Model: n workers identify c / (t + s) logs per s, at most one per
     serial time; t is the time of a log with one worker, c what n bare processes do over one, and s
     the processor time of main process and scheduler, which share the processors with the workers.
-Answer
-    Two workers, or two runs that share a store, identify twice as many logs as one, as two bare
-    processes do; four and eight on two processors a little more. The main process takes 0.4 ms a
-    log for processes and 1.1 ms for Dask. Two runs identify each log once.
 Run time
     Twelve minutes of two processors.
 """

@@ -11,11 +11,6 @@ Method
     the errors are normal, so that with true standard deviations 0.27 % of the frequencies are
     beyond 3. Controls: the same samples with the mean rate in the place of the stamps must give
     wrong frequencies, and a copy that is not compared with the others must not be named.
-Answer
-    No. Of 224 axes all that are wrong by more than a mode's error are refused, resampled or named:
-    of 128 frequencies without a word and 372 with one none is beyond 3 standard deviations. All 100
-    sets are named with the right reason; both controls are found. The first run found one log whose
-    fit overflowed and ended in an exception; that is mended.
 Run time
     Ten minutes on one processor.
 """

@@ -9,11 +9,6 @@ Method
     same signals, read in a process of its own by the reader and by the bare call, which holds all
     of the log (control): the peak of its memory, less what it had after a short file, in minutes of
     the log (8 bytes for each sample of each channel), and the processor time.
-Answer
-    CSV and Parquet cost at most 1.3 times the library. HDF5, TDMS and MAT cost 1.4 to 2.2 times:
-    they are read in a process that may die, and its samples come through pages that both share,
-    10 ms for a minute of four signals. `read_log` takes 50 ms more to hash and judge them. Memory
-    is an eighth of the log's at most, except UFF58, whose library holds the whole file.
 Run time
     About ten minutes, and 2 GB of disk.
 """

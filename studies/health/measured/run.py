@@ -10,9 +10,6 @@ Method
     of the same one (``same``: the control, of which no loss may be stated). ``beyond`` are changes
     that the description does not hold: five steps of the roller at once, a map that ends before the
     new place, columns whose modes leave every search. No value may be certified of these.
-Answer
-    Four of five steps of 25 mm are held by intervals of 5 mm. Two of eight controls are called
-    changed, by changes that are real. No change beyond the descriptions is certified.
 Run time
     Twenty minutes of a busy processor.
 Data

@@ -9,9 +9,6 @@ Method
     flipped bits without a checksum, text cut between rows or inside the last number. The exit
     status must report refused logs, and standard error must be empty. Controls: a good log
     expected to be bad, a bad one expected to be good, and a wrong reason must be detected.
-Answer
-    All 1,000 good logs are analysed, and all 329 damaged ones of 73 kinds have the stated reason.
-    Exit status 3, nothing on standard error.
 Run time
     Ten minutes on two processors.
 """

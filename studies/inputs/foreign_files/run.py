@@ -12,10 +12,6 @@ Method
     as nan. A file is right where the rate and all samples of both signals are, lost samples
     included; refused; or wrong. Control: a reader that takes commas for marks between
     thousands, on files with decimal commas: the same comparison must find its values wrong.
-Answer
-    432 files of 16 formats are read right. Of 2,000 dialects none is read with other values,
-    1,771 are read, 47 have marks between thousands and 182 are refused otherwise: units behind
-    names between blanks, moments between colons.
 Run time
     Four minutes on one processor.
 """

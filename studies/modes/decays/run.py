@@ -12,12 +12,6 @@ Method
     roller position; the mode is searched within 30 % of 33 Hz with a damping of 0.2 % within a
     factor of ten. Reference frequencies come from Welch spectra and least squares, good to 0.15
     Hz.
-Answer
-    Yes: 24 of 24 coverages in nine cases. Narrow intervals are detected 24 times, wide ones 22
-    times (``not_met``: the least damped mode after one stop has heavy tails). Least squares cover
-    15 to 65 %. Errors are 1.0 to 1.4 times the bound. Simulated stages give 112 of 120 modes, none
-    confused with another, with coverages of 98 and 99 %. The beam is right to 0.05 Hz in 28 dwells
-    and refused in 5, among them the three that nothing excites.
 Run time
     13 minutes on one processor. The beam needs ``dropbear_ds8`` in LMSHEALTH_DATA.
 """

@@ -7,8 +7,6 @@ Method
     refused as ``too-few-lines``; frequencies whose third line is within 5 % of the end of that
     range are not drawn. Controls with a line every 0.25 Hz: a motor whose cube exceeds its current
     must be refused as ``nonlinear``, six heavily damped modes in noise of their size as ``noise``.
-Answer
-    Every mode is found where three lines show it, and every other one is refused with its reason.
 Run time
     Three minutes on two processors.
 """

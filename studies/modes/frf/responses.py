@@ -14,10 +14,6 @@ Method
     (3) A linear guide with friction (two experiments, two encoders) and a bench of two inertias:
     against published values, sides and experiments against each other, noise-only uncertainty
     against the jackknife over periods.
-Answer
-    Yes around the modes: all coverages contain 95 %, errors are 1.00 to 1.11 times the bound.
-    Distortion that neighbouring lines do not share is overestimated threefold. No in a band with
-    many weak modes (``not_met``): X's pitch is off by up to 6 σ, 0.12 Hz.
 Run time
     Eleven minutes on one processor. The benches need LMSHEALTH_DATA.
 """

@@ -9,11 +9,6 @@ Method
     is regressed on the logarithm of the excitation that is published, and the residual counts.
     Controls on the same logs: the likelihood with a force that is steady and white, and
     frequencies that soften without the covariate.
-Answer
-    Yes: 92 to 97 % of 95 % intervals hold in all worlds (42 to 84 % of the controls of f), at 1.05
-    times the width where the force is steady and white. Unsteady forces have their flag in 98 to
-    100 % of the estimates, humps in 81 %; no white force is called coloured. A hump may look like a
-    further resonance, beside which a name is doubtful or refused.
 Run time
     Nine minutes on one processor.
 """

@@ -9,13 +9,6 @@ Method
     it back, friction then holds it on springs, and the response must have pitch too high; the
     methods without excitation must keep it. Control: without friction the response at 1 mm/s has
     it right.
-Answer
-    At 1 mm/s the response has pitch 0.45 % too high, which reads as 3.6 % more preload; following
-    error and accelerometers do not. Sweep while the stage moves, as the paper does: at 10 mm/s the
-    slope of friction over velocity leaves 20 parts in a million. That is five of the response's
-    standard deviations: none of its eight 95 % intervals holds the truth (mean offset 15 of its
-    standard errors), as they allow for noise and not for friction. Not met either: at 10 mm/s the
-    accelerometers are 0.19 Hz too high, 3.4 standard errors of the mean.
 Run time
     Seven minutes on one busy processor.
 """

@@ -10,9 +10,6 @@ Method
     be standard normal: chi-squared, and the mean over all seeds. Controls that must disagree: a
     response on a stage of 5 % less preload; the response to the motor's whole current, which has
     the poles of the stage without its servo.
-Answer
-    Yes, in every mode that two methods show. The standard deviation of pitch is 1 mHz from a
-    response of Y, 7 mHz of X, and 0.2 to 0.35 Hz from an undisturbed move.
 Run time
     Seven minutes of processor time on two processors for 20 seeds of both stages.
 """

@@ -9,11 +9,6 @@ Method
     no name, the right name (without and with a description of modes and temperature), or only a
     description. Judged are labels, modes, alarms and 90 % intervals of the temperature's slopes.
     Control, which must fail: association that takes stated errors as they are, as before.
-Answer
-    Yes, in all 100 lives. 93 to 98 % of the estimates have a label, whatever is stated, and 99.9 %
-    of these the right one (control: 9 % have one); 393 of 400 slopes lie inside their intervals.
-    Most of the rest is ambiguous, most often where the table has no names. Three lives alarm, two
-    were allowed.
 Run time
     About five minutes of one processor.
 """

@@ -14,14 +14,6 @@ Method
     with one setting and regular logs: largest difference of ln f in standard deviations, and
     processor time as a multiple of a plain filterpy loop, the median over the turns; that of the
     tracker includes outliers, and the search for changes and for rates that are new.
-Answer
-    The filter is right: errors, innovations and quantiles of the average over settings are as
-    stated, and numbers are those of filterpy. What is published of that average, a mean and a
-    standard deviation, is too wide in the middle: intervals of 50 % hold 60 to 63 % of ln f and
-    drifts, those of 90 % are right. Two sources cover as one does. Common errors that are taken for
-    independent do not show any more, since the tracker allows for errors that are larger than
-    stated. Tracking over all 2,500 settings, of which a few are left after some hundred logs, takes
-    five times the filterpy loop of one setting, 3.7 s where 2 s were asked.
 Run time
     Nine minutes on one processor, most of them for lives of two sources. simdkalman and statsmodels
     come with the extra ``peers``; without them their rows are missing.
