@@ -4,11 +4,12 @@ Method
     Machines of one to three modes in three accelerometers over 20 to 60 s, identified with their
     description, in worlds that the likelihood does not describe: bursts of 30 % duty 26 dB above
     the rest, a log-normal intensity, an amplitude that grows by ten, a hump of the force (2 to 4
-    times the PSD, one to three half-power bandwidths wide, one to four from a mode), and a
-    frequency that falls by 0.45 % where the level doubles. There ln f of the 15 logs of a machine
-    is regressed on the logarithm of the excitation that is published, and the residual counts.
-    Controls on the same logs: the likelihood with a force that is steady and white, and
-    frequencies that soften without the covariate.
+    times the PSD, one to three half-power bandwidths wide, one to four from a mode), channels that
+    move in a mode with phases of up to 10°, forces that reach modes with delays of up to 1 ms,
+    and a frequency that falls by 0.45 % where the level doubles. There ln f of the 15 logs of a
+    machine is regressed on the logarithm of the excitation that is published, and the residual
+    counts. Controls on the same logs: the likelihood with a force that is steady, white and in
+    phase, and frequencies that soften without the covariate.
 Run time
     Nine minutes on one processor.
 """
@@ -23,6 +24,7 @@ import numpy as np
 
 from lmshealth import identify
 from lmshealth.io.log import Log
+from lmshealth.modal import constants
 from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.excitation import Colour, Unsteadiness
 from lmshealth.modal.modes import Modes
@@ -34,6 +36,8 @@ from studies.modes.single_logs.worlds import LOGS_OF_MACHINE, WORLDS, draw_machi
 LOGS, QUICK_LOGS = 150, 5
 LEAST, WIDEST = 0.90, 1.25
 UNSTEADY = "bursts", "log-normal", "ramp"
+# Worlds of which the control may hold: forces that are half independent hardly show a delay.
+MILD = "steady", "delayed"
 
 
 def main() -> None:
@@ -72,8 +76,9 @@ def examine(world: str, k: int, n_logs: int = LOGS_OF_MACHINE) -> list[Row]:
 
 
 def as_if_plain(log: Log, stage: Stage) -> Modes:
-    """Identify modes as if every force was steady and white."""
+    """Identify modes as if every force was steady and white, and all moved in phase."""
     with (
+        patch.object(constants, "QUADRATURE_SIGMAS", (np.inf, np.inf)),
         patch.object(cluster_fit, "unsteadiness", lambda *_: Unsteadiness(1.0, 0)),
         patch.object(
             cluster_fit, "average_colours", lambda _, p, white, *__: Colour(white[0], white[1], 0.0)
@@ -168,7 +173,7 @@ def verdicts(worlds: dict[str, Row]) -> dict[str, bool]:
             steady["unsteady"]["hits"] or steady["coloured"]["hits"]
         ),
         "controls do not hold": all(
-            worlds[name]["control"]["f"]["share"] < LEAST for name in WORLDS if name != "steady"
+            worlds[name]["control"]["f"]["share"] < LEAST for name in WORLDS if name not in MILD
         ),
     }
 
@@ -182,7 +187,7 @@ def claims(record: Row) -> Iterator[Claim]:
             f"95 % intervals of f and ζ of single logs hold, {name}",
             f"{percents([ours['f']['share'], ours['zeta']['share']])} of {n}",
             f"± {100 * 1.96 * np.sqrt(0.95 * 0.05 / n):.1f} %",
-            f"steady, white forces assumed: {percents([control['f']['share']])} of f; "
+            f"steady, white forces in phase assumed: {percents([control['f']['share']])} of f; "
             f"{span(one['wider'])} times as wide",
             record["passed"][f"95 % intervals hold 90 %, {name}"],
         )

@@ -18,7 +18,9 @@ RATE, N_CHANNELS = 1000.0, 3
 LOGS_OF_MACHINE = 15
 # Relative loss of frequency where the level doubles.
 SOFTENING = 0.0045
-WORLDS = ("steady", "bursts", "log-normal", "ramp", "hump", "softening")
+WORLDS = ("steady", "bursts", "log-normal", "ramp", "hump", "softening", "out of phase", "delayed")
+# Most phase of a channel in a mode, and delay of the force of a mode in s.
+PHASE, DELAY = np.radians(10.0), 1e-3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,6 +70,11 @@ def record(world: str, machine: Machine, rng: np.random.Generator) -> tuple[Log,
         place = f[i] + rng.choice([-1, 1]) * rng.uniform(1, 4) * width
         hump = np.exp(-0.5 * ((frequency - place) / (rng.uniform(1, 3) * width)) ** 2)
         gain = np.sqrt(1 + (rng.uniform(2, 4) - 1) * hump)
+    turned = np.ones((N_CHANNELS, f.size, 1))
+    if world == "out of phase":
+        turned = np.exp(1j * rng.uniform(-PHASE, PHASE, turned.shape))
+    if world == "delayed":
+        turned = np.exp(-2j * np.pi * rng.uniform(0, DELAY, (1, f.size, 1)) * frequency)
     own = envelope(world, rng, n)
     # The second half of the circle, mirrored, precedes the record.
     amplitude = np.concatenate([own, own[::-1], np.ones(size - 2 * n)])
@@ -79,7 +86,8 @@ def record(world: str, machine: Machine, rng: np.random.Generator) -> tuple[Log,
         beta = frequency / centre
         moved = fft.rfft(force) * gain * -(beta**2) / (1 - beta**2 + 2j * zeta * beta)
         strength = np.sqrt(machine.snr[i]) * 2 * zeta
-        values += strength * np.outer(machine.shapes[:, i], fft.irfft(moved, size)[:n])
+        parts = machine.shapes[:, [i]] * fft.irfft(turned[:, i] * moved, size)[:, :n]
+        values += strength * parts
     values *= np.sqrt(RATE / 2)
     return make_log({f"acc_{c}": row for c, row in enumerate(values)}, RATE), f
 
