@@ -55,8 +55,9 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
     phases: list[Segment] = []
     for start, stop in log.pieces:
         found: list[Segment] = []
-        # Differences over some 1 ms: between neighbouring samples a slow ramp appears constant.
-        lag = max(1, min(20, (stop - start) // 4))
+        # Between neighbouring samples a slow ramp appears constant.
+        lag = max(constants.LEAST_VELOCITY_LAG, round(constants.VELOCITY_LAG * log.sample_rate))
+        lag = max(1, min(lag, (stop - start) // 4))
         # A piece that begins at rest is idle.
         last_move = start - settling - 1
         for at, block in blocks(velocity, start, stop):
