@@ -57,6 +57,8 @@ _NO_ROW = re.compile(rb"^(?:[A-Za-z*][^\n]*|[ \t\r]*)\n", re.MULTILINE)
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # Most bytes of text behind the rows: rates, counts and ends that exporters write there.
 _TRAILER = 1 << 12
+# Between the parts of a number, of which the last is its decimals or its exponent.
+_PARTS = re.compile(r"[.,:eE]")
 _WORD = re.compile(r"[^\W\d_]{3}")
 
 
@@ -131,10 +133,13 @@ class Text:
                 found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
                 needed = "needed shorter rows, and a second quote to every quote"
                 raise Unusable("corrupt", f"{found} {self.position}; {needed}")
-        if rows := self._without_text(b"".join(held), dialect):
-            yield rows
+        rows = self._without_text(b"".join(held), dialect)
         end = rows[rows.rfind(b"\n") + 1 :]
-        # The last number of a file that ends inside a row may be incomplete.
+        if end and _is_cut(rows[-_TRAILER:], dialect):
+            self.trailer = "the last row ends inside its last number, left out"
+            rows, end = rows[: -len(end)], b""
+        if rows:
+            yield rows
         n_found = len(fields_of(end.decode(errors="replace"), dialect.delimiter))
         n_fields = len(dialect.channels)
         if end and not end.endswith(b"\r") and n_found < n_fields:
@@ -165,6 +170,22 @@ def _is_remark(line: bytes, dialect: Dialect) -> bool:
     first = (fields_of(text, dialect.delimiter) or [""])[0]
     several = len(dialect.channels) > 1 or len(text.split()) > 1
     return bool(_WORD.match(first)) and several and not is_number_or_moment(first)
+
+
+def _is_cut(rows: bytes, dialect: Dialect) -> bool:
+    """Return whether the last number of the last row has fewer digits than all above it have.
+
+    The first row is not counted. -6.133e-0 may be the beginning of -6.133e-05.
+    """
+    fields = (fields_of(row.decode("latin-1"), dialect.delimiter) for row in rows.split(b"\n")[1:])
+    full = [own[-1].strip(' "') for own in fields if len(own) == len(dialect.channels)]
+    parts = [_PARTS.split(text.lstrip("+-")) for text in full if text]
+    if len(parts) < 5 or not full[-1]:  # of fewer rows a complete one may well be the shortest
+        return False
+    *others, own = parts
+    alike = [len(one[-1]) for one in others if len(one) == len(own)]
+    is_short = len("".join(own)) < min(len("".join(one)) for one in others)
+    return is_short or len(own[-1]) < min(alike, default=0)
 
 
 def _without_headers(

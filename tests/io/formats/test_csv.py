@@ -265,3 +265,22 @@ def test_rows_that_are_cut_off_are_no_text(tmp_path, end):
     (tmp_path / "a.csv").write_text("# sample_rate_hz: 10\nn,acc_x_g,acc_y_g\n" + rows + end)
     with pytest.raises(BadLog):
         read_log(tmp_path / "a.csv")
+
+
+@pytest.mark.parametrize(
+    ("row", "n_kept"),
+    [
+        ("5,-6.133e-05", 40),
+        ("5,-6.133e-0", 39),
+        ("5,-6.133", 39),
+        ("5,-", 39),
+        ("5,-6.133e-05\n", 40),
+    ],
+)
+def test_a_last_number_that_is_cut_is_left_out(tmp_path, row, n_kept):
+    """A row without the end of its line counts where its last number is as long as the others."""
+    rows = "".join(f"{k},{(-1) ** k * 1e-4 / (k + 1):.3e}\n" for k in range(39))
+    (tmp_path / "a.csv").write_text("# sample_rate_hz: 10\nn,acc_x_m_s2\n" + rows + row)
+    log = read_log(tmp_path / "a.csv")
+    assert log.channels[0].values.size == n_kept
+    assert any("ends inside its last number" in text for text in log.guessed) == (n_kept == 39)
