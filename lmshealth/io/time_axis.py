@@ -4,7 +4,6 @@ Samples are never sorted; `channel_checks` fills short gaps only (README.md, "Ti
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple, Self
 
@@ -91,22 +90,30 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     step = resolution(time)
     span = float(time[time.size - 1 :][0] - time[:1][0])
     coarse = 0 < 0.2 * span < (time.size - 1) * step
-    try:
-        if n_repeated:
-            found = f"time_s repeats {n_repeated} times in {time.size} samples"
-            raise Unusable("time", f"{found}; needed increasing time stamps")
-        return _axis(time, rate, step, 0.0)
-    except Unusable:
-        # Rounding to a step near the interval makes them unlike: the clock decides.
-        if coarse:
-            with suppress(Unusable):
-                return _axis(time, rate, step, step)
-        raise
+    if n_repeated and not coarse:
+        found = f"time_s repeats {n_repeated} times in {time.size} samples"
+        raise Unusable("time", f"{found}; needed increasing time stamps")
+    # Rounding to a step near the interval makes intervals unlike: the clock decides.
+    attempts = (0.0, step) if coarse else (0.0,)
+    refused: dict[float, Unusable] = {}
+    for slack in reversed(attempts) if n_repeated else attempts:
+        try:
+            return _axis(time, rate, step, slack)
+        except Unusable as error:
+            refused[slack] = error
+    raise refused[attempts[-1]]
 
 
 def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
     """Find the axis of stamps, rounded to a step in s; ``slack`` in s widens tolerances."""
-    breaks, lengths, note, interval, scatter = _interruptions(time, slack)
+    breaks, lengths, note, scatter = _interruptions(time, slack)
+    scatter = max(scatter, slack)
+    interval, rounding = _mean_interval(time, breaks), _ROUNDING * max(step, slack)
+    # Stamps cut to whole steps lie on their line, which long runs of either step turn a little.
+    whole = slack * round(interval / slack) if slack else 0.0
+    is_whole = abs(whole / interval - 1) < constants.AGREEMENT and not breaks.size
+    if is_whole and _off_line(time, (0, time.size), whole) <= rounding:
+        interval = whole
     if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
         found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
         raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
@@ -117,7 +124,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
         clock, slope = _clock(time, start, stop, least)
         allowed = constants.AGREEMENT + scatter / (interval * min(least, (stop - start) / 2))
         # In a stretch this short a rate cannot be measured.
-        if stop - start >= _GROUP:
+        if stop - start >= _GROUP and _off_line(time, (start, stop), interval) > rounding:
             varies |= bool((np.abs(slope / interval - 1) > allowed).any())
             slopes += slope.tolist()
             lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
@@ -154,11 +161,26 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
     return TimeAxis(own, breaks, note, gone, (), np.where(certain & few, dropped, 0))
 
 
-def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float, float]:
+def _mean_interval(time: Samples, breaks: IntArray) -> float:
+    """Return the slope in s of parallel least-squares lines through the stretches between breaks.
+
+    The mean of the intervals would depend on the rounding of the first and the last stamp alone.
+    """
+    moment = size = 0.0
+    for start, stop in pairwise([0, *breaks.tolist(), time.size]):
+        first, n = float(time[start : start + 1][0]), stop - start
+        size += n * (n**2 - 1) / 12
+        for at, stamps in blocks(time, start, stop):
+            index = np.arange(at, at + stamps.size) - (start + stop - 1) / 2
+            moment += float(index @ (stamps - first))
+    return moment / size if size else float(np.median(np.diff(time[:])))
+
+
+def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float]:
     """Find gaps and odd intervals by the median interval of a group and of its neighbours.
 
-    Return breaks, the intervals before them in s, their counts as a text, the mean regular interval
-    and four times the usual deviation from it in s.
+    Return breaks, the intervals before them in s, their counts as a text, and four times the usual
+    deviation of an interval from its group in s.
     """
     middles, spreads = [], []
     starts = range(0, time.size - 1, BLOCK)  # in whole groups but the last
@@ -174,7 +196,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     if median.min() <= 0:
         raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
     local = np.pad(median, 1, mode="edge")
-    total, n_gaps, n_missing = 0.0, 0, 0.0
+    n_gaps, n_missing = 0, 0.0
     breaks, lengths = [np.empty(0, dtype=np.int64)], [np.empty(0)]
     for at in starts:
         steps = np.diff(time[at : at + BLOCK + 1])
@@ -184,7 +206,6 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
         gap = odd & (steps > constants.GAP * near[1])
         n_gaps += int(gap.sum())
         n_missing += float(np.round(steps[gap] / near[1, gap] - 1).sum())
-        total += float(steps[~odd].sum())
         breaks.append(np.flatnonzero(odd) + at + 1)
         lengths.append(steps[odd])
     where: IntArray = np.concatenate(breaks)
@@ -195,10 +216,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     note = " and ".join(notes)
     if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
-    # The mean over all regular intervals averages the rounding of time stamps out.
-    n_regular = time.size - 1 - where.size
-    interval = total / n_regular if n_regular else float(np.median(median))
-    return where, np.concatenate(lengths), note, interval, 4 * float(np.median(spread))
+    return where, np.concatenate(lengths), note, 4 * float(np.median(spread))
 
 
 def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, FloatArray]:
@@ -235,6 +253,15 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
             spool.append(np.linspace(first, last, stop - start + 2)[1:-1])
         taken = following
     return spool.samples()
+
+
+def _off_line(time: Samples, stretch: tuple[int, int], interval: float) -> float:
+    """Return the range in s of the deviations of stamps from those of one interval."""
+    low, high = np.inf, -np.inf
+    for at, stamps in blocks(time, *stretch):
+        error = stamps - interval * np.arange(at, at + stamps.size)
+        low, high = min(low, float(error.min())), max(high, float(error.max()))
+    return high - low
 
 
 def _residual(
