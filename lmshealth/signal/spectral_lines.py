@@ -392,9 +392,10 @@ def find_lines_by_velocity(
 ) -> tuple[Line, ...]:
     """Find the lines at every velocity of a log, and name those that are proportional to it.
 
-    `part` is a motion phase; of the whole record the stationary segments are searched. Segments of one speed are searched together, those less than half as long as the longest are
-    omitted. A line that is no order of the description, but at one wavelength of several
-    velocities, is named ``order of … mm``. The band is in Hz; `false_alarm` is the probability that
+    `part` is a motion phase; of the whole record the stationary segments are searched. Segments of
+    one speed are searched together, those less than half as long as the longest are omitted. A line
+    that is no order of the description, but at one wavelength of several velocities, is named
+    ``order of … mm``. The band is in Hz; `false_alarm` is the probability that
     a channel without lines shows any, at all velocities together. The result is ascending in
     frequency, each line once per channel, at its strongest.
     """
