@@ -30,7 +30,6 @@ from lmshealth.io.formats.content import (
     choose,
     describe,
     not_numeric,
-    parse_moments,
 )
 from lmshealth.io.formats.dialect import (
     Dialect,
@@ -356,7 +355,7 @@ def _spooled(
             is_number = values.dtype.kind in "fiu"
             if not is_number and name not in times:
                 raise not_numeric(name, _first_text(values.tolist(), n_rows))
-            numbers = values.to_numpy() if is_number else times[name](parse_moments(values))
+            numbers = values.to_numpy() if is_number else times[name].parse(values)
             if n_used:
                 taken[name].append(np.full(n_blank, np.nan))
                 taken[name].append(numbers[:n_used])
