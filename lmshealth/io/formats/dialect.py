@@ -99,7 +99,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     """Find marks, names, units and the first row from the first lines of a text.
 
     `Unusable`: ``empty`` without names or rows, ``corrupt`` where row and names differ in number,
-    ``columns`` where the text can be read in two ways, ``metadata`` for a key with two values.
+    ``columns`` where the text can be read in two ways, ``metadata`` for a key of the
+    contract with two values.
     """
     layout = columns.csv
     skip = layout.skip_rows or 0
