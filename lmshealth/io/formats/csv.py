@@ -12,8 +12,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -262,13 +261,6 @@ def parse_text(stream: Any, columns: ColumnMap) -> Content:
     return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
-@cache
-def _is_old_pandas() -> bool:
-    """Return whether pandas is older than 3.1."""
-    major, minor = version("pandas").split(".")[:2]
-    return (int(major), int(minor)) < (3, 1)
-
-
 class _File:
     """A file for pandas, which takes blocks of any size."""
 
@@ -304,10 +296,7 @@ def _numbers(
             # Numbers are ASCII in every encoding that comes here.
             encoding_errors="replace",
             header=None,
-            # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas
-            # pull request 66944), which a spare column receives, and rounds the last digits.
-            names=list(range(n_fields + _is_old_pandas())),
-            float_precision="round_trip" if _is_old_pandas() else None,
+            names=list(range(n_fields)),
             index_col=False,
             # A block is small enough as a whole.
             low_memory=False,
@@ -317,7 +306,7 @@ def _numbers(
             **options,
         )
         with tables:
-            return _spooled(tables, places, times, n_fields)
+            return _spooled(tables, places, times)
 
     with _WARNINGS, warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
@@ -331,22 +320,18 @@ def _numbers(
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
             if found := _LONG_ROW.search(str(error)):
-                raise _too_long(found[1], found[2], n_fields) from error
+                detail = f"row {found[1]} has {found[2]} fields, the first line {n_fields}"
+                raise corrupt(detail) from error
             raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
 def _spooled(
-    tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst], n_fields: int
+    tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
     """Collect the columns of tables, block by block."""
     taken = {name: Spool() for name in places}
     n_rows = n_blank = 0
     for table in tables:
-        for extra in table.columns[n_fields:]:
-            is_long = table[extra].notna().to_numpy()
-            if is_long.any():
-                row = n_rows + int(is_long.argmax()) + 1
-                raise _too_long(row, f"{n_fields + 1} or more", n_fields)
         n_used = len(table)
         if n_used and table.iloc[-1].isna().all():
             n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
@@ -364,10 +349,6 @@ def _spooled(
     if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
-
-
-def _too_long(row: object, found: str, needed: int) -> Unusable:
-    return corrupt(f"row {row} has {found} fields, the first line {needed}")
 
 
 def _first_text(values: list[object], n_before: int) -> str:
