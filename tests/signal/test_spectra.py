@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -447,7 +448,9 @@ def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:
 
 
 @pytest.mark.parametrize("kind", ["displacement", "acceleration"])
-def test_a_segment_without_an_ordinate_is_omitted(kind: str) -> None:
+def test_a_segment_without_an_ordinate_is_omitted(
+    kind: Literal["displacement", "acceleration"],
+) -> None:
     """A log that ends some samples after a stop has the spectra of its other segments."""
     channels = [Channel("a", kind, np.random.default_rng(0).normal(size=4000))]
     for short in range(1, 12):

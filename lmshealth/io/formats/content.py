@@ -448,8 +448,8 @@ class SinceFirst:
             raise Unusable("time", f"{detail}; write them as YYYY-MM-DD")
         dotted = bool(words.str.match(r"\d{1,2}\.").any())
         text = words.str.replace(",", ".") if text.dtype == object else text
-        options = {"errors": "coerce", "utc": True, "format": "mixed"}
-        found = pd.to_datetime(text, dayfirst=dotted or bool(day_first), **options)
+        first = dotted or bool(day_first)
+        found = pd.to_datetime(text, errors="coerce", utc=True, dayfirst=first, format="mixed")
         return self(found.dt.tz_localize(None).to_numpy("datetime64[ns]"))
 
     def __call__(self, moments: np.ndarray) -> FloatArray:
