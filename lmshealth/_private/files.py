@@ -114,12 +114,26 @@ def _locked(part: Path, create: int = 0) -> Iterator[None]:
         os.close(guard)
 
 
+def free_name(stem: str, taken: set[str]) -> str:
+    """Return a name that is not taken, regardless of case, by a number where needed; take it."""
+    name, count = stem, 1
+    while name.casefold() in taken:
+        count += 1
+        name = f"{stem}-{count}"
+    taken.add(name.casefold())
+    return name
+
+
 def write_draws(target: Path, stages: Sequence[str], trees: Sequence[DataTree]) -> None:
     """Write posterior draws as NetCDF: in ArviZ's layout, of several machines in named groups."""
     from xarray import DataTree  # late: it takes a second to import
 
-    names = [stage.replace("/", "_") for stage in stages]
-    named = dict(zip(names, trees, strict=True))
+    # A group has no slash in its name; a machine that has none either keeps its own.
+    taken = {stage.casefold() for stage in stages if "/" not in stage}
+    named = {
+        free_name(stage.replace("/", "_"), taken) if "/" in stage else stage: tree
+        for stage, tree in zip(stages, trees, strict=True)
+    }
     tree = trees[0] if len(trees) == 1 else DataTree.from_dict(named)
     with _writing(target):
         tree.to_netcdf(target, engine="h5netcdf")

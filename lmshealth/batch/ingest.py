@@ -24,7 +24,7 @@ from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
 from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
-from lmshealth.io.refusal import visible
+from lmshealth.io.refusal import listed, visible
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import Language
 from lmshealth.stage.description import Stage
@@ -216,7 +216,6 @@ def _tasks(
 ) -> tuple[list[_Task], list[Refusal]]:
     """Hash every log; the same content twice is one log and its copy."""
     digests = _all_digests({path: _file_key(path, folder) for path in found}, resources)
-    tasks: list[_Task] = []
     refused = [
         *manifest.refused,
         *(
@@ -225,7 +224,7 @@ def _tasks(
             if isinstance(digest := digests[path], BadLog)
         ),
     ]
-    seen: dict[tuple[str, str], str] = {}
+    seen: dict[tuple[str, str], _Task] = {}
     # Of several copies the one in a manifest is analysed: only that one has its metadata.
     for path in sorted(found, key=lambda path: not manifest.names(path)):
         name, digest = name_of(path, folder), digests[path]
@@ -236,14 +235,25 @@ def _tasks(
         try:
             overrides = manifest.overrides(path)
             if content in seen:
-                detail = f"same content as {seen[content]}, which is analysed for both"
-                raise BadLog(name, "duplicate", detail)
+                raise BadLog(name, "duplicate", _copy_of(seen[content], overrides))
         except BadLog as error:
             refused.append(Refusal(name, error.reason, error.detail))
             continue
-        seen[content] = name
-        tasks.append(_Task(path, name, overrides, digest, columns))
-    return tasks, refused
+        seen[content] = _Task(path, name, overrides, digest, columns)
+    return [*seen.values()], refused
+
+
+def _copy_of(task: _Task, overrides: Mapping[str, str]) -> str:
+    """Describe a copy of a log, and what its row of the manifest states otherwise."""
+    other = {
+        key: f"{key} {visible(value)} (there {visible(task.overrides[key])})"
+        for key, value in overrides.items()
+        if task.overrides.get(key, value) != value
+    }
+    if not other:
+        return f"same content as {task.name}, which is analysed for both"
+    found = f"same content as {task.name}, but manifest.csv states {listed(other.values())}"
+    return f"{found}; only {task.name} is analysed: correct the row, or delete one of the files"
 
 
 def _file_key(path: Path, folder: Path) -> tuple[str, bool]:

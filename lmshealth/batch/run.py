@@ -513,7 +513,8 @@ def watch(
 
     Files whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
     a later run. The folder is polled, because network shares report no changes. There is a run on
-    every new day (UTC) too: services fall due, and machines fall silent, without a new log.
+    every new day (UTC) too: services fall due, and machines fall silent, without a new log. A run
+    that fails is repeated at the next poll, unless no log was usable.
     """
     before, done, day = _files(folder, out), _Files(), None
     while True:
@@ -524,12 +525,16 @@ def watch(
         new = settled.items() - done.items() or done.keys() - now.keys()
         # A folder without files may be a share that is not mounted now: tables stay as they are.
         if settled and (new or today != day):
-            done, day = settled, today
             growing = frozenset(now.keys() - settled.keys())
+            result: RunResult | LmshealthError
             try:
-                yield run(folder, stages, out, replace(settings, growing=growing))
+                result = run(folder, stages, out, replace(settings, growing=growing))
             except LmshealthError as error:
-                yield error
+                result = error
+            # A store that is away may be back at the next poll; without new logs none is usable.
+            if isinstance(result, RunResult | NothingUsable):
+                done, day = settled, today
+            yield result
 
 
 def _files(folder: Path, out: Path) -> _Files:

@@ -450,8 +450,16 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
     stage, band, period = given["stage"], given["band"], given["period"]
     source, output = given["source"], given["output"]
     _check_outputs(given)
+    if given["impact"] and period is not None:
+        raise click.UsageError("--period has no effect on blows of a hammer (--impact).")
 
     def analyse(log: Log | MeasuredResponse) -> tuple[Log | MeasuredResponse, FrfReading]:
+        is_measured = isinstance(log, MeasuredResponse)
+        unused = ("period", "impact") if is_measured else ("averages", "exponential")
+        if any(given[option] is not None for option in unused):
+            what = "a measured response" if is_measured else "a log"
+            names = " and ".join(f"--{option}" for option in unused)
+            raise click.UsageError(f"{log.name} is {what}, on which {names} have no effect.")
         if isinstance(log, MeasuredResponse):
             averages, window = given["averages"], given["exponential"]
             return log, read_measured(log, band=band, averages=averages, window=window)

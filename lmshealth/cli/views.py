@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from datetime import date
 from itertools import combinations, permutations, zip_longest
@@ -43,6 +44,7 @@ from lmshealth.report.text import (
     travel_left,
     whole_km,
 )
+from lmshealth.signal.segments import distinct_velocities
 from lmshealth.tracking.track import Track
 
 if TYPE_CHECKING:
@@ -219,9 +221,11 @@ def print_magnitudes(rows: Sequence[Row], lines: Sequence[Row], refused: Sequenc
 def _print_channel(title: str, rows: Sequence[Row]) -> None:
     """Print a table of bands by velocities: magnitudes, or RMS of health and watched bands."""
     at: dict[tuple[str, float], list[Row]] = {}
+    known = [row["velocity_mm_s"] for row in rows if not math.isnan(row["velocity_mm_s"])]
+    distinct = [-1.0, *distinct_velocities(known)]
     for row in rows:
-        speed = row["velocity_mm_s"]
-        speed = -1.0 if math.isnan(speed) else float(f"{speed:.2g}")
+        exact = row["velocity_mm_s"]
+        speed = distinct[0 if math.isnan(exact) else bisect_right(distinct, exact) - 1]
         at.setdefault((row["band"], speed), []).append(row)
     speeds = sorted({speed for _, speed in at})
     left_out = len(speeds) - constants.TERMINAL_VELOCITIES
@@ -240,7 +244,9 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
             is_line = key == "magnitude_mm_s2" and any(row["line"] for row in own)
             mean = sum(row[key] for row in own) / max(len(own), 1)
             level = number(mean, 3 if mean >= 0.1 else 2) if own else ""
-            cell["unknown" if speed < 0 else f"{speed:g}"] = level + ("~" if is_line else " ")
+            cell["unknown" if speed < 0 else f"{float(f'{speed:.3g}'):g}"] = level + (
+                "~" if is_line else " "
+            )
         cell["grows"] = "–"
         if row["grows"] is not None:
             star = "*" if row["grows"] else " "

@@ -9,6 +9,7 @@ import io
 import os
 import re
 import stat
+import unicodedata
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -137,9 +138,6 @@ def to_numbers(path: Path, table: "pd.DataFrame", names: Iterable[str]) -> None:
         text = table[name]
         given = text.str.strip() != ""
         numbers = pd.to_numeric(text, errors="coerce")
-        if numbers.dtype == float:  # before 3.1 pandas rounds their last digits
-            known = np.isfinite(numbers)
-            numbers[known] = text[known].astype(float)
         table[name] = numbers
         unknown, odd = given & ~np.isfinite(numbers), given & ~numbers.between(*low_high(name))
         for wrong, needed in ((unknown, "a finite number"), (odd, possible(name))):
@@ -347,7 +345,10 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
             detail = trouble or f"file is {file!r}, needed the path of a log"
             yield Refusal(name_of(path, root), "bad-row", f"{where}: {detail}")
             continue
-        log = _absolute(path.parent / file)
+        # Accents are one letter or two, as the system that named the file composes them.
+        spelt = [file, *(unicodedata.normalize(form, file) for form in ("NFC", "NFD"))]
+        logs = [_absolute(path.parent / name) for name in spelt]
+        log = next(filter(os.path.isfile, logs), logs[0])
         outside = not log.is_relative_to(_absolute(root))
         if outside or (not follow_links and escapes(log, root)):
             yield Refusal(shown(file), "escapes", f"{place} names a file out of the folder")

@@ -4,7 +4,6 @@ Samples are never sorted; `channel_checks` fills short gaps only (README.md, "Ti
 """
 
 from collections.abc import Callable, Sequence
-from contextlib import suppress
 from itertools import pairwise
 from typing import NamedTuple, Self
 
@@ -35,7 +34,7 @@ _GROUP, _MOST_DIGITS, _MOST_KNOTS = 128, 10, 1 << 14
 # exp(-x) with which the highest line of white jitter exceeds its expectation.
 _ROUNDING, _CHANCE = 1.2, 7.0
 # Resampled at once, and the kernel: zeros to either side, and its window, which damps by 100 dB.
-_OUTPUT, _ZEROS, _WINDOW = 1 << 12, 32, 10.0
+_OUTPUT, ZEROS, _WINDOW = 1 << 12, 32, 10.0
 
 
 class TimeAxis(NamedTuple):
@@ -91,22 +90,30 @@ def time_axis(time: Samples | None, rate: float | None) -> TimeAxis:
     step = resolution(time)
     span = float(time[time.size - 1 :][0] - time[:1][0])
     coarse = 0 < 0.2 * span < (time.size - 1) * step
-    try:
-        if n_repeated:
-            found = f"time_s repeats {n_repeated} times in {time.size} samples"
-            raise Unusable("time", f"{found}; needed increasing time stamps")
-        return _axis(time, rate, step, 0.0)
-    except Unusable:
-        # Rounding to a step near the interval makes them unlike: the clock decides.
-        if coarse:
-            with suppress(Unusable):
-                return _axis(time, rate, step, step)
-        raise
+    if n_repeated and not coarse:
+        found = f"time_s repeats {n_repeated} times in {time.size} samples"
+        raise Unusable("time", f"{found}; needed increasing time stamps")
+    # Rounding to a step near the interval makes intervals unlike: the clock decides.
+    attempts = (0.0, step) if coarse else (0.0,)
+    refused: dict[float, Unusable] = {}
+    for slack in reversed(attempts) if n_repeated else attempts:
+        try:
+            return _axis(time, rate, step, slack)
+        except Unusable as error:
+            refused[slack] = error
+    raise refused[attempts[-1]]
 
 
 def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeAxis:
     """Find the axis of stamps, rounded to a step in s; ``slack`` in s widens tolerances."""
-    breaks, lengths, note, interval, scatter = _interruptions(time, slack)
+    breaks, lengths, note, scatter = _interruptions(time, slack)
+    scatter = max(scatter, slack)
+    interval, rounding = _mean_interval(time, breaks), _ROUNDING * max(step, slack)
+    # Stamps cut to whole steps lie on their line, which long runs of either step turn a little.
+    whole = slack * round(interval / slack) if slack else 0.0
+    is_whole = abs(whole / interval - 1) < constants.AGREEMENT and not breaks.size
+    if is_whole and _off_line(time, (0, time.size), whole) <= rounding:
+        interval = whole
     if rate is not None and abs(interval * rate - 1) > constants.AGREEMENT:
         found = f"time_s gives {1 / interval:.8g} Hz, sample_rate_hz is {rate:.8g}"
         raise Unusable("time", f"{found}; needed agreement within {constants.AGREEMENT:g}")
@@ -117,7 +124,7 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
         clock, slope = _clock(time, start, stop, least)
         allowed = constants.AGREEMENT + scatter / (interval * min(least, (stop - start) / 2))
         # In a stretch this short a rate cannot be measured.
-        if stop - start >= _GROUP:
+        if stop - start >= _GROUP and _off_line(time, (start, stop), interval) > rounding:
             varies |= bool((np.abs(slope / interval - 1) > allowed).any())
             slopes += slope.tolist()
             lost.append(_residual(time, (start, stop), clock, interval, max(step, slack)))
@@ -154,11 +161,26 @@ def _axis(time: Samples, rate: float | None, step: float, slack: float) -> TimeA
     return TimeAxis(own, breaks, note, gone, (), np.where(certain & few, dropped, 0))
 
 
-def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float, float]:
+def _mean_interval(time: Samples, breaks: IntArray) -> float:
+    """Return the slope in s of parallel least-squares lines through the stretches between breaks.
+
+    The mean of the intervals would depend on the rounding of the first and the last stamp alone.
+    """
+    moment = size = 0.0
+    for start, stop in pairwise([0, *breaks.tolist(), time.size]):
+        first, n = float(time[start : start + 1][0]), stop - start
+        size += n * (n**2 - 1) / 12
+        for at, stamps in blocks(time, start, stop):
+            index = np.arange(at, at + stamps.size) - (start + stop - 1) / 2
+            moment += float(index @ (stamps - first))
+    return moment / size if size else float(np.median(np.diff(time[:])))
+
+
+def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float]:
     """Find gaps and odd intervals by the median interval of a group and of its neighbours.
 
-    Return breaks, the intervals before them in s, their counts as a text, the mean regular interval
-    and four times the usual deviation from it in s.
+    Return breaks, the intervals before them in s, their counts as a text, and four times the usual
+    deviation of an interval from its group in s.
     """
     middles, spreads = [], []
     starts = range(0, time.size - 1, BLOCK)  # in whole groups but the last
@@ -174,7 +196,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     if median.min() <= 0:
         raise Unusable("time", f"time_s repeats over {_GROUP} samples; needed finer time stamps")
     local = np.pad(median, 1, mode="edge")
-    total, n_gaps, n_missing = 0.0, 0, 0.0
+    n_gaps, n_missing = 0, 0.0
     breaks, lengths = [np.empty(0, dtype=np.int64)], [np.empty(0)]
     for at in starts:
         steps = np.diff(time[at : at + BLOCK + 1])
@@ -184,7 +206,6 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
         gap = odd & (steps > constants.GAP * near[1])
         n_gaps += int(gap.sum())
         n_missing += float(np.round(steps[gap] / near[1, gap] - 1).sum())
-        total += float(steps[~odd].sum())
         breaks.append(np.flatnonzero(odd) + at + 1)
         lengths.append(steps[odd])
     where: IntArray = np.concatenate(breaks)
@@ -195,10 +216,7 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
     note = " and ".join(notes)
     if too_many(where.size, time.size):
         raise Unusable("time", f"{note}; needed uniform samples, export them at the sampling clock")
-    # The mean over all regular intervals averages the rounding of time stamps out.
-    n_regular = time.size - 1 - where.size
-    interval = total / n_regular if n_regular else float(np.median(median))
-    return where, np.concatenate(lengths), note, interval, 4 * float(np.median(spread))
+    return where, np.concatenate(lengths), note, 4 * float(np.median(spread))
 
 
 def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, FloatArray]:
@@ -237,6 +255,15 @@ def with_dropped(values: Samples, added: IntArray, *, linear: bool) -> Samples:
     return spool.samples()
 
 
+def _off_line(time: Samples, stretch: tuple[int, int], interval: float) -> float:
+    """Return the range in s of the deviations of stamps from those of one interval."""
+    low, high = np.inf, -np.inf
+    for at, stamps in blocks(time, *stretch):
+        error = stamps - interval * np.arange(at, at + stamps.size)
+        low, high = min(low, float(error.min())), max(high, float(error.max()))
+    return high - low
+
+
 def _residual(
     time: Samples, stretch: tuple[int, int], clock: Clock, interval: float, step: float
 ) -> IntArray:
@@ -270,7 +297,7 @@ def resampled(
         clock = axis.clocks[int(np.searchsorted(axis.breaks, start, side="right"))]
         knots = np.linspace(start, stop - 1, 2 + (stop - start) // _GROUP)
         at = clock(knots)
-        half = int(np.ceil(_ZEROS * max(1.0, float((np.diff(knots) / np.diff(at)).max() / rate))))
+        half = int(np.ceil(ZEROS * max(1.0, float((np.diff(knots) / np.diff(at)).max() / rate))))
         begin, end = clock(np.array([start + half, stop - 1 - half]))
         n = int((end - begin) * rate) + 1 if stop - start > 2 * half else 0
         if n < constants.SHORTEST_PIECE:
@@ -281,7 +308,7 @@ def resampled(
             place = np.interp(wanted, at, knots)
             for _ in range(3):
                 place -= (clock(place) - wanted) / clock(place, 1)
-            weights, index = _kernel(place, clock(place, 1) * rate, half)
+            weights, index = sinc_weights(place, clock(place, 1) * rate, half)
             low = int(index.min())
             for (samples, is_signal), spool in zip(columns, spools, strict=True):
                 part = samples[low : int(index.max()) + 1]
@@ -292,11 +319,15 @@ def resampled(
     return [spool.samples() for spool in spools], tuple(pieces)
 
 
-def _kernel(place: FloatArray, density: FloatArray, half: int) -> tuple[FloatArray, IntArray]:
-    """Return weights and indices of the samples around fractional places, ``(n, 2 half)``."""
+def sinc_weights(place: FloatArray, density: FloatArray, half: int) -> tuple[FloatArray, IntArray]:
+    """Return weights and indices of the samples around fractional places, ``(n, 2 half)``.
+
+    They are a windowed sinc of `ZEROS` zeros to either side; ``density``, ``(n,)``, is the interval
+    between samples over that of the zeros. Up to 0.45 of the rate of the zeros its error is 1e-4.
+    """
     index = np.floor(place).astype(np.int64)[:, None] + np.arange(1 - half, half + 1)
     x = (index - place[:, None]) * density[:, None]
-    inside = np.sqrt(np.clip(1 - (x / _ZEROS) ** 2, 0, None))
+    inside = np.sqrt(np.clip(1 - (x / ZEROS) ** 2, 0, None))
     grid = np.linspace(0, 1, 1 << 14)
     weights = np.sinc(x) * np.interp(inside, grid, np.i0(_WINDOW * grid)) * (inside > 0)
     return weights / weights.sum(axis=1, keepdims=True), index

@@ -50,6 +50,6 @@ def survey(
     return Survey(
         log.name,
         magnitudes,
-        find_lines_by_velocity(log, accelerometers, stage, widest),
+        find_lines_by_velocity(log, accelerometers, stage, widest, part=part),
         log.refused,
     )

@@ -105,10 +105,11 @@ def _expect_connected(setups: Sequence[LogEstimates]) -> None:
     shared = np.array([[bool(one & other) for other in channels] for one in channels])
     n_groups = connected_components(shared, directed=False)[0] if setups else 0
     if len(setups) < 2 or n_groups > 1:
-        parts = "; ".join(f"{one.log}: {', '.join(one.modes.shape_channels)}" for one in setups)
+        named = [(one.log, ", ".join(one.modes.shape_channels)) for one in setups]
+        parts = "; ".join(f"{log}: {names or 'no mode shape'}" for log, names in named)
         raise NotEnoughData(
             "set-ups with mode shapes are merged by the channels that they share; found are "
-            f"{parts}: needed are two or more, each with a channel of another one; keep a sensor "
+            f"{parts}; needed are two or more, each with a channel of another one; keep a sensor "
             "at its place and its name in all set-ups"
         )
 

@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import numpy as np
 from scipy.special import chdtrc
 
-from lmshealth._private.files import write_text
+from lmshealth._private.files import free_name, write_text
 from lmshealth.io.log import Refusal
 from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.fleet_prior import FleetPrior, LawPrior, Pace
@@ -414,12 +414,7 @@ def file_names(identities: Iterable[str]) -> dict[str, str]:
         stem = re.sub(r"[^\w.-]+", "-", identity).strip("-._")[:_NAME_LENGTH] or "stage"
         if _DEVICES.fullmatch(stem.split(".")[0]):
             stem = f"stage-{stem}"
-        name, count = stem, 1
-        while name.casefold() in taken:
-            count += 1
-            name = f"{stem}-{count}"
-        taken.add(name.casefold())
-        names[identity] = f"{name}.html"
+        names[identity] = f"{free_name(stem, taken)}.html"
     return names
 
 

@@ -1,8 +1,9 @@
 """Constants that decide which samples, lines and levels are used and published."""
 
 # --- Segments -----------------------------------------------------------------------------------
-# Change of the set velocity over 1 ms, as a share of its maximum, up to which it is constant.
-VELOCITY_TOLERANCE = 1e-3
+# Change of the set velocity over this time in s, but at least so many samples, as a share of its
+# maximum, up to which it is constant.
+VELOCITY_LAG, LEAST_VELOCITY_LAG, VELOCITY_TOLERANCE = 1e-3, 20, 1e-3
 # Time in s after a move in which the stage settles: some periods of its slowest modes and loop.
 SETTLING_TIME = 0.5
 # Relative difference up to which two set velocities are one: encoders measure them to a percent.

@@ -18,6 +18,7 @@ from lmshealth.signal import constants
 from lmshealth.signal.segments import (
     Part,
     Segment,
+    distinct_velocities,
     find_segments,
     nominal_velocity,
     select_channels,
@@ -390,8 +391,7 @@ def _growth(stage: str, channel: str, band: str, points: list[tuple[float, float
     from scipy.stats import linregress  # late: half a second
 
     x, y = np.array(points).reshape(-1, 2).T
-    # Set velocities that differ by a percent are equal.
-    n_velocities = np.unique(np.round(x / 0.02)).size
+    n_velocities = len(distinct_velocities(np.exp(x)))
     slope = std = p_value = float("nan")
     if n_velocities > 1:
         line = linregress(x, y, alternative="greater")

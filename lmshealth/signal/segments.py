@@ -1,6 +1,6 @@
 """Segments of a log: gap-free parts of one motion phase (README.md, "Segments")."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Literal, get_args
@@ -55,8 +55,9 @@ def find_phases(log: Log) -> tuple[Segment, ...]:
     phases: list[Segment] = []
     for start, stop in log.pieces:
         found: list[Segment] = []
-        # Differences over some 1 ms: between neighbouring samples a slow ramp appears constant.
-        lag = max(1, min(20, (stop - start) // 4))
+        # Between neighbouring samples a slow ramp appears constant.
+        lag = max(constants.LEAST_VELOCITY_LAG, round(constants.VELOCITY_LAG * log.sample_rate))
+        lag = max(1, min(lag, (stop - start) // 4))
         # A piece that begins at rest is idle.
         last_move = start - settling - 1
         for at, block in blocks(velocity, start, stop):
@@ -208,3 +209,12 @@ def nominal_velocity(log: Log) -> float:
     if speed.max() > (1 + constants.SAME_VELOCITY) * speed.min():
         return float("nan")
     return float(np.median(speed))
+
+
+def distinct_velocities(speeds: Iterable[float]) -> tuple[float, ...]:
+    """Return the lowest of the speeds that are equal within `SAME_VELOCITY`, ascending."""
+    found: list[float] = []
+    for speed in sorted(speeds):
+        if not found or speed > (1 + constants.SAME_VELOCITY) * found[-1]:
+            found.append(speed)
+    return tuple(found)

@@ -136,7 +136,7 @@ def _peak_ordinate(rest: ComplexArray, at: int) -> float:
     """
     below, own, above = rest[[max(0, at - 1), at, min(at + 1, len(rest) - 1)]]
     channel = int(np.argmax(np.abs(own)))
-    ratio = float(((above - below) / own)[channel].real)
+    ratio = float(((above - below)[channel] / own[channel]).real)
     return at + ratio / (1 + float(np.hypot(1, ratio)))
 
 
@@ -175,7 +175,8 @@ def _fit(
         there = alone & (apart[0] > inner) & (apart[0] <= outer)
         if not there.any():
             return np.full(rest.shape[1], np.nan)
-        return np.asarray(np.median(np.abs(after[there]) ** 2, axis=0) / np.log(2))
+        # A channel may be without a signal in this segment.
+        return np.asarray(np.median(np.abs(after[there]) ** 2, axis=0) / np.log(2)).clip(1e-300)
 
     bases = [_basis(slice(0, len(rest)), place, choice[-1]) for place in places]
 
@@ -408,8 +409,10 @@ def cross_spectra(
 
     Channels are displacements or accelerations; sample rate, top and ceiling are in Hz, as in
     `transform_segment`. Where a segment does not resolve possible resonances no sinusoid is
-    removed.
+    removed. Segments that have no ordinate, as of a log that ends right after a stop, are omitted.
     """
+    lag = _lag(sample_rate, top) if any(c.kind == "displacement" for c in channels) else 0
+    segments = [s for s in segments if s.stop - s.start > 2 * lag + 2]
     options: dict[str, Any] = {"ceiling": ceiling, "resonances": resonances}
     transform = partial(transform_segment, channels, sample_rate=sample_rate, top=top, **options)
     return tuple(_mean(map(transform, group)) for group in _exchangeable(segments))
@@ -519,13 +522,18 @@ def as_acceleration(
     x = channel.values[segment.start : segment.stop]
     if channel.kind != "displacement":
         return x, 0
-    lag = max(1, int(sample_rate / (_LAG_PERIODS * top)))
+    lag = _lag(sample_rate, top)
     # In place: each intermediate array would be as large as the segment.
     difference: FloatArray = x[2 * lag :] + x[: -2 * lag]
     difference -= x[lag:-lag]
     difference -= x[lag:-lag]
     difference *= sample_rate**2
     return difference, lag
+
+
+def _lag(sample_rate: float, top: float) -> int:
+    """Return the lag of second differences in samples that the top of a band in Hz permits."""
+    return max(1, int(sample_rate / (_LAG_PERIODS * top)))
 
 
 def lag_gain(frequency: FloatArray, lag: int, sample_rate: float) -> FloatArray:

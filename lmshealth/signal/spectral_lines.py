@@ -14,7 +14,7 @@ from scipy.special import fdtri, gammainccinv
 from lmshealth._private.arrays import ComplexArray, FloatArray
 from lmshealth.io.log import Channel, Log
 from lmshealth.signal import constants
-from lmshealth.signal.segments import Segment, find_segments
+from lmshealth.signal.segments import Part, Segment, find_segments, select_segments
 from lmshealth.signal.spectra import as_acceleration, lag_gain
 from lmshealth.stage.description import Stage
 
@@ -387,17 +387,20 @@ def find_lines_by_velocity(
     stage: Stage | None,
     band: tuple[float, float],
     false_alarm: float = constants.LINE_TEST_FALSE_ALARM,
+    *,
+    part: Part = "record",
 ) -> tuple[Line, ...]:
     """Find the lines at every velocity of a log, and name those that are proportional to it.
 
-    Segments of one speed are searched together, those less than half as long as the longest are
-    omitted. A line that is no order of the description, but at one wavelength of several
-    velocities, is named ``order of … mm``. The band is in Hz; `false_alarm` is the probability that
+    `part` is a motion phase; of the whole record the stationary segments are searched. Segments of
+    one speed are searched together, those less than half as long as the longest are omitted. A line
+    that is no order of the description, but at one wavelength of several velocities, is named
+    ``order of … mm``. The band is in Hz; `false_alarm` is the probability that
     a channel without lines shows any, at all velocities together. The result is ascending in
     frequency, each line once per channel, at its strongest.
     """
-    segments = find_segments(log, 0.0)
-    groups = _by_velocity(segments)
+    segments = find_segments(log, 0.0) if part == "record" else select_segments(log, part)
+    groups = [list(segments)] if part in ("settling", "idle") else _by_velocity(segments)
     lines: list[Line] = []
     for channel in channels:
         detections = []

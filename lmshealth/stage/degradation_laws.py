@@ -74,16 +74,13 @@ def _expect_mass(name: str, prior: Prior, low: float, high: float) -> None:
         raise ValueError(f"{name} must lie between {low:g} and {high:g}, got {prior}")
 
 
-def _draw(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
-    return np.asarray(prior.quantile(rng.uniform(1e-9, 1 - 1e-9, n)))
-
-
-def _draw_length(prior: Prior, rng: np.random.Generator, n: int) -> FloatArray:
-    """Draw lengths in m from a prior in km, truncated at 0."""
-    km = _draw(prior, rng, n)
-    while (negative := km <= 0).any():
-        km[negative] = _draw(prior, rng, int(negative.sum()))
-    return _KM * km
+def _draw(
+    prior: Prior, rng: np.random.Generator, n: int, low: float = -np.inf, high: float = np.inf
+) -> FloatArray:
+    """Draw from a prior, truncated at low and high as `log_prior` truncates it."""
+    below, upto = prior.probability(np.array([low, high]))
+    level = below + (upto - below) * rng.uniform(1e-9, 1 - 1e-9, n)
+    return np.asarray(prior.quantile(level))
 
 
 class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
@@ -116,7 +113,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
-        life = _draw_length(self.life_km, rng, n)
+        life = _KM * _draw(self.life_km, rng, n, 0.0)
         share = rng.uniform(1e-6, 1 - 1e-6, n)
         exponent = self.exponent.quantile(share)
         return np.column_stack([exponent * np.log(now / life), np.log(share / (1 - share))])
@@ -170,8 +167,8 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
-        life = _draw_length(self.life_km, rng, n)
-        floor = np.clip(_draw(self.floor, rng, n), 1e-6, 1 - 1e-6)
+        life = _KM * _draw(self.life_km, rng, n, 0.0)
+        floor = _draw(self.floor, rng, n, 0.0, 1.0)
         return np.column_stack([np.log((1 - floor) * -np.expm1(-now / life)), np.log(life)])
 
     def health(self, theta: FloatArray, travel: FloatArray) -> FloatArray:

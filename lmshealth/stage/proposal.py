@@ -108,7 +108,7 @@ class _Column:
     @cached_property
     def steps(self) -> tuple[float, float, float]:
         """Least, mean and largest difference of consecutive samples."""
-        x = np.diff(self.first)
+        x = np.diff(np.where(np.isfinite(self.first), self.first, np.nan))
         return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
 
     @property
@@ -351,7 +351,7 @@ def _durations(content: Content) -> list[float]:
     """Return the durations in s that the metadata state."""
     found = []
     for key, text in content.metadata.items():
-        number = re.match(r"\s*([\d.]+(?:[eE][+-]?\d+)?)\s*([a-zµμ]*)", text)
+        number = re.match(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.:])\s*([a-zµμ]*)", text)
         if _DURATION.search(key) and number:
             unit = unit_key(number[2], "time") or _time_unit(key) or "s"
             scale = _LONG_UNITS.get(number[2]) or SI_TIMES[unit]

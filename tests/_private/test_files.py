@@ -8,8 +8,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import xarray as xr
 
-from lmshealth._private.files import remove_abandoned, write_bytes, write_text
+from lmshealth._private.files import remove_abandoned, write_bytes, write_draws, write_text
 from lmshealth.errors import BadTable
 
 
@@ -100,3 +101,16 @@ def test_only_incomplete_files_of_killed_writers_are_removed(tmp_path: Path) -> 
         writer.kill()
     remove_abandoned(tmp_path)
     assert sorted(tmp_path.iterdir()) == sorted(others)
+
+
+def test_machines_whose_groups_would_have_one_name_keep_their_draws(tmp_path: Path) -> None:
+    """A slash is none of a group's name: names that become equal are numbered."""
+    machines = ["A/1", "A_1", "A/2", "a-2", "A_2"]
+    trees = [
+        xr.DataTree.from_dict({"posterior": xr.Dataset({"x": float(k)})})
+        for k in range(len(machines))
+    ]
+    write_draws(tmp_path / "draws.nc", machines, trees)
+    with xr.open_datatree(tmp_path / "draws.nc", engine="h5netcdf") as found:
+        values = {name: float(found[f"{name}/posterior"]["x"]) for name in found.children}
+    assert values == {"A_1-2": 0, "A_1": 1, "A_2-2": 2, "a-2": 3, "A_2": 4}

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _identified, _Outcome, _Task, identify_log
+from lmshealth.batch.ingest import _copy_of, _identified, _Outcome, _Task, identify_log
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.io.log import Refusal
@@ -84,3 +84,12 @@ def test_a_log_is_refused_at_the_end_of_its_time(tmp_path: Path) -> None:
     assert "--seconds-per-log" in refusal.detail
     assert not short.lasting
     assert isinstance(identify_log(task, (stage,), {}, 60.0).outcome, LogEstimates)
+
+
+def test_a_copy_that_its_row_contradicts_names_the_contradiction() -> None:
+    """The same samples are of one machine; without a contradiction they count for both names."""
+    task = _Task(Path("a.csv"), "a.csv", {"stage": "A", "travel_km": "1"}, "0" * 64, None)
+    assert "analysed for both" in _copy_of(task, {"stage": "A"})
+    text = _copy_of(task, {"stage": "B", "travel_km": "1"})
+    assert "stage B (there A); only a.csv is analysed" in text
+    assert "travel_km" not in text

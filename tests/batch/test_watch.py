@@ -14,9 +14,10 @@ from typing import Any
 import pytest
 
 from lmshealth.batch import run as watching
+from lmshealth.batch.database import StoreError
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, watch
-from lmshealth.errors import NothingUsable
+from lmshealth.errors import LmshealthError, NothingUsable
 from studies.harness.servers import wait_until
 from tests.signals import write_archive_stage, write_log
 
@@ -126,6 +127,27 @@ def test_tables_stay_while_a_share_is_gone_and_a_new_day_is_a_reason(
     log.write_text("x")
     polls = [nothing, log.unlink, nothing, next_day, nothing, lambda: log.write_text("x"), nothing]
     assert runs([*polls, next_day, nothing]) == [(1, set()), (7, set()), (8, set())]
+
+
+def test_a_run_that_failed_is_repeated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A store that cannot be reached costs no log its analysis; then there is no further run."""
+    logs, n_runs, polls = tmp_path / "logs", 0, iter(range(6))
+    logs.mkdir()
+    (logs / "one.csv").write_text("x")
+
+    def run(*_: object) -> RunResult:
+        nonlocal n_runs
+        n_runs += 1
+        if n_runs < 3:
+            raise StoreError("could not connect to server")
+        return RunResult(tmp_path / "index.html", (), {})
+
+    monkeypatch.setattr(time, "sleep", lambda _: next(polls))
+    monkeypatch.setattr(watching, "run", run)
+    results: list[RunResult | LmshealthError] = []
+    with pytest.raises(RuntimeError):
+        results.extend(watch(logs, [], tmp_path / "out", Settings(), interval=1.0))
+    assert [type(result) for result in results] == [StoreError, StoreError, RunResult]
 
 
 @pytest.fixture

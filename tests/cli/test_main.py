@@ -553,6 +553,21 @@ def test_frf_as_csv_lists_modes_and_as_a_table_both(bench: Path) -> None:
     assert max(len(line) for line in shown.splitlines()) <= 80
 
 
+def test_frf_refuses_options_that_have_no_effect(bench: Path, tmp_path: Path) -> None:
+    """Averages and window are of measured responses, period and blows of logs."""
+    f = np.arange(20.0, 120.0, 0.5)
+    table = np.column_stack([f, np.ones(f.size), np.ones(f.size)])
+    head = "frequency_hz,real,imag"
+    np.savetxt(tmp_path / "a.csv", table, delimiter=",", header=head, comments="")
+    of_log: list[list[object]] = [["--averages", 5], ["--exponential", 0.1]]
+    for option in (*of_log, ["--period", 4, "--impact"]):
+        result = frf(bench, *option)
+        assert result.exit_code == 2 and "no effect" in result.stderr
+    for others in ("--period=1", "--impact", "--no-impact"):
+        result = call("frf", tmp_path / "a.csv", others)
+        assert result.exit_code == 2 and "a measured response" in result.stderr
+
+
 def test_frf_is_drawn(bench: Path, tmp_path: Path) -> None:
     """The page shows gain, phase and coherence, and lists the modes."""
     assert frf(bench, "--plot", tmp_path / "f.html").exit_code == 0

@@ -84,6 +84,15 @@ def test_magnitudes_fit_eighty_columns(capsys: pytest.CaptureFixture[str]) -> No
     assert line.count("777") == 7
 
 
+def test_velocities_of_more_than_a_percent_are_apart(capsys: pytest.CaptureFixture[str]) -> None:
+    """100 and 104 mm/s have columns of their own, 200 and 201 one of their mean level."""
+    rows = [magnitude("100 Hz", v, magnitude_mm_s2=v / 10) for v in (100.0, 104.0, 200.0, 201.0)]
+    print_magnitudes(rows, [], [])
+    head, _, row = capsys.readouterr().out.splitlines()[2:5]
+    assert head.split()[1:4] == ["100", "104", "200"]
+    assert row.split()[2:5] == ["10", "10.4", "20.1"]
+
+
 def test_omitted_velocities_are_counted(capsys: pytest.CaptureFixture[str]) -> None:
     """Of twelve velocities seven are shown, the slowest and the fastest among them."""
     print_magnitudes([magnitude("100 Hz", float(v)) for v in range(1, 13)], [], [])

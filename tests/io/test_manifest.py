@@ -1,6 +1,7 @@
 """Folders of logs and their manifests."""
 
 import os
+from unicodedata import normalize
 
 import pytest
 
@@ -74,6 +75,15 @@ def test_a_misspelt_column_is_noticed(make, tmp_path):
         "column temperatur_c is not read, unlike temperature_c; rename it if that is meant",
     ]
     assert manifest.overrides(tmp_path / "log.csv") == {"stage": "A", "payload_kg": "3"}
+
+
+@pytest.mark.parametrize(("of_file", "of_row"), [("NFC", "NFD"), ("NFD", "NFC")])
+def test_accents_are_composed_or_not(make, tmp_path, of_file, of_row):
+    """A name is the same with its accents as letters of their own, as macOS writes them."""
+    path = make(normalize(of_file, "größe.csv"))
+    (tmp_path / "manifest.csv").write_text(HEADER + normalize(of_row, "größe.csv") + ",one,1,\n")
+    manifest = read_manifest(tmp_path)
+    assert manifest.refused == () and manifest.overrides(path)["stage"] == "one"
 
 
 def test_no_manifest(tmp_path):

@@ -106,6 +106,36 @@ def test_rounded_stamps_are_no_jitter(rate, digits):
     assert not axis.breaks.size and not axis.clocks and not axis.note
 
 
+def test_a_short_record_of_rounded_stamps_gives_the_rate():
+    """In 2 s with stamps in ms the rate is within 1e-5, and the one that is stated agrees."""
+    for offset in np.linspace(0, 1, 23):
+        stamps = np.round(offset + np.arange(10_400) / 5200.0, 3)
+        assert time_axis(stamps, None).sample_rate == pytest.approx(5200, rel=1e-5)
+        assert time_axis(stamps, 5200.0).sample_rate == 5200.0
+    with pytest.raises(Unusable, match="sample_rate_hz is 5210"):
+        time_axis(stamps, 5210.0)
+
+
+def test_stamps_cut_to_the_interval_are_one_rate():
+    """Stamps cut to ms at 1 kHz, some a step low by binary fractions, keep the rate."""
+    for time in (np.arange(30_000) / 1000, np.cumsum(np.full(30_000, 1e-3))):
+        stamps = np.floor(time * 1e3) / 1e3
+        assert (np.diff(stamps) < 5e-4).any()
+        axis = time_axis(stamps, None)
+        assert axis.sample_rate == 1000.0 and not axis.clocks and not axis.note
+        assert not axis.breaks.size
+
+
+def test_samples_that_are_doubled_cut_the_record():
+    """The record is cut at a few stamps that repeat; one is within a step of rounding."""
+    time = np.arange(30_000) / 1000
+    axis = time_axis(np.insert(time, [777, 9000, 20_000], time[[777, 9000, 20_000]]), None)
+    assert axis.breaks.tolist() == [778, 9002, 20_003] and not axis.clocks
+    assert axis.sample_rate == 1000.0
+    axis = time_axis(np.insert(time, 777, time[777]), None)
+    assert not axis.clocks and axis.sample_rate == 1000.0
+
+
 def test_jitter_of_one_frequency_is_refused():
     """Periodic jitter makes sidebands and is refused; the same power as noise is accepted."""
     time = INDEX / 1000

@@ -56,3 +56,12 @@ def test_a_log_without_accelerometers_is_refused() -> None:
     with pytest.raises(BadLog) as caught:
         survey(make_log({"current": np.ones(N)}, RATE), STAGE, None)
     assert caught.value.reason == "no-accelerometer"
+
+
+def test_lines_are_of_the_part_that_is_asked_for() -> None:
+    """A line that is there while the stage moves is none of its rest."""
+    moving = np.arange(N) % 5000 < 3000
+    samples = np.random.default_rng(0).normal(size=N) + moving * sine(N, RATE, 90.0, 5.0)
+    log = make_log({"acc_a": samples}, RATE, velocity=0.1 * moving)
+    assert [round(x.frequency) for x in survey(log, None, None, part="constant").lines] == [90]
+    assert survey(log, None, None, part="idle").lines == ()

@@ -178,6 +178,11 @@ def test_set_ups_without_a_common_channel_are_refused() -> None:
         lmshealth.merge_setups(apart)
     with pytest.raises(NotEnoughData, match="two or more"):
         lmshealth.merge_setups(apart[:1])
+    bare = replace(
+        apart[0], modes=replace(apart[0].modes, shape_channels=(), shapes=np.empty((1, 0)))
+    )
+    with pytest.raises(NotEnoughData, match=r"a-a2.h5: no mode shape; needed are"):
+        lmshealth.merge_setups([bare])
     with pytest.raises(NotEnoughData, match="same log"):
         lmshealth.merge_setups([apart[0], apart[0]])
     other = replace(apart[1], metadata=replace(METADATA, stage="N"))

@@ -202,6 +202,13 @@ def test_one_velocity_has_no_slope_and_two_logs_no_uncertainty() -> None:
     assert none.n_logs == 0
 
 
+def test_speeds_within_a_percent_are_one() -> None:
+    """Wherever they lie there is no growth of levels by 0.2 % of the speed."""
+    for speed in np.linspace(0.1, 0.3, 50).tolist():
+        (found,) = find_growth([at(speed * (1 + 1e-3 * k), 1.0 + k) for k in (-1, 0, 1)])
+        assert found.n_velocities == 1
+
+
 def test_machines_are_not_mixed() -> None:
     """Each machine has its own line."""
     found = find_growth([at(0.1, 1.0, "A"), at(0.2, 5.0, "B")])

@@ -121,6 +121,16 @@ def test_moves_are_cut_to_their_constant_velocity() -> None:
         assert (stop - start) - (segment.stop - segment.start) <= 42
 
 
+def test_a_slow_ramp_is_a_ramp_at_every_rate() -> None:
+    """Ramps of 0.45 s, 0.2 % of the velocity per ms, are not constant at 51.2 kHz either."""
+    for rate in (20_000.0, 51_200.0):
+        time = np.arange(0, 2, 1 / rate)
+        velocity = 0.1 * np.clip(np.minimum(time, 2 - time) / 0.45, 0, 1)
+        log = make_log({"acc_a": np.zeros(time.size)}, rate, velocity=velocity)
+        (constant,) = select_segments(log, "constant")
+        assert (constant.stop - constant.start) / rate == pytest.approx(1.1, abs=3e-3)
+
+
 def test_phases_are_all_of_a_move_and_named() -> None:
     """Rest, ramp, constant velocity and settling follow each other without a hole."""
     velocity, _ = moves()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -444,3 +445,26 @@ def test_a_resonance_of_a_short_move_is_not_taken_for_a_tone() -> None:
     assert kept["there"] == 60
     # Negative control: where none is expected about half of the moves lose it.
     assert kept["elsewhere"] < 45
+
+
+@pytest.mark.parametrize("kind", ["displacement", "acceleration"])
+def test_a_segment_without_an_ordinate_is_omitted(
+    kind: Literal["displacement", "acceleration"],
+) -> None:
+    """A log that ends some samples after a stop has the spectra of its other segments."""
+    channels = [Channel("a", kind, np.random.default_rng(0).normal(size=4000))]
+    for short in range(1, 12):
+        segments = [Segment(0, 3000, 0.0), Segment(3000, 3000 + short, 0.0)]
+        first, *others = cross_spectra(channels, segments, RATE, RATE / 40)
+        assert first.frequency.size > 100
+        assert all(one.frequency.size for one in others)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_channel_without_a_signal_has_no_ratio() -> None:
+    """A sinusoid of one channel is removed beside a channel that is constant in the segment."""
+    n = 20_000
+    noisy = np.random.default_rng(0).normal(size=n) + 50 * np.sin(0.7 * np.arange(n))
+    channels = [Channel("a", "acceleration", noisy), Channel("b", "acceleration", np.ones(n))]
+    (spectrum,) = cross_spectra(channels, [Segment(0, n, 0.0)], RATE, RATE / 4)
+    assert spectrum.lines

@@ -173,6 +173,14 @@ def test_a_prior_that_reaches_below_zero_is_cut_there(law: AnyLaw) -> None:
     assert np.isfinite(y).all()
 
 
+def test_draws_are_of_the_truncated_prior() -> None:
+    """Floor and life of normal priors are distributed as scipy's truncated normal."""
+    law = Loosening(Normal(5000, 3000), Normal(0.9, 0.2))
+    floor, life = law.natural(law.draw(np.random.default_rng(3), 20_000, NOW), NOW).T
+    assert stats.kstest(floor, stats.truncnorm(-4.5, 0.5, 0.9, 0.2).cdf).pvalue > 1e-3
+    assert stats.kstest(life / 1e3, stats.truncnorm(-5 / 3, np.inf, 5e3, 3e3).cdf).pvalue > 1e-3
+
+
 @pytest.mark.parametrize("law", [*LAWS, FREE], ids=[*NAMES, "free"])
 def test_closed_form_passage_is_the_root_of_health(law: AnyLaw) -> None:
     """Where a limit is reached, root finding on health gives the same travel."""

@@ -307,3 +307,27 @@ def test_files_of_others(
     assert log.sample_rate == pytest.approx(rate, rel=1e-5) and len(log.channels) == n_channels
     times = [g.why for g in guesses if g.target.startswith("time")]
     assert all(f"{log.sample_rate:.6g} Hz" in why for why in times)
+
+
+@pytest.mark.parametrize("duration", ["00.05.00", "1.2.3 s", "...", "00:00:30", "30.0 s"])
+def test_durations_of_any_form_end_nothing(tmp_path: Path, duration: str) -> None:
+    """What is no number states no duration; one that is decides the unit of the times."""
+    samples = np.random.default_rng(0).normal(size=3000)
+    rows = "".join(f"{k},{x:.6f}\n" for k, x in zip(range(0, 30_000, 10), samples, strict=True))
+    path = tmp_path / "a.csv"
+    path.write_text(f"# Duration: {duration}\ntime,acc_x_m_s2\n{rows}")
+    if duration == "30.0 s":
+        assert "time_ms" in str(propose(path))
+        return
+    with pytest.raises(BadLog, match="nothing states its unit"):
+        propose(path)
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_column_with_infinite_values_is_no_signal_and_no_warning(tmp_path: Path) -> None:
+    """Two of them in a row have no difference."""
+    samples = np.random.default_rng(0).normal(size=(3000, 2))
+    samples[7:9, 1] = np.inf
+    head = "acc_x_m_s2,1"
+    np.savetxt(tmp_path / "a.csv", samples, delimiter=",", header=head, comments="")
+    assert "acc_x_m_s2" in str(propose(tmp_path / "a.csv", rate=1000.0))

@@ -426,6 +426,31 @@ class SinceFirst:
     def __init__(self, name: str, columns: ColumnMap) -> None:
         self._unit = columns.signal(columns.target(name) or "").factor
         self.first: np.datetime64 | None = None
+        self._dates: set[str] = set()  # with slashes, of which either number may be the day
+
+    def parse(self, text: Any) -> FloatArray:
+        """Return the times of a series of text, ``(n,)``; what is no moment is no time.
+
+        `Unusable` (``time``) for several dates like 05/01/2026, of which none shows their order.
+        """
+        import pandas as pd
+
+        words = text.astype(str)
+        slashed = words.str.extract(r"^\s*(\d{1,2}/\d{1,2}/\d{4})", expand=False).dropna().unique()
+        before = bool(_day_first(self._dates)) if self._dates else None
+        self._dates = self._dates.union(slashed)
+        day_first = _day_first(self._dates)
+        # A single date of either order gives the same times: it is read with the month first.
+        is_open = day_first is None or before not in (None, day_first)
+        if len(self._dates) > 1 and is_open:
+            found = " and ".join(sorted(self._dates)[:2])
+            detail = f"dates like {found} may begin with the day or with the month"
+            raise Unusable("time", f"{detail}; write them as YYYY-MM-DD")
+        dotted = bool(words.str.match(r"\d{1,2}\.").any())
+        text = words.str.replace(",", ".") if text.dtype == object else text
+        first = dotted or bool(day_first)
+        found = pd.to_datetime(text, errors="coerce", utc=True, dayfirst=first, format="mixed")
+        return self(found.dt.tz_localize(None).to_numpy("datetime64[ns]"))
 
     def __call__(self, moments: np.ndarray) -> FloatArray:
         """Return the times of moments, ``(n,)`` each, NaN where there is none."""
@@ -438,15 +463,12 @@ class SinceFirst:
         return (moments - self.first) / np.timedelta64(1, "ns") * (1e-9 / self._unit)
 
 
-def parse_moments(text: Any) -> np.ndarray:
-    """Read a series of text as moments, ``(n,)``; what is none is no time."""
-    import pandas as pd
-
-    day_first = bool(text.astype(str).str.match(r"\d{1,2}\.").any())
-    text = text.astype(str).str.replace(",", ".") if text.dtype == object else text
-    found = pd.to_datetime(text, errors="coerce", utc=True, dayfirst=day_first, format="mixed")
-    moments: np.ndarray = found.dt.tz_localize(None).to_numpy("datetime64[ns]")
-    return moments
+def _day_first(dates: Iterable[str]) -> bool | None:
+    """Return whether dates with slashes begin with the day; None where none shows it."""
+    pairs = [tuple(map(int, date.split("/")[:2])) for date in dates]
+    if any(first > 12 for first, _ in pairs):
+        return True
+    return False if any(second > 12 for _, second in pairs) else None
 
 
 def without_epoch(content: Content, columns: ColumnMap) -> Content:

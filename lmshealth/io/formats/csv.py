@@ -12,8 +12,7 @@ import warnings
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, partial
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from lmshealth.io.formats.content import (
     choose,
     describe,
     not_numeric,
-    parse_moments,
 )
 from lmshealth.io.formats.dialect import (
     Dialect,
@@ -57,6 +55,8 @@ _NO_ROW = re.compile(rb"^(?:[A-Za-z*][^\n]*|[ \t\r]*)\n", re.MULTILINE)
 _LONG_ROW = re.compile(r"in line (\d+), saw (\d+)")
 # Most bytes of text behind the rows: rates, counts and ends that exporters write there.
 _TRAILER = 1 << 12
+# Between the parts of a number, of which the last is its decimals or its exponent.
+_PARTS = re.compile(r"[.,:eE]")
 _WORD = re.compile(r"[^\W\d_]{3}")
 
 
@@ -131,10 +131,13 @@ class Text:
                 found = f"no row ends in {constants.LONGEST_BLOCK} bytes before byte"
                 needed = "needed shorter rows, and a second quote to every quote"
                 raise Unusable("corrupt", f"{found} {self.position}; {needed}")
-        if rows := self._without_text(b"".join(held), dialect):
-            yield rows
+        rows = self._without_text(b"".join(held), dialect)
         end = rows[rows.rfind(b"\n") + 1 :]
-        # The last number of a file that ends inside a row may be incomplete.
+        if end and _is_cut(rows[-_TRAILER:], dialect):
+            self.trailer = "the last row ends inside its last number, left out"
+            rows, end = rows[: -len(end)], b""
+        if rows:
+            yield rows
         n_found = len(fields_of(end.decode(errors="replace"), dialect.delimiter))
         n_fields = len(dialect.channels)
         if end and not end.endswith(b"\r") and n_found < n_fields:
@@ -165,6 +168,22 @@ def _is_remark(line: bytes, dialect: Dialect) -> bool:
     first = (fields_of(text, dialect.delimiter) or [""])[0]
     several = len(dialect.channels) > 1 or len(text.split()) > 1
     return bool(_WORD.match(first)) and several and not is_number_or_moment(first)
+
+
+def _is_cut(rows: bytes, dialect: Dialect) -> bool:
+    """Return whether the last number of the last row has fewer digits than all above it have.
+
+    The first row is not counted. -6.133e-0 may be the beginning of -6.133e-05.
+    """
+    fields = (fields_of(row.decode("latin-1"), dialect.delimiter) for row in rows.split(b"\n")[1:])
+    full = [own[-1].strip(' "') for own in fields if len(own) == len(dialect.channels)]
+    parts = [_PARTS.split(text.lstrip("+-")) for text in full if text]
+    if len(parts) < 5 or not full[-1]:  # of fewer rows a complete one may well be the shortest
+        return False
+    *others, own = parts
+    alike = [len(one[-1]) for one in others if len(one) == len(own)]
+    is_short = len("".join(own)) < min(len("".join(one)) for one in others)
+    return is_short or len(own[-1]) < min(alike, default=0)
 
 
 def _without_headers(
@@ -242,13 +261,6 @@ def parse_text(stream: Any, columns: ColumnMap) -> Content:
     return replace(content, columns=samples, metadata=metadata, guessed=tuple(guessed))
 
 
-@cache
-def _is_old_pandas() -> bool:
-    """Return whether pandas is older than 3.1."""
-    major, minor = version("pandas").split(".")[:2]
-    return (int(major), int(minor)) < (3, 1)
-
-
 class _File:
     """A file for pandas, which takes blocks of any size."""
 
@@ -284,10 +296,7 @@ def _numbers(
             # Numbers are ASCII in every encoding that comes here.
             encoding_errors="replace",
             header=None,
-            # Before 3.1 pandas drops an extra field of the first row of a block (pandas-dev/pandas
-            # pull request 66944), which a spare column receives, and rounds the last digits.
-            names=list(range(n_fields + _is_old_pandas())),
-            float_precision="round_trip" if _is_old_pandas() else None,
+            names=list(range(n_fields)),
             index_col=False,
             # A block is small enough as a whole.
             low_memory=False,
@@ -297,7 +306,7 @@ def _numbers(
             **options,
         )
         with tables:
-            return _spooled(tables, places, times, n_fields)
+            return _spooled(tables, places, times)
 
     with _WARNINGS, warnings.catch_warnings():
         # A row longer than the header is a warning in pandas and a loss of data here.
@@ -311,22 +320,18 @@ def _numbers(
             raise Unusable("empty", _NO_ROWS) from error
         except (pd.errors.ParserError, pd.errors.ParserWarning, UnicodeDecodeError) as error:
             if found := _LONG_ROW.search(str(error)):
-                raise _too_long(found[1], found[2], n_fields) from error
+                detail = f"row {found[1]} has {found[2]} fields, the first line {n_fields}"
+                raise corrupt(detail) from error
             raise Unusable("corrupt", f"rows cannot be read: {error}") from error
 
 
 def _spooled(
-    tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst], n_fields: int
+    tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
     """Collect the columns of tables, block by block."""
     taken = {name: Spool() for name in places}
     n_rows = n_blank = 0
     for table in tables:
-        for extra in table.columns[n_fields:]:
-            is_long = table[extra].notna().to_numpy()
-            if is_long.any():
-                row = n_rows + int(is_long.argmax()) + 1
-                raise _too_long(row, f"{n_fields + 1} or more", n_fields)
         n_used = len(table)
         if n_used and table.iloc[-1].isna().all():
             n_used = int(np.flatnonzero([True, *table.notna().any(axis=1)])[-1])
@@ -335,7 +340,7 @@ def _spooled(
             is_number = values.dtype.kind in "fiu"
             if not is_number and name not in times:
                 raise not_numeric(name, _first_text(values.tolist(), n_rows))
-            numbers = values.to_numpy() if is_number else times[name](parse_moments(values))
+            numbers = values.to_numpy() if is_number else times[name].parse(values)
             if n_used:
                 taken[name].append(np.full(n_blank, np.nan))
                 taken[name].append(numbers[:n_used])
@@ -344,10 +349,6 @@ def _spooled(
     if n_rows == n_blank:
         raise Unusable("empty", _NO_ROWS)
     return {name: spool.samples() for name, spool in taken.items()}
-
-
-def _too_long(row: object, found: str, needed: int) -> Unusable:
-    return corrupt(f"row {row} has {found} fields, the first line {needed}")
 
 
 def _first_text(values: list[object], n_before: int) -> str:

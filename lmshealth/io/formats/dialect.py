@@ -28,7 +28,7 @@ from lmshealth.io.column_map import (
     unit_key,
 )
 from lmshealth.io.formats.content import Described, rate_of
-from lmshealth.io.log import moment_after
+from lmshealth.io.log import metadata_keys, moment_after
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
 # Delimiters in the order in which equal candidates are preferred; a blank is any run of them.
@@ -99,7 +99,8 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
     """Find marks, names, units and the first row from the first lines of a text.
 
     `Unusable`: ``empty`` without names or rows, ``corrupt`` where row and names differ in number,
-    ``columns`` where the text can be read in two ways, ``metadata`` for a key with two values.
+    ``columns`` where the text can be read in two ways, ``metadata`` for a key of the
+    contract with two values.
     """
     layout = columns.csv
     skip = layout.skip_rows or 0
@@ -194,7 +195,7 @@ def _leading(lines: Sequence[str], skip: int) -> tuple[dict[str, str], int]:
         if line.strip() and not line.startswith("#"):
             return metadata, k
         key, colon, value = (part.strip() for part in line.lstrip("# \t").partition(":"))
-        if colon and metadata.setdefault(key, value) != value:
+        if colon and metadata.setdefault(key, value) != value and key in metadata_keys():
             both = f"{metadata[key]!r} and {value!r}"
             raise Unusable("metadata", f"{key} is given twice, as {both}; keep one")
     return metadata, len(lines)

@@ -406,4 +406,5 @@ def _lines(output: Channel, fit: ResponseFit) -> tuple[Line, ...]:
     if output.kind == "displacement":
         amplitude = amplitude * (2 * np.pi * frequency) ** 2
     seen = [(output.name, f, a) for f, a in np.column_stack([frequency, amplitude]).tolist()]
-    return name_lines(seen, (), None, fit.ordinates.spacing)
+    # A strong sine leaks into the fourth ordinate from it.
+    return name_lines(seen, (), None, 1.5 * fit.ordinates.spacing)

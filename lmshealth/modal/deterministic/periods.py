@@ -6,6 +6,7 @@ import numpy as np
 from scipy import fft
 
 from lmshealth._private.arrays import ComplexArray, FloatArray
+from lmshealth.io.time_axis import ZEROS, sinc_weights
 
 # Correlation of a signal with itself at a period and its multiples: half of it is no noise.
 _REPEATS = 0.5
@@ -17,9 +18,7 @@ _STATED_WITHIN = 0.01
 _REACH = 3
 # Periods that slip by less than this many samples over the record are whole numbers of samples.
 _SLIP = 0.1
-# Samples to either side of the interpolation kernel, and its shape: below 0.45 of the sample rate
-# its error is some 1e-4 of the signal.
-_HALF_WIDTH, _KAISER = 32, 8.0
+# Samples that are interpolated at once.
 _BLOCK = 1 << 14
 
 
@@ -106,8 +105,8 @@ def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexAr
         cut = [x[start:].reshape(n_periods, whole) for x in signals]
         period = float(whole)
     else:
-        n_periods = int((n - 2 * _HALF_WIDTH) / period)
-        at = (n - _HALF_WIDTH) - n_periods * period + np.arange(n_periods * whole) * period / whole
+        n_periods = int((n - 2 * ZEROS) / period)
+        at = (n - ZEROS) - n_periods * period + np.arange(n_periods * whole) * period / whole
         cut = [_interpolate(x, at).reshape(n_periods, whole) for x in signals]
     ramp = (np.arange(whole) - (whole - 1) / 2) / whole
     spectra = []
@@ -121,15 +120,11 @@ def cut_periods(signals: Sequence[FloatArray], period: float) -> tuple[ComplexAr
 
 
 def _interpolate(values: FloatArray, at: FloatArray) -> FloatArray:
-    """Interpolate between samples by a sinc with a Kaiser window."""
-    offsets = np.arange(1 - _HALF_WIDTH, _HALF_WIDTH + 1)
+    """Interpolate between samples by a windowed sinc."""
     found = np.empty(at.size)
     for first in range(0, at.size, _BLOCK):
         place = at[first : first + _BLOCK]
-        floor = np.floor(place).astype(int)
-        distance = (place - floor)[:, None] - offsets
-        window = np.i0(_KAISER * np.sqrt(np.maximum(0.0, 1 - (distance / _HALF_WIDTH) ** 2)))
-        kernel = np.sinc(distance) * window / np.i0(_KAISER)
-        index = np.clip(floor[:, None] + offsets, 0, values.size - 1)
-        found[first : first + _BLOCK] = np.sum(kernel * values[index], axis=1)
+        weights, index = sinc_weights(place, np.ones(place.size), ZEROS)
+        near = values[np.clip(index, 0, values.size - 1)]
+        found[first : first + _BLOCK] = np.einsum("ij,ij->i", weights, near)
     return found

@@ -540,3 +540,13 @@ def test_noise_of_a_bench_is_its_scatter_over_periods(bench: Callable[[str], Log
     for ratio in found["stated_over_scatter"]:
         assert 0.7 < ratio < 2
         assert not 0.7 < ratio / 3 < 2
+
+
+def test_one_sine_is_one_line() -> None:
+    """A strong sine in a displacement leaks into the ordinates around it, which are no lines."""
+    log = driven(Machine(displacement=True), periods=12, random=True)
+    current, response = (channel.values[:] for channel in log.channels)
+    sine = 200 * response.std() * np.cos(2 * np.pi * 90.02 * np.arange(response.size) / RATE)
+    log = make_log({"current": current, "delta_e": response + sine}, RATE)
+    (line,) = read_frf(log, "current", "delta_e", band=(40, 120)).modes.lines
+    assert line.frequency == pytest.approx(90.02, abs=0.02)
