@@ -20,6 +20,7 @@ LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
 # and of wander.
 LIFE, SETTLING_LOGS, COMMON_RATE, COMMON_WANDER = 150, 1.0, 0.9, 0.3
 BIAS = (0.005, 0.2)
+UNSEEN_STD = 0.03  # of ln f by a covariate of which no value is known yet
 # Standard deviations of the jumps of ln f and ln ζ.
 JUMPS = {
     "step": (0.03, 0.3),
@@ -120,14 +121,15 @@ def _unknown(history: History, known: Known, k: int) -> float:
         values = history.covariates[name]
         if np.isnan(values[k]):
             so_far = values[:k][~np.isnan(values[:k])]
-            spread = float(np.std(so_far)) if so_far.size else 0.0
-            total += (std * max(spread, 1.0)) ** 2
-    return total
+            total += (std * max(np.std(so_far), 1.0)) ** 2 if so_far.size else UNSEEN_STD**2
+    return float(total)
 
 
-def _offset(history: History, name: str, reference: float, k: int) -> float:
-    value = float(history.covariates[name][k])
-    return 0.0 if np.isnan(value) else value - reference
+def _offset(history: History, name: str, reference: float, k: int, power: int = 1) -> float:
+    """Give a power of a covariate about its reference: its mean so far where it is unknown."""
+    powers = [(float(value) - reference) ** power for value in history.covariates[name][: k + 1]]
+    so_far = [one for one in powers if not np.isnan(one)]
+    return powers[-1] if not np.isnan(powers[-1]) else float(np.mean(so_far or [0.0]))
 
 
 def _first(table: FloatArray) -> float:
@@ -270,7 +272,7 @@ class Textbook:
                 offset = _offset(history, name, reference, k)
                 h[a, at[name, one.mode]] = offset
                 if curvature:
-                    h[a, at[name + "^2", one.mode]] = offset**2
+                    h[a, at[name + "^2", one.mode]] = _offset(history, name, reference, k, 2)
             if ("bias f", one) in at:
                 h[a, at["bias f", one]] = h[r + a, at["bias z", one]] = 1
             for j, step in enumerate(history.steps):
@@ -363,8 +365,9 @@ def _readings(history: History, known: Known, a: Series, c: Series, part: int) -
     n = len(history.logs)
     read = np.zeros((n, n), dtype=np.longdouble)
     for name, reference, std, curvature in known.covariates if part == 0 else ():
-        offset = np.array([_offset(history, name, reference, k) for k in range(n)], np.longdouble)
-        read += std**2 * np.outer(offset, offset) + curvature**2 * np.outer(offset**2, offset**2)
+        for power, size in ((1, std), (2, curvature)):
+            offset = [_offset(history, name, reference, k, power) for k in range(n)]
+            read += np.longdouble(size) ** 2 * np.outer(offset, offset)
     if a == c and a != _reference(history, a.mode):
         read += BIAS[part] ** 2
     for step in history.steps:
