@@ -509,6 +509,9 @@ def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, Flo
     first = history.baseline
     ln_f = history.ln_frequency[first:]
     n, m = ln_f.shape
+    temperature = history.covariates["temperature_c"][first:]
+    used = [not np.isnan(t) or np.isnan(temperature[k:]).all() for k, t in enumerate(temperature)]
+    ln_f = np.where(np.array(used)[:, None], ln_f, np.nan)
     where = [(k, i) for k in range(n) for i in range(m) if not np.isnan(ln_f[k, i])]
     centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
     values = np.array([ln_f[k, i] - centre[i] for k, i in where])
@@ -531,9 +534,9 @@ def life_covariance(
     """
     where, _, clock = _life_data(history)
     first = history.baseline
-    values = history.covariates["temperature_c"][first:]
-    unknown = np.isnan(values)
-    offset = np.where(unknown, 0.0, values - belief.reference)
+    unknown = np.isnan(history.covariates["temperature_c"][first:])
+    logs = range(first, len(history.logs))
+    offset = [_offset(history, "temperature_c", belief.reference, k) for k in logs]
     known = Known((("temperature_c", belief.reference, belief.b_std, 0.0),))
     cov = np.zeros((len(where), len(where)))
     for a, (k, i) in enumerate(where):
