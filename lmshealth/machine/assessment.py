@@ -318,10 +318,9 @@ def _with_results(
     stage, every = made.stage, constants.EMCEE_EVERY
     seed = seed_of(made.seed, history.stage, stage.digest)
     past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
-    if before is None or before.past != past:
-        ended = ended_lives(history, stage, seed)
-    else:
-        ended = before.ended
+    if before is not None and before.past != past:  # draws of another life are no start of this
+        before = None
+    ended = ended_lives(history, stage, seed) if before is None else before.ended
     chains = before is None or len(history.logs) // every > before.n_logs // every
     start = None if before is None else before.start
     life = fit_life(history, stage, seed, chains=chains, before=start)

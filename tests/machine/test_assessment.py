@@ -84,6 +84,18 @@ def test_emcee_samples_the_first_and_each_sixteenth_log(
     assert fits == [(n in emcee, n > 13) for n in found]
 
 
+def test_a_new_life_is_not_updated_from_the_old_one(
+    stage: Stage, fits: list[tuple[bool, bool]]
+) -> None:
+    """After a baseline chains run without the draws of the life before."""
+    logs = readings(20)
+    _, before = assess_from(logs[:17], stage, None)
+    logs[10] = replace(logs[10], metadata=replace(logs[10].metadata, baseline=True))
+    fits.clear()
+    assess_from(logs[:18], stage, before)
+    assert fits == [(True, False)]
+
+
 def test_emcee_samples_where_the_verdict_changes(
     stage: Stage, fits: list[tuple[bool, bool]]
 ) -> None:

@@ -241,7 +241,7 @@ def advance(space: StateSpace, bank: FilterBank, first: int, last: int) -> Filte
 def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> FilterBank:
     """Start a regime: keep state, noise scales and wander; process noise has its prior again.
 
-    Only work on the machine starts it `anew`: parts then run in.
+    A baseline and work on the machine start it `anew`: parts then run in.
     """
     grid, own = space.grid, bank.hyperparameters
     kept, place = np.unique(own.disturbance, return_inverse=True)
