@@ -286,6 +286,9 @@ def _judge_step(
                 sizes=moved,
             )
         )
+    sentences.append(
+        fact("A payload or another condition that no log states would move the modes likewise.")
+    )
     if health is not None and health.publishable_parameters().any():
         sentences.append(_parameter_sentences(stage, health))
     # The evidence is against all that is harmless: wander, outliers, running-in.

@@ -32,7 +32,7 @@ class ProbabilityBounds(ReadOnly):
 class Service:
     """Service date of a machine, and the criterion that chose it."""
 
-    kind: Literal["now", "by", "later", "unknown"]  # by a day; later than the horizon or never
+    kind: Literal["now", "by", "later", "unknown"]  # by a day; later than horizon or calendar
     by: date | None  # last day, that of the last log for ``now``
     # Days from the last log, negative if the accepted risk was reached before it, infinite for
     # ``later``, NaN for ``unknown``.
@@ -82,8 +82,10 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
         return Service("unknown", None, np.nan, np.nan, None, unknown, *criterion)
     wait = _wait(prognosis, decision)
     by, planned = day_after(prognosis, wait), decision.next_service
-    kind: Literal["now", "by", "later", "unknown"] = "later" if np.isinf(wait) else "unknown"
-    if by is not None:
+    kind: Literal["now", "by", "later", "unknown"] = "later"
+    if by is None:  # beyond the horizon or the calendar
+        wait = np.inf
+    else:
         kind = "now" if by <= prognosis.recorded_at.date() else "by"
     risk = np.nan if by is None else _any_risk(prognosis, by)[1]
     planned_risk = unknown if planned is None else _any_risk(prognosis, planned)

@@ -213,8 +213,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
     history : History
         Modal estimates with covariance; missing ones are NaN.
     stage : Stage, optional
-        Its covariates are regressed out, and rates are per its horizon. Without it every covariate
-        present is, about its median, and rates are per length of the history.
+        Its covariates are regressed out. Without it every covariate present is, about its median.
 
     Returns
     -------

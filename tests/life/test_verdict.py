@@ -193,6 +193,7 @@ def test_an_undeclared_step_is_the_verdict(stage: Stage) -> None:
     assert "roll −3.0 %" in found.why
     assert "pitch +0.2 %" in found.why
     assert "Mount stiffness is at 60 %" in found.why
+    assert "A payload or another condition that no log states" in found.why
     # Also where the logs do not carry health.
     assert judge(stage, logs(8), None, stepped()).verdict == "step"
     # Each jump since the baseline is named.

@@ -44,7 +44,8 @@ class LifeData(ReadOnly):
         """Select the data of a life; raise `NotEnoughData` as `fit_life` describes it."""
         if not stage.parameters:
             raise BadStage(f"{stage.name}: no [[parameter]] to infer")
-        history, regressed = _with_regressors(with_clock(history, stage), stage, min_logs)
+        whole = with_clock(history, stage)
+        history, regressed = _with_regressors(whole, stage, min_logs)
         if not history.has_odometer:
             raise NotEnoughData(
                 fact(
@@ -60,7 +61,7 @@ class LifeData(ReadOnly):
         of_series = [history.series[i].mode for i in columns]
         modes = tuple(dict.fromkeys(of_series))
         ln_f = history.ln_frequency[history.baseline :, columns]
-        all_clock, steps = clock_and_steps(history)
+        all_clock, (_, steps) = clock_and_steps(history)[0], clock_and_steps(whole)
         clock = all_clock[history.baseline :]
         now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
         if n_logs < min_logs or now <= 0:

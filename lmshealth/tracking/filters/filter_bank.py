@@ -250,12 +250,10 @@ def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> Filte
     at = np.searchsorted(kept, grid.disturbance)
     share = np.bincount(place, weights=bank.weight)[at]
     # Without running-in the kept filters are fewer: healthy has its prior probability all the same.
-    cell = 2 * at + grid.healthy
+    cell, chance = 2 * at + grid.healthy, constants.HEALTHY_PROBABILITY
     prior = np.exp(grid.log_prior)
     prior /= np.bincount(cell, weights=prior)[cell]
-    prior *= np.where(
-        grid.healthy, constants.HEALTHY_PROBABILITY, 1 - constants.HEALTHY_PROBABILITY
-    )
+    prior *= np.where(grid.healthy, chance, 1 - chance)
     prior /= np.bincount(at, weights=prior)[at]
     state = np.empty((at.size, *bank.state.shape[1:]))
     for d, group in product(range(kept.size), (True, False)):

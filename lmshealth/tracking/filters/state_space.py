@@ -200,20 +200,15 @@ class StateSpace:
     @property
     def effects(self) -> list[tuple[str, str, int]]:
         """Mode, name and place in the state of each coefficient of ln f that is no wear."""
-        history = self.history
+        modes, series = self.history.modes, self.history.series
         places = [(one.name, self.regressor(j).start) for j, one in enumerate(self.regressed)]
         places += [
             (f"{step.kind}:{step.name or step.source}", self.jump(j).start)
             for j, step in enumerate(self.steps)
             if not step.changes_modes
         ]
-        found = [
-            (mode, name, first + i)
-            for name, first in places
-            for i, mode in enumerate(history.modes)
-        ]
-        for j, i in enumerate(self.biased):
-            one = history.series[i]
+        found = [(mode, name, at + i) for name, at in places for i, mode in enumerate(modes)]
+        for j, one in enumerate(series[i] for i in self.biased):
             found.append((one.mode, f"bias:{one.source}", self.first_bias + 2 * j))
         return found
 

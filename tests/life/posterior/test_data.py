@@ -88,6 +88,17 @@ def test_baseline_last_log_and_steps_are_not_mixed() -> None:
         assert history.logs[old.first - 1] == short.logs[new.first - 1]
 
 
+def test_a_step_is_between_its_logs_in_a_condensed_life(tmp_path: Path) -> None:
+    """Not between the means of the groups before and after it."""
+    n, k = 450, 203
+    history = make_history(np.tile(np.log(FREQUENCY[:2]), (n, 1)))
+    data = LifeLikelihood.of(
+        replace(history, steps=(since("step", k, n),)), make_stage(tmp_path)
+    ).data
+    assert len(data.history.logs) < n
+    assert data.steps == (history.clock()[k - 1 : k + 1].mean(),)
+
+
 def test_covariates_of_a_group_are_those_of_its_estimates(tmp_path: Path) -> None:
     """Daily cycles and temperatures are averaged over the logs that have an estimate.
 
