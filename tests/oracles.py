@@ -121,8 +121,9 @@ def _unknown(history: History, known: Known, k: int) -> float:
         values = history.covariates[name]
         if np.isnan(values[k]):
             so_far = values[:k][~np.isnan(values[:k])]
-            total += (std * max(np.std(so_far), 1.0)) ** 2 if so_far.size else UNSEEN_STD**2
-    return float(total)
+            spread = float(np.std(so_far)) if so_far.size else 0.0
+            total += (std * max(spread, 1.0)) ** 2 if so_far.size else UNSEEN_STD**2
+    return total
 
 
 def _offset(history: History, name: str, reference: float, k: int, power: int = 1) -> float:

@@ -69,8 +69,8 @@ def find_covariate_effects(
     short = len(taken.logs) <= constants.MOST_SMOOTHED
     level = (smooth(taken, track, stage) if short else track).ln_frequency
     coefficients = np.array([one.coefficient for one in track.effects[: len(places)]])
-    logs, series = range(len(history.logs)), slice(len(history.series))
-    moved = np.array([space.matrix(k)[series, places] @ coefficients for k in logs])
+    logs, n_series = range(len(history.logs)), len(history.series)
+    moved = np.array([space.matrix(k)[:n_series, places] @ coefficients for k in logs])
     rest = taken.ln_frequency - level[:, taken.mode_of()] - moved
     found = []
     for covariate in stage.description.covariate:
@@ -79,9 +79,8 @@ def find_covariate_effects(
             effects = tuple(track.effects[len(track.modes) * j + i] for j in own)
             at, values = history.columns(mode), history.covariates[covariate.name]
             epochs, series = np.nonzero(np.isfinite(rest[:, at]) & np.isfinite(values)[:, None])
-            explained = sum(
-                e.coefficient * columns[j].values for j, e in zip(own, effects, strict=True)
-            )
+            parts = zip(own, effects, strict=True)
+            explained = np.sum([e.coefficient * columns[j].values for j, e in parts], axis=0)
             found.append(
                 CovariateEffect(
                     mode=mode,

@@ -104,13 +104,14 @@ def test_a_drift_is_that_of_a_source_with_an_estimate(stage: Stage) -> None:
     made, _ = assess_from(readings(4), stage, None)
     modes, n = ("roll", "pitch", "yaw"), 4
     series = (*(Series(mode, "acc") for mode in modes), Series("roll", "delta_e"))
-    ln_f = np.log(FREQUENCY)[[0, 1, 2, 0]] + 3e-4 * np.random.default_rng(0).normal(size=(n, 4))
+    rng = np.random.default_rng(0)
+    ln_f = np.asarray(np.log(FREQUENCY)[[0, 1, 2, 0]] + 3e-4 * rng.standard_normal((n, 4)))
     ln_f[-1, [0, 3]] -= 0.05
     cov = np.tile(np.diag([1e-7] * 4 + [0.05**2] * 4), (n, 1, 1))
     missing = np.zeros((n, 4), dtype=bool)
     missing[-1, 0] = True
-    estimates = ln_f, np.full((n, 4), np.log(0.02)), cov
-    history = make_history(modes, 1e5 * np.arange(n), estimates, series=series, missing=missing)
+    estimates = ln_f, np.full((n, 4), float(np.log(0.02))), cov
+    history = make_history(modes, 1e5 * np.arange(4.0), estimates, series=series, missing=missing)
     found = replace(made, history=history, track=track(history, stage))
     assert found.drifted["roll"][0] == pytest.approx(-0.05, abs=1e-3)
 

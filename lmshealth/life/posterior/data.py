@@ -6,7 +6,7 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
@@ -145,13 +145,11 @@ def _with_regressors(
     known = np.array([one.unknown == 0 for one in found], bool).reshape(-1, len(history.logs))
     known_later = np.logical_or.accumulate(known[:, ::-1], axis=1)[:, ::-1]
     lost = (~known & known_later).any(axis=0)
-    seen = np.isfinite(history.ln_frequency).any(axis=1)
+    seen: BoolArray = np.asarray(np.isfinite(history.ln_frequency).any(axis=1))
     if (seen & ~lost)[history.baseline :].sum() >= min_logs:
-        estimates = history.ln_frequency.copy(), history.ln_damping.copy(), history.cov.copy()
-        for own in estimates:
-            own[lost] = np.nan
-        names = ("ln_frequency", "ln_damping", "cov")
-        history = replace(history, **dict(zip(names, estimates, strict=True)))
+        ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
+        ln_f[lost] = ln_zeta[lost] = cov[lost] = np.nan
+        history = replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov)
         seen &= ~lost
     # Means over the logs of a group that have an estimate, also of squares and of daily cycles.
     columns = {f"{one.name}:unknown": one.unknown for one in found}
