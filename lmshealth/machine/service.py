@@ -32,10 +32,10 @@ class ProbabilityBounds(ReadOnly):
 class Service:
     """Service date of a machine, and the criterion that chose it."""
 
-    kind: Literal["now", "by", "later", "unknown"]  # by a day; later than horizon or calendar
+    kind: Literal["now", "by", "later", "unknown"]  # by a day; later than the horizon or never
     by: date | None  # last day, that of the last log for ``now``
     # Days from the last log, negative if the accepted risk was reached before it, infinite for
-    # ``later``, NaN for ``unknown``.
+    # ``later``; of ``unknown`` NaN without a prognosis, else beyond the calendar.
     wait: float
     risk: float  # upper bound of the probability to reach a limit before that day; NaN without one
     planned: date | None  # next service by the description
@@ -82,10 +82,8 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
         return Service("unknown", None, np.nan, np.nan, None, unknown, *criterion)
     wait = _wait(prognosis, decision)
     by, planned = day_after(prognosis, wait), decision.next_service
-    kind: Literal["now", "by", "later", "unknown"] = "later"
-    if by is None:  # beyond the horizon or the calendar
-        wait = np.inf
-    else:
+    kind: Literal["now", "by", "later", "unknown"] = "later" if np.isinf(wait) else "unknown"
+    if by is not None:
         kind = "now" if by <= prognosis.recorded_at.date() else "by"
     risk = np.nan if by is None else _any_risk(prognosis, by)[1]
     planned_risk = unknown if planned is None else _any_risk(prognosis, planned)
