@@ -32,6 +32,7 @@ from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History, Series, Step
 from lmshealth.tracking.track import Effect, Track
 from tests.lives import health_of, plain_nuisances
@@ -108,7 +109,10 @@ def make_track(history: History, truth: FloatArray, seed: int = 2) -> Track:
         ln_damping_std=np.full((n, m), 0.02),
         drift=drift + wander,
         drift_cov=(std**2)[:, :, None] * np.eye(m),
-        effects=tuple(Effect(mode, "temperature_c", -1.2e-4, 1.5e-5) for mode in history.modes),
+        effects=tuple(
+            Effect(mode, name, -1.2e-4 if name == "temperature_c" else 0.0, 1.5e-5)
+            for mode, name, _ in StateSpace(history, load_stage("lms-y")).effects
+        ),
         nis=rng.chisquare(dof),
         nis_dof=dof,
         noise_scale=np.ones((n, 1)),

@@ -20,6 +20,7 @@ LEVEL_STD, DAMPING_STD, DAMPING_WALK = 0.1, 1.0, 0.5
 # and of wander.
 LIFE, SETTLING_LOGS, COMMON_RATE, COMMON_WANDER = 150, 1.0, 0.9, 0.3
 BIAS = (0.005, 0.2)
+UNSEEN_STD = 0.03  # of ln f by a covariate of which no value is known yet
 # Standard deviations of the jumps of ln f and ln ζ.
 JUMPS = {
     "step": (0.03, 0.3),
@@ -121,13 +122,15 @@ def _unknown(history: History, known: Known, k: int) -> float:
         if np.isnan(values[k]):
             so_far = values[:k][~np.isnan(values[:k])]
             spread = float(np.std(so_far)) if so_far.size else 0.0
-            total += (std * max(spread, 1.0)) ** 2
+            total += (std * max(spread, 1.0)) ** 2 if so_far.size else UNSEEN_STD**2
     return total
 
 
-def _offset(history: History, name: str, reference: float, k: int) -> float:
-    value = float(history.covariates[name][k])
-    return 0.0 if np.isnan(value) else value - reference
+def _offset(history: History, name: str, reference: float, k: int, power: int = 1) -> float:
+    """Give a power of a covariate about its reference: its mean so far where it is unknown."""
+    powers = [(float(value) - reference) ** power for value in history.covariates[name][: k + 1]]
+    so_far = [one for one in powers if not np.isnan(one)]
+    return powers[-1] if not np.isnan(powers[-1]) else float(np.mean(so_far or [0.0]))
 
 
 def _first(table: FloatArray) -> float:
@@ -270,7 +273,7 @@ class Textbook:
                 offset = _offset(history, name, reference, k)
                 h[a, at[name, one.mode]] = offset
                 if curvature:
-                    h[a, at[name + "^2", one.mode]] = offset**2
+                    h[a, at[name + "^2", one.mode]] = _offset(history, name, reference, k, 2)
             if ("bias f", one) in at:
                 h[a, at["bias f", one]] = h[r + a, at["bias z", one]] = 1
             for j, step in enumerate(history.steps):
@@ -363,8 +366,9 @@ def _readings(history: History, known: Known, a: Series, c: Series, part: int) -
     n = len(history.logs)
     read = np.zeros((n, n), dtype=np.longdouble)
     for name, reference, std, curvature in known.covariates if part == 0 else ():
-        offset = np.array([_offset(history, name, reference, k) for k in range(n)], np.longdouble)
-        read += std**2 * np.outer(offset, offset) + curvature**2 * np.outer(offset**2, offset**2)
+        for power, size in ((1, std), (2, curvature)):
+            offset = [_offset(history, name, reference, k, power) for k in range(n)]
+            read += np.longdouble(size) ** 2 * np.outer(offset, offset)
     if a == c and a != _reference(history, a.mode):
         read += BIAS[part] ** 2
     for step in history.steps:
@@ -506,6 +510,9 @@ def _life_data(history: History) -> tuple[list[tuple[int, int]], FloatArray, Flo
     first = history.baseline
     ln_f = history.ln_frequency[first:]
     n, m = ln_f.shape
+    temperature = history.covariates["temperature_c"][first:]
+    used = [not np.isnan(t) or np.isnan(temperature[k:]).all() for k, t in enumerate(temperature)]
+    ln_f = np.where(np.array(used)[:, None], ln_f, np.nan)
     where = [(k, i) for k in range(n) for i in range(m) if not np.isnan(ln_f[k, i])]
     centre = [np.mean(ln_f[~np.isnan(ln_f[:, i]), i]) for i in range(m)]
     values = np.array([ln_f[k, i] - centre[i] for k, i in where])
@@ -528,9 +535,9 @@ def life_covariance(
     """
     where, _, clock = _life_data(history)
     first = history.baseline
-    values = history.covariates["temperature_c"][first:]
-    unknown = np.isnan(values)
-    offset = np.where(unknown, 0.0, values - belief.reference)
+    unknown = np.isnan(history.covariates["temperature_c"][first:])
+    logs = range(first, len(history.logs))
+    offset = [_offset(history, "temperature_c", belief.reference, k) for k in logs]
     known = Known((("temperature_c", belief.reference, belief.b_std, 0.0),))
     cov = np.zeros((len(where), len(where)))
     for a, (k, i) in enumerate(where):

@@ -478,7 +478,7 @@ def _rates(kind: str, lives: Sequence[LifeOutcome], stage: Stage) -> Iterator[Ra
         seen = [bool(one) for one in hits]
         if seen:
             row = share_row(sum(seen), len(seen), 0.95)
-            if "at_most" in more:
+            if more.get("at_most") is not None:  # None where a service is chosen by its cost
                 more["p_value"] = float(binom.sf(sum(seen) - 1, len(seen), more["at_most"]))
             yield Rate(kind, what, **row, **more)
 

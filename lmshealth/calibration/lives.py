@@ -17,7 +17,13 @@ from lmshealth.life import constants as of_life
 from lmshealth.life.posterior.data import KM
 from lmshealth.life.posterior.likelihood import NO_MODE, lone_kernel, scatter_prior
 from lmshealth.life.posterior.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
-from lmshealth.life.prognosis import early_life, parameters_with_limit, rate_std
+from lmshealth.life.prognosis import (
+    early_life,
+    lives_by_law,
+    parameters_with_limit,
+    rate_std,
+    reach_of,
+)
 from lmshealth.stage import constants as of_stage
 from lmshealth.stage.degradation_laws import Unchanging
 from lmshealth.stage.description import Stage
@@ -80,9 +86,8 @@ def _median_life(stage: Stage) -> float:
         laws = [(law, weight) for law, weight in laws_of(parameter, 0.0) if law.names]
         ends = []
         for law, weight in laws:
-            path, share = DegradationPath(law, 0.0, ()), weight / sum(own for _, own in laws)
-            theta = path.natural(path.draw(rng, int(np.ceil(share * n)), KM), KM)
-            ends.append(path.passage(theta, limit))
+            share = weight / sum(own for _, own in laws)
+            ends.append(lives_by_law(law, limit, rng, int(np.ceil(share * n)), KM))
         if ends:
             medians.append(float(np.median(np.concatenate(ends))))
     return min(medians)
@@ -108,12 +113,12 @@ class Part:
 
     def left(self, rng: np.random.Generator, now: float, limit: float, horizon: float) -> float:
         """Draw the travel in m from now until the limit; inf past the horizon."""
+        law = self.path.law
         left = self._left_by_law(rng, now, limit, horizon)
         if left > 0 and self.changes:
-            if left <= horizon:
-                law = self.path.law
+            if np.isfinite(left):
                 left *= rng.lognormal(0.0, rate_std(law) * np.sqrt(np.log2(1 + left / now)))
-            proven = now + early_life(self.path.law, limit, rng)
+            proven = now + early_life(law, limit, rng, now)
             hazard = rng.gamma(of_life.UNSEEN_ONSETS) / proven
             onset = rng.exponential() / hazard if hazard > 0 else np.inf
             growth = of_life.UNSEEN_GROWTH
@@ -124,16 +129,18 @@ class Part:
     def _left_by_law(
         self, rng: np.random.Generator, now: float, limit: float, horizon: float
     ) -> float:
-        """Follow the parameter by its law and its deviation alone."""
+        """Follow the parameter by its law and its deviation alone, inf far past the horizon."""
         start = limit * np.exp(-self.off[-1])
         closed = float(self.path.passage(self.theta[None], start)[0]) - now
         # A parameter that gains may have been below the limit before.
         if closed <= 0 and self.by_law(np.array([now]))[0] > start:
             return np.inf
         if self.rate == 0 or closed <= 0:
-            return closed if closed <= horizon else np.inf
-        ahead = np.linspace(0.0, horizon, constants.STEPS_AHEAD + 1)[1:]
-        walk = np.cumsum(np.sqrt(self.rate * ahead[0]) * rng.standard_normal(ahead.size))
+            return closed
+        n, reach = constants.STEPS_AHEAD, reach_of(self.path.law, now, horizon)
+        ends = np.append(np.linspace(0.0, horizon, n + 1), np.linspace(horizon, reach, n + 1)[1:])
+        ahead = ends[1:]
+        walk = np.cumsum(np.sqrt(self.rate * np.diff(ends)) * rng.standard_normal(ahead.size))
         with np.errstate(divide="ignore"):
             health = np.log(self.by_law(now + ahead)) + self.off[-1] + walk
         below = np.flatnonzero(health <= np.log(limit))

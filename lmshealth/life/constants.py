@@ -93,8 +93,6 @@ LIFE_SHARES = (0.3, 0.6, 0.9)
 """Shares of an ended life after which its end is predicted: young, middle-aged and old."""
 MIN_PAST = 0.5
 """Probability of being past a limit at its last log from which an ended life has reached it."""
-SURPRISE = 0.01
-"""Probability of as many early ends, were the predictions right, below which they are noticed."""
 
 # Sampling.
 N_DRAWS = 4000

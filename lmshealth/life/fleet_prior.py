@@ -9,12 +9,14 @@ from itertools import pairwise
 
 import msgspec
 import numpy as np
-from scipy.special import bdtrc, betainc, softmax
+from numpy.linalg import LinAlgError
+from scipy.special import betainc, softmax
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import fingerprint
 from lmshealth.errors import LmshealthError
 from lmshealth.life import constants
+from lmshealth.life.posterior.data import with_clock
 from lmshealth.life.posterior.fit import LifePosterior
 from lmshealth.life.posterior.likelihood import NO_MODE, scatter_prior
 from lmshealth.life.posterior.scenarios import laws_of
@@ -160,9 +162,10 @@ def fleet_priors(stage: Stage, evidence: Mapping[str, MachineEvidence]) -> dict[
     laws: dict[str, list[LawPrior]] = {name: [] for name in needy}
     for parameter in stage.parameters:
         predictives = []
+        n_laws = len(laws_of(parameter, stage.description.life.free))
         for law in parameter.laws:
             own = {name: evidence[name].laws[parameter.name][law.kind] for name in machines}
-            predictives.append(_predictives(own, needy, len(parameter.laws)))
+            predictives.append(_predictives(own, needy, n_laws))
         for name in needy:
             found = [one[name] for one in predictives]
             laws[name] += _law_priors(parameter, evidence[name].laws[parameter.name], found)
@@ -337,28 +340,30 @@ class Calibration:
     """Remaining travel that a share of machines outlives at least, by the ended lives of a fleet.
 
     `coverage` is that share, 1 - k / (n + 1) for the k-th smallest place of n lives; `travel` in m
-    is infinite beyond the horizon. `early` lives ended before the travel predicted for a tenth;
-    with right predictions as many have the probability `p_value`.
+    is infinite beyond the horizon.
     """
 
     n_lives: int
     n_reached: int
     coverage: float
     travel: float
-    early: int
-    p_value: float
 
 
 def ended_lives(history: History, stage: Stage, seed: int | Sequence[int]) -> tuple[EndedLife, ...]:
     """Predict the ends of the lives before the present baseline, and compare with their ends.
 
-    Lives that are too short for a prognosis are left out.
+    A life ends at the work after its baseline. Lives without a prognosis, as they are too short,
+    are left out.
     """
     found = []
-    for _, end in pairwise(history.baselines):
+    history = with_clock(history, stage)
+    resets = [step.first for step in history.steps if step.kind == "reset"]
+    for begin, after in pairwise(history.baselines):
+        # The work may be logs before the next baseline.
+        end = next((first for first in resets if begin < first), after)
         try:
-            found.append(_ended_life(history.first_logs(end), stage, seed))
-        except LmshealthError:
+            found.append(_ended_life(history.first_logs(min(end, after)), stage, seed))
+        except (LmshealthError, LinAlgError):  # no ended life must end the present one
             continue
     return tuple(one for one in found if one is not None)
 
@@ -389,12 +394,9 @@ def calibrate(prognosis: Prognosis, lives: Sequence[EndedLife]) -> Calibration |
     level, left = places[k - 1], 0.0
     if level > 0:  # else an end came before every draw, and no travel is supported
         left = float(np.quantile(prognosis.remaining[:, -1], level, method="inverted_cdf"))
-    early = sum(place < constants.CALIBRATED_RISK for place in places)
     return Calibration(
         n_lives=n,
         n_reached=sum(one.reached for one in lives),
         coverage=1 - k / (n + 1),
         travel=np.inf if left > prognosis.horizon else max(left, 0.0),
-        early=early,
-        p_value=float(bdtrc(early - 1, n, constants.CALIBRATED_RISK)),
     )

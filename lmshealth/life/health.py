@@ -385,15 +385,17 @@ def _first_of(weights: tuple[float, ...]) -> tuple[float, ...]:
 
 
 def _of_drifts(drifts: Drifts, stage: Stage, k: int) -> History | None:
-    """Return a history of the baseline and of the drifts at an epoch; None without a drift."""
+    """Return a history of baseline and drifts at an epoch; None without a drift or travel."""
     variance = np.einsum("kii->ki", drifts.drift_cov)
     there = np.isfinite(drifts.drift) & np.isfinite(variance) & (variance > 0)
     modes = [m for m in stage.informative if m in drifts.modes and there[k, drifts.modes.index(m)]]
     if not modes:
         return None
-    # A baseline has no variance; without one the odometer counts from it.
-    before = [j for j in range(k) if not there[j].any()]
+    # A baseline has drifts of variance 0; without one the odometer counts from its 0.
+    before = [j for j in range(k) if (variance[j] == 0).any() and not there[j].any()]
     begin = drifts.travel[before[-1]] if before else 0.0
+    if drifts.travel[k] <= begin:
+        return None
     n, columns = len(modes), [drifts.modes.index(mode) for mode in modes]
     cov = np.zeros((2, 2 * n, 2 * n))
     diagonal(cov)[:] = _EXACT

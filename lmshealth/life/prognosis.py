@@ -26,6 +26,7 @@ _N_CURVE, _N_COARSE = 101, 40
 _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 # Grid points up to 1.5 times the passage of the law alone, and from there to the horizon.
 _NEAR, _FAR, _BEYOND = 24, 12, 1.5
+_REACH = 3.0  # standard deviations of ln of the travel left
 _N_LIVES = 2000  # of the prior of a law
 _RARE = 1e-9  # bounds of the mean and shape of the inverse Gaussian
 
@@ -249,11 +250,12 @@ def passages(
             assert parameter.limit is not None
             path, limit = one.scenario.paths[j], parameter.limit.below / parameter.baseline
             of_health = (path, theta[j], off[:, j], rate[:, j], rng)
-            left = first_passage(*of_health, now=now, limit=limit, horizon=horizon)
+            reach = reach_of(path.law, now, horizon)
+            left = first_passage(*of_health, now=now, limit=limit, horizon=reach)
             by_law = path.health(theta[j], np.array([now]))[:, 0]
             half = path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
             if path.law.names:
-                proven = now + early_life(path.law, limit, rng)
+                proven = now + early_life(path.law, limit, rng, now)
                 left, half = _beyond_laws(rng, path.law, left, half, now=now, proven=proven)
             columns.append(left)
             halves.append(half)
@@ -272,11 +274,27 @@ def rate_std(law: Law) -> float:
     return constants.ACCELERATION_STD if late else constants.RATE_STD
 
 
-def early_life(law: AnyLaw, limit: float, rng: np.random.Generator) -> float:
+def reach_of(law: Law, now: float, horizon: float) -> float:
+    """Return the travel in m up to which an end by a law may come within the horizon after all."""
+    spread = rate_std(law) * np.sqrt(np.log2(1 + horizon / now)) if law.names else 0.0
+    return horizon * float(np.exp(_REACH * spread))
+
+
+def early_life(law: AnyLaw, limit: float, rng: np.random.Generator, now: float) -> float:
     """Return the travel in m before which few machines of the description reach a limit."""
-    path = DegradationPath(law, 0.0, ())
-    lives = path.passage(path.natural(path.draw(rng, _N_LIVES, KM), KM), limit)
+    lives = lives_by_law(law, limit, rng, _N_LIVES, now)
     return float(np.quantile(lives, constants.EARLY_LIFE, method="inverted_cdf"))
+
+
+def lives_by_law(
+    law: AnyLaw, limit: float, rng: np.random.Generator, n: int, now: float
+) -> FloatArray:
+    """Draw the travel in m to a limit by the prior of a law, ``(n,)``.
+
+    The prior of a change without a law is that up to `now`, the travel in m of the last log.
+    """
+    path = DegradationPath(law, 0.0, ())
+    return path.passage(path.natural(path.draw(rng, n, now), now), limit)
 
 
 def _beyond_laws(

@@ -280,6 +280,9 @@ def _judge_step(
                 sizes=moved,
             )
         )
+    sentences.append(
+        fact("A payload or another condition that no log states would move the modes likewise.")
+    )
     if health is not None and health.publishable_parameters().any():
         sentences.append(_parameter_sentences(stage, health))
     # The evidence is against all that is harmless: wander, outliers, running-in.
@@ -298,13 +301,14 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
     lone = health.lone.ravel() if lost else np.empty(0, dtype=int)
     degraded = np.column_stack(list(lost.values()))
     modes = np.where(degraded.any(axis=1), NO_MODE, lone)
-    draws = Counter(zip(map(tuple, degraded.tolist()), modes.tolist(), strict=True))
+    draws = Counter(zip(map(tuple, degraded.tolist()), (modes != NO_MODE).tolist(), strict=True))
     # Of equally probable verdicts the one with more degraded parameters: it allows for more.
     chosen = max(draws, key=lambda one: (draws[one], sum(one[0]), one))
-    verdict, mode = verdict_of(tuple(compress(lost, chosen[0]))), chosen[1]
+    verdict = verdict_of(tuple(compress(lost, chosen[0])))
     why = _parameter_sentences(stage, health)
-    if mode != NO_MODE:
+    if chosen[1]:
         verdict = OUTSIDE_MAP
+        [(mode, _)] = Counter(modes[modes != NO_MODE].tolist()).most_common(1)
         name = health.modes[mode]
         why = f"{lone_sentence(next(m for m in health.lone_modes if m.mode == name), stage)} {why}"
     probability = draws[chosen] / draws.total()

@@ -121,7 +121,9 @@ class Assessment:
             return {}
         drift, variance = track.drift[-1].copy(), np.diagonal(track.drift_cov[-1]).copy()
         for mode in (mode for epoch, mode in track.outliers if epoch == len(track.logs) - 1):
-            k, column = track.modes.index(mode), history.columns(mode)[0]
+            own = history.columns(mode)
+            there = np.isfinite(history.ln_frequency[-1, own])
+            k, column = track.modes.index(mode), own[int(there.argmax())]
             drift[k] = history.ln_frequency[-1, column] - track.ln_frequency[-2, k]
             variance[k] = history.cov[-1, column, column] + track.ln_frequency_std[-2, k] ** 2
         with np.errstate(divide="ignore", invalid="ignore"):
@@ -318,10 +320,9 @@ def _with_results(
     stage, every = made.stage, constants.EMCEE_EVERY
     seed = seed_of(made.seed, history.stage, stage.digest)
     past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
-    if before is None or before.past != past:
-        ended = ended_lives(history, stage, seed)
-    else:
-        ended = before.ended
+    if before is not None and before.past != past:  # draws of another life are no start of this
+        before = None
+    ended = ended_lives(history, stage, seed) if before is None else before.ended
     chains = before is None or len(history.logs) // every > before.n_logs // every
     start = None if before is None else before.start
     life = fit_life(history, stage, seed, chains=chains, before=start)
@@ -342,7 +343,8 @@ def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: 
         try:
             prognosis = prognosis_of(life, history, stage)
         except NotEnoughData as error:
-            notices = (*notices, Notice("no-result", "serious", "", str(error)))
+            notice = Notice("no-result", "serious", "", str(error))
+            notices = (*(one for one in notices if one != notice), notice)
     judgement = judge(stage, made.history, health, made.track, doubt=made.doubt)
     return replace(made, health=health, prognosis=prognosis, judgement=judgement, notices=notices)
 

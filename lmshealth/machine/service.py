@@ -35,7 +35,7 @@ class Service:
     kind: Literal["now", "by", "later", "unknown"]  # by a day; later than the horizon or never
     by: date | None  # last day, that of the last log for ``now``
     # Days from the last log, negative if the accepted risk was reached before it, infinite for
-    # ``later``, NaN for ``unknown``.
+    # ``later``; of ``unknown`` NaN without a prognosis, else beyond the calendar.
     wait: float
     risk: float  # upper bound of the probability to reach a limit before that day; NaN without one
     planned: date | None  # next service by the description

@@ -15,7 +15,7 @@ from scipy.special import chdtrc, gammaincinv
 from lmshealth._private.arrays import FloatArray, finite_or_none
 from lmshealth._private.tables import FLAGS, fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
-from lmshealth.life.constants import CALIBRATED_RISK, LONE_NAMED, MIN_FIT, SURPRISE
+from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.verdict import (
     NO_HEALTH,
     OUTSIDE_MAP,
@@ -200,20 +200,6 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
         rely = fact("Do not rely on the remaining life, and record further logs soon.")
         to_do = fact("Record further logs soon.") if by_chance else rely
         yield Notice("laws-do-not-fit", "caution" if by_chance else "serious", "", what, to_do)
-    fleet = assessment.calibration
-    if fleet is not None and fleet.p_value < SURPRISE:
-        what = fact(
-            "{early} of the {n} ended lives of this fleet ended before the travel predicted for "
-            "{share:.0%} of them (p = {p:.1g}).",
-            early=fleet.early,
-            n=fleet.n_lives,
-            share=CALIBRATED_RISK,
-            p=fleet.p_value,
-        )
-        to_do = fact(
-            "Plan by the calibrated travel instead of the service date; add a law that fits."
-        )
-        yield Notice("fleet-ends-early", "serious", "", what, to_do)
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:

@@ -83,6 +83,12 @@ def _draw(
     return np.asarray(prior.quantile(level))
 
 
+def _truncated(prior: Prior, x: FloatArray, high: float = np.inf) -> FloatArray:
+    """Return the log density of a prior truncated at 0 and another value, at values inside."""
+    below, upto = prior.probability(np.array([0.0, high]))
+    return np.asarray(prior.log_density(x) - np.log(upto - below))
+
+
 class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
     """Preload lost by wear of the rolling contacts: P(s) = (1 - (s / s_w)^n)^1.5."""
 
@@ -109,7 +115,7 @@ class HertzWear(Law, frozen=True, tag="hertz-wear", tag_field="kind"):
         """Return the log prior with |d(s_w, n)/d(y1, y2)| = (s_w / n) (dn/dy2)."""
         life, n = HertzWear.natural(self, y, now).T
         slope = log_expit(y[:, 1]) + log_expit(-y[:, 1])
-        return np.asarray(self.life_km.log_density(life / _KM) + np.log(life / _KM / n) + slope)
+        return np.asarray(_truncated(self.life_km, life / _KM) + np.log(life / _KM / n) + slope)
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:
         """Draw coordinates from the prior."""
@@ -162,7 +168,7 @@ class Loosening(Law, frozen=True, tag="loosening", tag_field="kind"):
         floor, life = self.natural(y, now).T
         inside = (floor >= 0) & (floor < 1)
         rest = np.where(inside, 1 - floor, 1.0)
-        value = self.floor.log_density(floor) + self.life_km.log_density(life / _KM)
+        value = _truncated(self.floor, floor, 1.0) + _truncated(self.life_km, life / _KM)
         return np.where(inside, value + np.log(rest * life / _KM), -np.inf)
 
     def draw(self, rng: np.random.Generator, n: int, now: float) -> FloatArray:

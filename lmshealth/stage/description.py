@@ -459,6 +459,15 @@ def load_stage(reference: str | Path, *, follow_links: bool = False) -> Stage:
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
+def _check_lone_mode(path: Path, each: float, n_modes: int) -> None:
+    """Refuse probabilities of modes that move alone, of which one does, above 1 together."""
+    if each * n_modes > 1:
+        raise BadStage(
+            f"{path}: life.lone_mode: {n_modes} modes with {each:g} each have a probability above "
+            f"1 together; needed is at most {1 / n_modes:.3g}"
+        )
+
+
 def _check_map(path: Path, description: Description, modal_map: ModalMap) -> None:
     """Refuse a description that contradicts its map."""
     ends = np.array([modal_map.low, modal_map.high])
@@ -478,11 +487,13 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
         except BadStage as error:
             raise BadStage(f"{path}: parameter[{k}].prior: {error}") from error
     described = [mode.name for mode in description.mode]
-    if not any(mode.tracked and mode.name in modal_map.modes for mode in description.mode):
+    known = [mode for mode in description.mode if mode.tracked and mode.name in modal_map.modes]
+    if not known:
         raise BadStage(
             f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
             f"tracked [[mode]] ({described})"
         )
+    _check_lone_mode(path, description.life.lone_mode, len(known))
     at = np.exp(modal_map.ln_frequency(np.log([[p.baseline for p in description.parameter]]))[0])
     free = {
         name.casefold(): (name, f)

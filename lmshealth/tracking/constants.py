@@ -1,7 +1,7 @@
 """Constants that decide what a track publishes.
 
-Frequencies enter as ln f and damping ratios as ln ζ; a "life" is the horizon of the stage
-description, or the length of the history without one. Rates and random walks are per life.
+Frequencies enter as ln f and damping ratios as ln ζ. Rates and random walks are per "life":
+`LOGS_PER_LIFE` mean distances between the logs so far, by odometer or time.
 """
 
 import numpy as np

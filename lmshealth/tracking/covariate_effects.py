@@ -1,6 +1,5 @@
 """Effects of temperature, payload and position on the modes, with the estimates that show them."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,7 +7,8 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.covariates import Regressor, regressors
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
 from lmshealth.tracking.smoother import smooth
 from lmshealth.tracking.track import Effect, Track, accepted_estimates
@@ -61,23 +61,26 @@ def find_covariate_effects(
     The order is that of the description; a covariate that is unknown or never left its reference
     has no effect. In a long history the level is the filtered one.
     """
-    columns = regressors(history.covariates, stage, history.recorded_at)
+    space = StateSpace(history, stage, track.steps)
+    columns, places = space.regressed, [at for _, _, at in space.effects]
     if not columns:
         return ()
     taken = accepted_estimates(history, track)
-    known = {(e.mode, e.covariate): e for e in track.effects}
     short = len(taken.logs) <= constants.MOST_SMOOTHED
     level = (smooth(taken, track, stage) if short else track).ln_frequency
-    moved, mode_of = covariate_shifts(history, track, stage), taken.mode_of()
-    rest = taken.ln_frequency - level[:, mode_of] - moved[:, mode_of] - _offsets(taken, known)
+    coefficients = np.array([one.coefficient for one in track.effects[: len(places)]])
+    logs, n_series = range(len(history.logs)), len(history.series)
+    moved = np.array([space.matrix(k)[:n_series, places] @ coefficients for k in logs])
+    rest = taken.ln_frequency - level[:, taken.mode_of()] - moved
     found = []
     for covariate in stage.description.covariate:
-        own = [r for r in columns if r.name.removesuffix("^2") == covariate.name]
-        for mode in track.modes if own else ():
-            effects = tuple(known[mode, r.name] for r in own)
+        own = [j for j, r in enumerate(columns) if r.name.removesuffix("^2") == covariate.name]
+        for i, mode in enumerate(track.modes) if own else ():
+            effects = tuple(track.effects[len(track.modes) * j + i] for j in own)
             at, values = history.columns(mode), history.covariates[covariate.name]
             epochs, series = np.nonzero(np.isfinite(rest[:, at]) & np.isfinite(values)[:, None])
-            explained = _explained(own, effects)
+            parts = zip(own, effects, strict=True)
+            explained = np.sum([e.coefficient * columns[j].values for j, e in parts], axis=0)
             found.append(
                 CovariateEffect(
                     mode=mode,
@@ -94,28 +97,8 @@ def find_covariate_effects(
 
 def covariate_shifts(history: History, track: Track, stage: Stage) -> FloatArray:
     """Return the change of ln f of every mode by covariates, shape ``(n_logs, n_modes)``."""
-    columns = regressors(history.covariates, stage, history.recorded_at)
-    known = {(e.mode, e.covariate): e for e in track.effects}
-    moved = np.zeros((len(history.logs), len(track.modes)))
-    for m, mode in enumerate(track.modes):
-        own = [r for r in columns if (mode, r.name) in known]
-        moved[:, m] += _explained(own, tuple(known[mode, r.name] for r in own))
-    return moved
-
-
-def _explained(columns: Sequence[Regressor], effects: Sequence[Effect]) -> FloatArray:
-    return np.asarray(sum(e.coefficient * r.values for r, e in zip(columns, effects, strict=True)))
-
-
-def _offsets(history: History, known: dict[tuple[str, str], Effect]) -> FloatArray:
-    """Return the offsets of ln f by sources, servo and sensors, shape ``(n_logs, n_series)``."""
-    offsets = np.zeros_like(history.ln_frequency)
-    for i, one in enumerate(history.series):
-        bias = known.get((one.mode, f"bias:{one.source}"))
-        offsets[:, i] = 0.0 if bias is None else bias.coefficient
-        for step in history.steps:
-            if step.changes_modes or step.source not in ("", one.source):
-                continue
-            effect = known[one.mode, f"{step.kind}:{step.name or step.source}"]
-            offsets[step.there, i] += effect.coefficient
-    return offsets
+    columns, n_modes = regressors(history.covariates, stage, history.recorded_at), len(track.modes)
+    effects = track.effects[: len(columns) * n_modes]
+    coefficients = np.array([one.coefficient for one in effects]).reshape(-1, n_modes)
+    values = np.array([one.values for one in columns]).reshape(-1, len(history.logs))
+    return np.asarray(values.T @ coefficients)

@@ -20,7 +20,7 @@ class Regressor:
     """One column of the regression of ln f on covariates."""
 
     name: str  # of the covariate, with ``^2`` for its square
-    values: FloatArray  # offset from the reference, 0 where unknown, ``(n_logs,)``
+    values: FloatArray  # offset from the reference, ``(n_logs,)``; where unknown, its mean so far
     prior_std: float  # prior standard deviation of d ln f per unit
     unknown: FloatArray  # variance of ln f where the value is unknown, ``(n_logs,)``
 
@@ -50,14 +50,17 @@ def regressors(
         offset = np.where(known, values - covariate.reference, 0.0)
         if not offset.any():  # it never leaves its reference
             continue
-        # Of the values up to each log: no log uses later ones.
-        n = np.maximum(np.cumsum(known), 1)
-        variance = np.cumsum(offset**2) / n - (np.cumsum(offset) / n) ** 2
-        unknown = np.where(known, 0.0, covariate.prior_std**2 * np.maximum(variance, 1.0))
-        found.append(Regressor(covariate.name, offset, covariate.prior_std, unknown))
+        # A missing value counts as the mean of those before: no log uses later ones.
+        n = np.cumsum(known)
+        mean, square = (np.cumsum(offset**p) / np.maximum(n, 1) for p in (1, 2))
+        unknown = covariate.prior_std**2 * np.maximum(square - mean**2, 1.0)
+        unknown = np.where(known, 0.0, np.where(n > 0, unknown, constants.EXTRAPOLATED**2))
+        value = np.where(known, offset, mean)
+        found.append(Regressor(covariate.name, value, covariate.prior_std, unknown))
         if covariate.curvature_std:
-            square = (f"{covariate.name}^2", offset**2, covariate.curvature_std)
-            found.append(Regressor(*square, np.zeros_like(unknown)))
+            value = np.where(known, offset**2, square)
+            none = np.zeros_like(unknown)
+            found.append(Regressor(f"{covariate.name}^2", value, covariate.curvature_std, none))
         if covariate.name == "temperature_c" and recorded_at:
             found += _daily(covariate, recorded_at)
     return tuple(found)

@@ -341,10 +341,12 @@ def _steps(ordered: Sequence[LogEstimates], actions: Sequence[Action]) -> tuple[
     """Return the declared steps between the logs."""
     moments = [reading.metadata.recorded_at for reading in ordered]
     steps: list[Step] = []
-    ids = np.array([reading.metadata.servo_id or "" for reading in ordered])
-    known = [name for name in dict.fromkeys(ids.tolist()) if name]
+    ids = [""]
+    for reading in ordered:  # an unknown tuning is that of the log before
+        ids.append(reading.metadata.servo_id or ids[-1])
+    known = [name for name in dict.fromkeys(ids) if name]
     for name in known[1:]:
-        there = ids == name
+        there = np.array(ids[1:]) == name
         steps.append(Step("servo", int(np.argmax(there)), there, name=name))
     retuned = {step.first for step in steps}
     for action in sorted(actions, key=lambda action: action.recorded_at):

@@ -100,6 +100,14 @@ def read_estimates(
         to_numbers(cross_terms, terms, ("cov_ln_f",))
         if (empty := terms["cov_ln_f"].isna()).any():
             raise BadTable(f"{cross_terms}, {lines(terms, empty)}: cov_ln_f is empty")
+        if notes or "stage" not in terms.columns:  # of one machine, or of that which has the log
+            machines = table.groupby("log")["stage"].unique()
+            if (several := machines.index[machines.str.len() > 1]).size:
+                raise BadTable(
+                    f"{cross_terms}: several machines have a log {several[0]}; needed is a column "
+                    "stage"
+                )
+            terms["stage"] = terms["log"].map(machines.str[0])
     known = [c for c in covariates if c in table.columns]
     logs = [
         _log(path, str(log), rows, known, shapes, terms)
@@ -256,19 +264,20 @@ def _term_notes(table: pd.DataFrame, terms: pd.DataFrame | None) -> list[str]:
 
     notes, covered = [], set()
     if terms is not None:
-        known = pd.MultiIndex.from_frame(table[["log", "mode", "source"]])
+        known = pd.MultiIndex.from_frame(table[["stage", "log", "mode", "source"]])
         used: BoolArray = np.ones(len(terms), dtype=bool)
         for end in ("a", "b"):
-            own = terms[["log", f"mode_{end}", f"source_{end}"]]
+            own = terms[["stage", "log", f"mode_{end}", f"source_{end}"]]
             used &= pd.MultiIndex.from_frame(own).isin(known)
         if not used.all():
             notes.append(
                 f"{int((~used).sum())} of {used.size} cross terms are of estimates that the table "
                 f"does not have ({lines(terms, pd.Series(~used, terms.index))}); they are not used"
             )
-        covered = set(terms["log"][used & (terms["source_a"] != terms["source_b"])])
-    several = table.groupby("log")["source"].nunique() > 1
-    lone = [str(log) for log in several.index[several] if log not in covered]
+        across = terms[used & (terms["source_a"] != terms["source_b"])]
+        covered = set(zip(across["stage"], across["log"], strict=True))
+    several = table.groupby(["stage", "log"])["source"].nunique() > 1
+    lone = [str(own[1]) for own in several.index[several] if own not in covered]
     if lone:
         notes.append(
             f"{len(lone)} logs with several sources, but no covariances between them "
@@ -341,7 +350,8 @@ def _covariance(path: Path, log: str, rows: pd.DataFrame, terms: pd.DataFrame | 
     cov[i, n + i] = cov[n + i, i] = rho * std_f * std_z
     if terms is not None:
         place = {key: i for i, key in enumerate(zip(rows["mode"], rows["source"], strict=True))}
-        for term in terms[terms["log"] == log].itertuples():
+        own = (terms["log"] == log) & (terms["stage"] == rows["stage"].iloc[0])
+        for term in terms[own].itertuples():
             a = place.get((str(term.mode_a), str(term.source_a)))
             b = place.get((str(term.mode_b), str(term.source_b)))
             if a is not None and b is not None and a != b:

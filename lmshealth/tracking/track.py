@@ -213,8 +213,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
     history : History
         Modal estimates with covariance; missing ones are NaN.
     stage : Stage, optional
-        Its covariates are regressed out, and rates are per its horizon. Without it every covariate
-        present is, about its median, and rates are per length of the history.
+        Its covariates are regressed out. Without it every covariate present is, about its median.
 
     Returns
     -------
@@ -404,22 +403,11 @@ def _evidence(step: Step, size: FloatArray, cov: FloatArray) -> float:
 
 def _effects(state: TrackState) -> tuple[Effect, ...]:
     """List the effects that are no wear, after the last log."""
-    space, bank, modes = state.space, state.bank, state.space.history.modes
+    space, bank = state.space, state.bank
     mean, std = state.published.mean, np.sqrt(np.maximum(np.diag(state.published.cov), 0.0))
-    places = [(one.name, space.regressor(j).start) for j, one in enumerate(space.regressed)]
-    places += [
-        (f"{step.kind}:{step.name or step.source}", space.jump(j).start)
-        for j, step in enumerate(space.steps)
-        if not step.changes_modes
-    ]
     effects = [
-        Effect(mode, name, float(mean[first + i]), float(std[first + i]))
-        for name, first in places
-        for i, mode in enumerate(modes)
+        Effect(mode, name, float(mean[at]), float(std[at])) for mode, name, at in space.effects
     ]
-    for j, i in enumerate(space.biased):
-        at, one = space.first_bias + 2 * j, space.history.series[i]
-        effects.append(Effect(one.mode, f"bias:{one.source}", float(mean[at]), float(std[at])))
     for s, source in enumerate(state.space.sources):
         values = bank.hyperparameters.scales[:, s]
         scale = float(bank.weight @ values)

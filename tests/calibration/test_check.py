@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -184,6 +185,18 @@ def test_rates_are_held_to_what_is_stated() -> None:
     assert found.wrong == (f"{DRAWN}: {late}",)
     alarms = next(one for one in found.rates if one.what == "alarm of the tracker (false)")
     assert (alarms.hits, alarms.n) == (10, 100)
+
+
+def test_a_service_chosen_by_its_cost_has_no_rate_to_hold() -> None:
+    """Without an accepted risk the rate of late services is reported alone."""
+    stage = load_stage("lms-y")
+    decision = msgspec.structs.replace(stage.description.decision, max_risk=None, cost_ratio=5.0)
+    by_cost = replace(
+        stage, description=msgspec.structs.replace(stage.description, decision=decision)
+    )
+    found = summarise(by_cost, SCHEDULE, outcomes(20, late=0.3), seed=0)
+    (late,) = (one for one in found.rates if one.what == "limit reached before the service date")
+    assert (late.at_most, late.hits > 0, late.exceeded) == (None, True, False)
 
 
 def test_a_life_without_posterior_counts_as_unpublished(

@@ -305,6 +305,18 @@ def test_a_mode_that_is_missing_at_an_epoch_is_done_without(tmp_path: Path) -> N
     assert found.recorded_at == (track.recorded_at[1], track.recorded_at[3])
     assert found.identifiable.tolist() == [[False, True], [True, True]]
     assert (found.informed[0] < found.informed[1]).all()
+    # The epoch without any is no baseline either: the travel counts from the first one.
+    kept = [0, 1, 3]
+    three = Drifts(
+        track.stage,
+        tuple(track.recorded_at[k] for k in kept),
+        track.travel[kept],
+        track.modes,
+        drift[kept],
+        cov[kept],
+    )
+    width = infer_drifts(three, stage, 3).prior_width[1]
+    assert found.prior_width[1] == pytest.approx(width, rel=0.2)
 
 
 @pytest.mark.usefixtures("unchained")

@@ -26,7 +26,7 @@ from lmshealth.life.prognosis import (
     parameters_with_limit,
     prognose,
 )
-from lmshealth.stage.degradation_laws import Accelerating, Linear
+from lmshealth.stage.degradation_laws import Accelerating, Free, Linear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Normal
 from lmshealth.tracking.history import History, Step
@@ -418,8 +418,12 @@ def test_an_unseen_onset_has_the_hazard_of_none_in_the_travel_proven(
 def test_early_lives_of_a_description_count_as_proven() -> None:
     """A twentieth of the rates of N(0, 2e-4) per km exceeds 3.29e-4: 1,216 km to a limit of 0.6."""
     law = Linear(rate_per_km=Normal(0.0, 2e-4))
-    found = early_life(law, 0.6, np.random.default_rng(1))
-    assert found == pytest.approx(0.4 / 3.29e-4 * 1e3, rel=0.06)
+    for now in (1e3, 1e6):
+        found = early_life(law, 0.6, np.random.default_rng(1), now)
+        assert found == pytest.approx(0.4 / 3.29e-4 * 1e3, rel=0.06)
+    # The prior of a change without a law is that up to now.
+    two = [early_life(Free(), 0.6, np.random.default_rng(1), now) for now in (1e5, 1e6)]
+    assert two[1] == pytest.approx(10 * two[0])
 
 
 def test_intervals_open_with_the_distance_beyond_the_travel_seen(
@@ -442,18 +446,23 @@ def test_intervals_open_with_the_distance_beyond_the_travel_seen(
     np.testing.assert_array_equal(of_past[0], past)
 
 
-@pytest.mark.parametrize("deviation", [0.0, 0.05])
+@pytest.mark.parametrize(("deviation", "rate_std"), [(0.0, 0.075), (0.05, 0.075), (0.05, 1.0)])
 def test_the_posterior_does_not_depend_on_the_horizon(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, deviation: float, rate_std: float
 ) -> None:
-    """Horizons of 2,500 and 160,000 km: the same health, and the same risks up to the nearer."""
+    """Horizons of 1,000 and 160,000 km: the same health, and the same risks up to the nearer.
+
+    The future that opens brings some ends within the horizon that are beyond it by their law.
+    """
     monkeypatch.setattr(constants, "DEVIATION_STDS", (deviation,))
+    monkeypatch.setattr(constants, "RATE_STD", rate_std)
     stages = [
         make_stage(tmp_path / str(km), (FADING,), tail=LAWS_ALONE + f"[usage]\nhorizon_km = {km}\n")
-        for km in (2500, 160_000)
+        for km in (1000, 160_000)
     ]
     near, far = (prognose(fading_life(1.5e-4), stage, 3, chains=False) for stage in stages)
     np.testing.assert_array_equal(near.health, far.health)
-    for level in (0.25, 0.5, 0.75):
-        travel = np.quantile(near.remaining[:, -1], level)
-        assert abs(np.mean(far.remaining[:, -1] <= travel) - level) < 0.035
+    for share in (0.25, 0.5, 0.75, 1.0):
+        risks = [np.mean(one.remaining[:, -1] <= share * near.horizon) for one in (near, far)]
+        assert abs(risks[0] - risks[1]) < 0.02
+    assert 0.05 < risks[0] < 0.9

@@ -157,6 +157,16 @@ def test_a_mode_that_moves_alone_counts_only_without_a_loss(stage: Stage) -> Non
     assert (found.verdict, found.probability) == ("preload", pytest.approx(0.4))
 
 
+def test_modes_that_may_each_have_moved_alone_count_together(stage: Stage) -> None:
+    """Of 33 draws in a hundred roll, of 32 yaw moved alone: one of them has, and roll is named."""
+    lone = np.repeat([0, 2, NO_MODE], [330, 320, 350])
+    roll = LoneMode("roll", -0.02, 0.001, 0.33)
+    health = make_health(around(0.99, 1.0), lone=lone, lone_modes=(roll, YAW))
+    found = judge(stage, logs(8), health)
+    assert (found.verdict, found.probability) == (OUTSIDE_MAP, pytest.approx(0.65))
+    assert found.why.startswith(lone_sentence(roll, stage))
+
+
 def test_a_mode_that_moves_alone_without_informed_health_is_no_verdict(stage: Stage) -> None:
     """Where the logs constrain no parameter, none of the draws counts."""
     health = make_health(around(0.99, 1.0), informed=(0.1, 0.1), lone=alone(1.0), lone_modes=(YAW,))
@@ -183,6 +193,7 @@ def test_an_undeclared_step_is_the_verdict(stage: Stage) -> None:
     assert "roll −3.0 %" in found.why
     assert "pitch +0.2 %" in found.why
     assert "Mount stiffness is at 60 %" in found.why
+    assert "A payload or another condition that no log states" in found.why
     # Also where the logs do not carry health.
     assert judge(stage, logs(8), None, stepped()).verdict == "step"
     # Each jump since the baseline is named.

@@ -10,13 +10,16 @@ import numpy as np
 import pytest
 
 from lmshealth._private.serialize import pack, unpack
+from lmshealth.calibration.lives import make_history
 from lmshealth.life import constants
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.machine import assessment as assessing
 from lmshealth.machine.assessment import Assessment, LifeState
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
+from lmshealth.tracking.history import Series
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from lmshealth.tracking.track import track
 from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage, true_drift
 
 
@@ -82,6 +85,35 @@ def test_emcee_samples_the_first_and_each_sixteenth_log(
     emcee = [n for n, sampler in found.items() if sampler == "emcee"]
     assert emcee == [13, 16, 33]
     assert fits == [(n in emcee, n > 13) for n in found]
+
+
+def test_a_new_life_is_not_updated_from_the_old_one(
+    stage: Stage, fits: list[tuple[bool, bool]]
+) -> None:
+    """After a baseline chains run without the draws of the life before."""
+    logs = readings(20)
+    _, before = assess_from(logs[:17], stage, None)
+    logs[10] = replace(logs[10], metadata=replace(logs[10].metadata, baseline=True))
+    fits.clear()
+    assess_from(logs[:18], stage, before)
+    assert fits == [(True, False)]
+
+
+def test_a_drift_is_that_of_a_source_with_an_estimate(stage: Stage) -> None:
+    """Roll falls by 5 % in the last of four logs, in which its first source has no estimate."""
+    made, _ = assess_from(readings(4), stage, None)
+    modes, n = ("roll", "pitch", "yaw"), 4
+    series = (*(Series(mode, "acc") for mode in modes), Series("roll", "delta_e"))
+    rng = np.random.default_rng(0)
+    ln_f = np.asarray(np.log(FREQUENCY)[[0, 1, 2, 0]] + 3e-4 * rng.standard_normal((n, 4)))
+    ln_f[-1, [0, 3]] -= 0.05
+    cov = np.tile(np.diag([1e-7] * 4 + [0.05**2] * 4), (n, 1, 1))
+    missing = np.zeros((n, 4), dtype=bool)
+    missing[-1, 0] = True
+    estimates = ln_f, np.full((n, 4), float(np.log(0.02))), cov
+    history = make_history(modes, 1e5 * np.arange(4.0), estimates, series=series, missing=missing)
+    found = replace(made, history=history, track=track(history, stage))
+    assert found.drifted["roll"][0] == pytest.approx(-0.05, abs=1e-3)
 
 
 def test_emcee_samples_where_the_verdict_changes(

@@ -87,7 +87,9 @@ def test_an_idle_machine_needs_no_service_within_any_calendar() -> None:
     """A day past the last one of the calendar is no date, and no error."""
     prognosis = make_prognosis(np.full(100, 9e6), np.full(100, 1.0))
     assert decide(prognosis, Decision(max_risk=0.05)).by is None
-    assert decide(prognosis, Decision()).kind == "unknown"
+    service = decide(prognosis, Decision())
+    assert (service.kind, service.by) == ("unknown", None)
+    assert np.isfinite(service.wait)
     assert day_after(prognosis, np.inf) is None
 
 

@@ -19,6 +19,7 @@ from lmshealth.io.buffers import MINUTE, Stored
 from lmshealth.io.column_map import load_columns
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.io.reading import read_log
+from lmshealth.modal import constants
 from lmshealth.modal import identification as modal
 from lmshealth.modal.ambient import cluster_fit
 from lmshealth.modal.ambient.cluster_fit import fit_modes
@@ -589,7 +590,7 @@ def test_shapes_out_of_phase_leave_modes_at_their_truth(
         for (f, zeta), shape in zip([(126, 0.015), (137, 0.015), (155, 0.018)], shapes, strict=True)
     ]
     if real:
-        monkeypatch.setattr(cluster_fit.constants, "QUADRATURE_SIGMAS", (np.inf, np.inf))
+        monkeypatch.setattr(constants, "QUADRATURE_SIGMAS", (np.inf, np.inf))
     off = []
     for seed in range(4):
         found = identify(acceleration_log(rng(seed), modes, 60.0, RATE, 0.5), make_stage(LMS_Y))

@@ -78,6 +78,21 @@ def test_prior_in_coordinates_is_the_natural_one_times_the_jacobian(law: AnyLaw)
     np.testing.assert_allclose(found, known, atol=2e-5)
 
 
+def test_truncated_priors_have_the_integral_1() -> None:
+    """Of lengths above 0 and floors from 0 to 1, on a grid of coordinates."""
+    wear = HertzWear(life_km=Normal(1000.0, 800.0))
+    loose = Loosening(life_km=Lognormal(4000.0, 1.0), floor=Normal(0.8, 0.3))
+    ends: tuple[tuple[AnyLaw, tuple[float, float], tuple[float, float]], ...] = (
+        (wear, (-12.0, 12.0), (-14.0, 14.0)),
+        (loose, (-20.0, 1.0), (np.log(1e4), np.log(1e9))),
+    )
+    for law, first, second in ends:
+        y1, y2 = np.linspace(*first, 1500), np.linspace(*second, 700)
+        y = np.stack(np.meshgrid(y1, y2, indexing="ij"), axis=-1).reshape(-1, 2)
+        mass = np.exp(law.log_prior(y, 3e5)).sum() * (y1[1] - y1[0]) * (y2[1] - y2[0])
+        assert mass == pytest.approx(1.0, abs=1e-3)
+
+
 @pytest.mark.parametrize("law", LAWS, ids=NAMES)
 def test_draws_follow_the_prior(law: AnyLaw) -> None:
     """Draws, turned to natural parameters, have the quantiles of the stated priors."""

@@ -223,6 +223,19 @@ def test_a_new_tuning_is_a_step_of_the_servo(stage: Stage) -> None:
     np.testing.assert_array_equal(history.steps[0].there, [False, False, True, True, False])
 
 
+def test_an_unknown_tuning_is_that_of_the_log_before(stage: Stage) -> None:
+    """Logs without servo_id after a retuning are not of the first tuning."""
+    readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(6)]
+    ids = (None, "a", None, "b", None, None)
+    named = [
+        replace(r, metadata=replace(r.metadata, servo_id=own))
+        for r, own in zip(readings, ids, strict=True)
+    ]
+    history, _ = build_history(named, stage)
+    assert [(s.kind, s.first, s.name) for s in history.steps] == [("servo", 3, "b")]
+    np.testing.assert_array_equal(history.steps[0].there, [False] * 3 + [True] * 3)
+
+
 def test_work_is_a_step_or_a_baseline(stage: Stage) -> None:
     """Work on guide or mount opens a baseline; actions before the first log have no effect."""
     readings = [make_reading(str(k), k, 1e5 * k, {"roll": 4.8}) for k in range(6)]

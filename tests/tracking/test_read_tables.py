@@ -128,6 +128,20 @@ def test_cross_terms_enter_the_covariance_of_their_log(tmp_path: Path) -> None:
     assert second.modes.cov.shape == (2, 2)
 
 
+def test_cross_terms_are_of_their_machine(tmp_path: Path) -> None:
+    """Two machines have a log of one name: the column stage is needed, and says which is meant."""
+    own = HEAD + row() + row(mode="pitch")
+    text = own + (row() + row(mode="pitch")).replace("AX-1", "AX-2")
+    with pytest.raises(BadTable, match="several machines have a log a; needed is a column stage"):
+        read(tmp_path, text, "a,acc,roll,acc,pitch,3e-7\n")
+    (tmp_path / "named.csv").write_text(
+        "stage,log,source_a,mode_a,source_b,mode_b,cov_ln_f\nAX-2,a,acc,roll,acc,pitch,3e-7\n"
+    )
+    (tmp_path / "modes.csv").write_text(text)
+    logs, _ = read_estimates(tmp_path / "modes.csv", cross_terms=tmp_path / "named.csv")
+    assert {one.metadata.stage: one.modes.cov[0, 1] for one in logs} == {"AX-1": 0.0, "AX-2": 3e-7}
+
+
 def test_another_program_needs_three_columns(tmp_path: Path) -> None:
     """The notes list what is assumed without names, sources, odometer and damping."""
     text = "recorded_at,frequency_hz,frequency_std_hz\n2026-03-01T06:00:00Z,126.4,0.1\n"

@@ -52,7 +52,7 @@ def test_the_published_filter_is_the_joint_gaussian_given_all_logs(
     history = awkward_history(np.random.default_rng(1))
     followed = track(history, stage)
     found = smooth(history, followed, stage)
-    book = batch(history, shown(wander), replace(KNOWN, reopened=(9,)), smoothed=True)
+    book = batch(history, shown(wander), replace(KNOWN, reopened=(1, 9)), smoothed=True)
     variance = np.einsum("kpipi->kpi", book.cov)
     std = np.sqrt(np.maximum(variance, 1e-2 * variance[:, :1]))
     judged = np.arange(len(history.logs)) >= history.baselines[0]

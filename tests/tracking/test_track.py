@@ -106,8 +106,8 @@ def test_one_setting_is_a_filterpy_loop(
     history = awkward_history(np.random.default_rng(1))
     plain(wander)
     found = track(history, stage)
-    # After work on the machine its rates are unknown anew.
-    known = replace(KNOWN, reopened=(9,))
+    # At a baseline, as after work on the machine, its rates are unknown anew.
+    known = replace(KNOWN, reopened=(1, 9))
     bank_book = filterpy_loop(history, wander, known)
     np.testing.assert_allclose(found.nis, bank_book.nis, rtol=1e-9, atol=1e-10)
     if wander.decay:
@@ -367,6 +367,18 @@ def test_temperature_alone_raises_no_drift(stage: Stage) -> None:
     for effect in effects:
         assert abs(effect.coefficient + 8e-4) < 4 * effect.std
         assert effect.std < 1e-4
+
+
+def test_an_alarm_is_of_the_drift_since_the_baseline(stage: Stage) -> None:
+    """A loss before a baseline that is flagged later is no alarm, and leaves that after it one."""
+    ln_f, ln_zeta = still(np.random.default_rng(3), 40)
+    loss = 0.004 * (np.minimum(np.arange(40), 15) + np.maximum(np.arange(40) - 24, 0))[:, None]
+    history = make_history(ln_f - loss, ln_damping=ln_zeta, std=5e-4)
+    at_first, later = (track(replace(history, baselines=(k,)), stage) for k in (0, 20))
+    assert [one.epoch < 20 for one in at_first.alarms] == [True]
+    (alarm,) = later.alarms
+    assert alarm.epoch > 24
+    assert -0.1 < alarm.size < 0
 
 
 def test_temperature_that_is_not_recorded_reads_as_drift(stage: Stage) -> None:

@@ -6,13 +6,14 @@ from typing import Self
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly
 from lmshealth._private.tables import fact
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.scenarios import Scenario, list_scenarios
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.constants import MAX_STEPS
+from lmshealth.tracking.covariates import Regressor, regressors
 from lmshealth.tracking.history import History
 
 SECONDS_PER_DAY, KM = 86_400.0, 1000.0
@@ -25,6 +26,7 @@ class LifeData(ReadOnly):
 
     stage: Stage
     history: History  # all logs, condensed
+    regressors: tuple[Regressor, ...]  # covariates of these
     # Series of the history that are used, their modes, and the mode of each, ``(n_series,)``.
     columns: list[int]
     modes: tuple[str, ...]
@@ -42,7 +44,8 @@ class LifeData(ReadOnly):
         """Select the data of a life; raise `NotEnoughData` as `fit_life` describes it."""
         if not stage.parameters:
             raise BadStage(f"{stage.name}: no [[parameter]] to infer")
-        history = condense(with_clock(history, stage), constants.MAX_LOGS)
+        whole = with_clock(history, stage)
+        history, regressed = _with_regressors(whole, stage, min_logs)
         if not history.has_odometer:
             raise NotEnoughData(
                 fact(
@@ -58,7 +61,7 @@ class LifeData(ReadOnly):
         of_series = [history.series[i].mode for i in columns]
         modes = tuple(dict.fromkeys(of_series))
         ln_f = history.ln_frequency[history.baseline :, columns]
-        all_clock, steps = clock_and_steps(history)
+        all_clock, (_, steps) = clock_and_steps(history)[0], clock_and_steps(whole)
         clock = all_clock[history.baseline :]
         now, n_logs = float(clock.max(initial=0.0)), np.isfinite(ln_f).any(axis=1).sum()
         if n_logs < min_logs or now <= 0:
@@ -77,7 +80,7 @@ class LifeData(ReadOnly):
         means = np.array([np.nanmean(ln_f[:, mode_of_series == i]) for i in range(len(modes))])
         y = ln_f[log_of, series_of] - means[mode_of_series[series_of]]
         places = (series_of, log_of, y)
-        return cls(stage, history, columns, modes, mode_of_series, clock, steps, *places)
+        return cls(stage, history, regressed, columns, modes, mode_of_series, clock, steps, *places)
 
     @property
     def now(self) -> float:
@@ -129,6 +132,34 @@ def with_clock(history: History, stage: Stage) -> History:
     assert per_day is not None  # the description has been checked
     days = (history.seconds - history.seconds[:1]) / SECONDS_PER_DAY
     return replace(history, travel=days * per_day * KM)
+
+
+def _with_regressors(
+    history: History, stage: Stage, min_logs: int
+) -> tuple[History, tuple[Regressor, ...]]:
+    """Condense a history and its covariates, without estimates whose covariate is unknown.
+
+    Those are kept that no log with the covariate follows, and all if too few others are left.
+    """
+    found = regressors(history.covariates, stage, history.recorded_at)
+    known = np.array([one.unknown == 0 for one in found], bool).reshape(-1, len(history.logs))
+    known_later = np.logical_or.accumulate(known[:, ::-1], axis=1)[:, ::-1]
+    lost = (~known & known_later).any(axis=0)
+    seen: BoolArray = np.asarray(np.isfinite(history.ln_frequency).any(axis=1))
+    if (seen & ~lost)[history.baseline :].sum() >= min_logs:
+        ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
+        ln_f[lost] = ln_zeta[lost] = cov[lost] = np.nan
+        history = replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov)
+        seen &= ~lost
+    # Means over the logs of a group that have an estimate, also of squares and of daily cycles.
+    columns = {f"{one.name}:unknown": one.unknown for one in found}
+    columns |= {one.name: one.values for one in found}
+    averaged = {name: np.where(seen, own, np.nan) for name, own in columns.items()}
+    history = condense(replace(history, covariates=averaged), constants.MAX_LOGS)
+    means = {name: np.nan_to_num(own) for name, own in history.covariates.items()}
+    return history, tuple(
+        replace(one, values=means[one.name], unknown=means[f"{one.name}:unknown"]) for one in found
+    )
 
 
 def condense(history: History, most: int) -> History:

@@ -24,7 +24,6 @@ from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage import constants as of_stage
 from lmshealth.stage.description import ScatterPrior, Stage
 from lmshealth.tracking.constants import BIAS_STD, JUMP_STD
-from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import History
 
 # Lives of the prior per scenario that the nodes are chosen by, and the drift in ln f that the QR
@@ -56,13 +55,14 @@ class LifeCovariance(ReadOnly):
     """Parts of the covariance Σ of the data, each of shape ``(n_data, n_data)``.
 
     `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
-    of the estimates; `walk` the random walk of ln f with variance 1 at the last log; `deviation`
-    that of ln health, likewise; `lone` the drift of a mode by a cause of its own, of all modes as
-    if each had one.
+    of the estimates; `unknown` the variances for want of covariates; `walk` the random walk of ln f
+    with variance 1 at the last log; `deviation` that of ln health, likewise; `lone` the drift of a
+    mode by a cause of its own, of all modes as if each had one.
     """
 
     fixed: FloatArray
     noise: FloatArray
+    unknown: FloatArray
     walk: FloatArray
     deviation: FloatArray
     lone: FloatArray
@@ -78,10 +78,11 @@ class LifeCovariance(ReadOnly):
         rows, columns = history.baseline + log_of, np.array(data.columns)[series_of]
         reported = history.cov[rows[:, None], columns[:, None], columns]
         common = np.full(same_mode.shape, constants.INTERCEPT_STD**2)
-        for regressor in regressors(history.covariates, data.stage):
+        unknown = np.zeros(rows.size)
+        for regressor in data.regressors:
             values = regressor.values[rows]
             common += regressor.prior_std**2 * np.outer(values, values)
-            common += same_log * regressor.unknown[rows]
+            unknown += regressor.unknown[rows]
         fixed = same_mode * common
         # The intercept is that of a mode's first series; each further one has its own bias.
         modes = data.mode_of_series
@@ -97,6 +98,7 @@ class LifeCovariance(ReadOnly):
         return cls(
             fixed=fixed,
             noise=np.where(same_log, reported, 0.0),
+            unknown=same_mode * same_log * unknown,
             walk=same_mode * shared,
             deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
             lone=same_mode * lone_kernel(clock, clock, now, data.steps),
@@ -107,7 +109,7 @@ class LifeCovariance(ReadOnly):
         self, walk: float, noise_scale: float, deviation: float, lone: int = NO_MODE
     ) -> FloatArray:
         """Return the Cholesky factor of Σ, shape ``(n_data, n_data)``."""
-        total = self.fixed + noise_scale**2 * self.noise + walk**2 * self.walk
+        total = self.fixed + self.unknown + noise_scale**2 * self.noise + walk**2 * self.walk
         if lone != NO_MODE:
             own = (self.mode_of == lone).astype(float)
             total += constants.LONE_STD**2 * np.outer(own, own) * self.lone

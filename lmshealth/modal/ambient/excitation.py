@@ -23,7 +23,7 @@ _STEPS = 501
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
-# Shift by a coloured force in standard deviations from which on the estimate for a white one counts.
+# Shift by a coloured force, in standard deviations, from which on that for a white one counts.
 _FAR = 4.0
 # Log evidence over that of a white force below which a coloured one is not fitted.
 _UNLIKELY = -4.0

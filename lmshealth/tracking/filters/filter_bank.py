@@ -241,7 +241,7 @@ def advance(space: StateSpace, bank: FilterBank, first: int, last: int) -> Filte
 def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> FilterBank:
     """Start a regime: keep state, noise scales and wander; process noise has its prior again.
 
-    Only work on the machine starts it `anew`: parts then run in.
+    A baseline and work on the machine start it `anew`: parts then run in.
     """
     grid, own = space.grid, bank.hyperparameters
     kept, place = np.unique(own.disturbance, return_inverse=True)
@@ -249,7 +249,12 @@ def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> Filte
     grid = grid[chosen & (anew | (grid.rate_decay == 0))]
     at = np.searchsorted(kept, grid.disturbance)
     share = np.bincount(place, weights=bank.weight)[at]
-    of_kept = np.bincount(at, weights=np.exp(grid.log_prior))[at]
+    # Without running-in the kept filters are fewer: healthy has its prior probability all the same.
+    cell, chance = 2 * at + grid.healthy, constants.HEALTHY_PROBABILITY
+    prior = np.exp(grid.log_prior)
+    prior /= np.bincount(cell, weights=prior)[cell]
+    prior *= np.where(grid.healthy, chance, 1 - chance)
+    prior /= np.bincount(at, weights=prior)[at]
     state = np.empty((at.size, *bank.state.shape[1:]))
     for d, group in product(range(kept.size), (True, False)):
         members = (place == d) & (own.healthy == group)
@@ -261,7 +266,7 @@ def restart(space: StateSpace, bank: FilterBank, *, anew: bool = False) -> Filte
     state[still, rates] = 0.0
     state[still, :, rates] = 0.0
     _add(state, space.rate, grid.rate_std**2, space.together)
-    log_weight = grid.log_prior - np.log(of_kept) + np.log(np.maximum(share, 1e-12))
+    log_weight = np.log(prior) + np.log(np.maximum(share, 1e-12))
     return FilterBank(grid, log_weight, state)
 
 

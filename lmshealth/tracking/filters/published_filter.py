@@ -131,37 +131,31 @@ def prior(space: StateSpace) -> Gaussian:
     return Gaussian(mean, cov)
 
 
-def filter_log(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
-    """Predict to log k from the state before it, and update with its estimates."""
+def filter_log(
+    space: StateSpace, before: Gaussian, own: Nuisances, k: int, *, undecided: bool = False
+) -> Gaussian:
+    """Predict to log k from the state before it, and update with its estimates.
+
+    An outlier may be a step. If that is `undecided`, half of the squared innovation is added to the
+    variance of its error and of the quantity: both explanations are within two standard deviations.
+    """
     from filterpy.kalman import predict, update  # late: it imports scipy.stats, half a second
 
     move, noise = _transition(space, own, k)
     mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    given = space.observations[k]
-    if given.rows.size:
-        mean, cov = update(mean, cov, given.values, _errors(given, own), space.observed_matrix(k))
-    return Gaussian(mean, cov)
-
-
-def undecided(space: StateSpace, before: Gaussian, own: Nuisances, k: int) -> Gaussian:
-    """Return the state after log k if it has outliers, any of which may be a step.
-
-    Half of the squared innovation is added to the variance of the error and of the quantity:
-    both explanations are within two standard deviations.
-    """
-    from filterpy.kalman import predict, update  # late, as above
-
     given, rows = space.observations[k], space.observations[k].rows
-    move, noise = _transition(space, own, k)
-    mean, cov = predict(before.mean, before.cov, F=move, Q=noise)
-    matrix = space.observed_matrix(k)
-    half = (given.values - matrix @ mean) ** 2 / 2
-    half[own.weight[rows] >= 0.5] = 0.0
-    first = np.where(rows < len(space.history.series), space.level.start, space.damping.start)
-    jump = np.zeros(space.size)
-    np.maximum.at(jump, first + space.mode_of[rows], half)
-    errors = _errors(given, replace(own, weight=np.ones_like(own.weight))) + np.diag(half)
-    return Gaussian(*update(mean, cov + np.diag(jump), given.values, errors, matrix))
+    if not rows.size:
+        return Gaussian(mean, cov)
+    matrix, errors = space.observed_matrix(k), _errors(given, own)
+    if undecided:
+        half = (given.values - matrix @ mean) ** 2 / 2
+        half[own.weight[rows] >= 0.5] = 0.0
+        first = np.where(rows < len(space.history.series), space.level.start, space.damping.start)
+        jump = np.zeros(space.size)
+        np.maximum.at(jump, first + space.mode_of[rows], half)
+        cov = cov + np.diag(jump)
+        errors = _errors(given, replace(own, weight=np.ones_like(own.weight))) + np.diag(half)
+    return Gaussian(*update(mean, cov, given.values, errors, matrix))
 
 
 def smooth_states(space: StateSpace, nuisances: Nuisances) -> tuple[FloatArray, FloatArray]:
@@ -203,7 +197,8 @@ def _transition(space: StateSpace, own: Nuisances, k: int) -> tuple[FloatArray, 
         variances[1] += own.running_in * own.moved
         noise[:size, :size] = (variances @ space.noise).reshape(size, size)
     begun = (step for step in space.steps if step.first == k)
-    if k and (own.reopened or any(step.kind == "reset" or not step.declared for step in begun)):
+    anew = own.reopened or k in space.history.baselines
+    if k and (anew or any(step.kind == "reset" or not step.declared for step in begun)):
         # Since the log before, the rates have their prior again.
         moved = move[:, space.rate]
         noise += constants.PUBLISHED_RATE_STD**2 * moved @ space.together @ moved.T

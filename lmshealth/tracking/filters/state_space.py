@@ -197,6 +197,21 @@ class StateSpace:
         longer._jumps = [*self._jumps, (step, self._jump_matrix(step))]
         return longer
 
+    @property
+    def effects(self) -> list[tuple[str, str, int]]:
+        """Mode, name and place in the state of each coefficient of ln f that is no wear."""
+        modes, series = self.history.modes, self.history.series
+        places = [(one.name, self.regressor(j).start) for j, one in enumerate(self.regressed)]
+        places += [
+            (f"{step.kind}:{step.name or step.source}", self.jump(j).start)
+            for j, step in enumerate(self.steps)
+            if not step.changes_modes
+        ]
+        found = [(mode, name, at + i) for name, at in places for i, mode in enumerate(modes)]
+        for j, one in enumerate(series[i] for i in self.biased):
+            found.append((one.mode, f"bias:{one.source}", self.first_bias + 2 * j))
+        return found
+
     def matrix(self, k: int) -> FloatArray:
         """Return the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
         fixed: FloatArray = self.fixed[k]

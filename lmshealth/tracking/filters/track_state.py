@@ -38,7 +38,6 @@ from lmshealth.tracking.filters.published_filter import (
     filter_log,
     prior,
     select_nuisances,
-    undecided,
 )
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import Step
@@ -93,8 +92,8 @@ class Checkpoint:
 class TrackState:
     """All that is known after some logs.
 
-    A regime begins at a reset and at a detected change: the state continues, the process noise has
-    its prior again, and changes before the regime are not weighed again.
+    A regime begins at a reset, a baseline and a detected change: the state continues, the process
+    noise has its prior again, and changes before the regime are not weighed again.
     """
 
     space: StateSpace  # with the steps so far
@@ -110,7 +109,7 @@ class TrackState:
     loop_changes: tuple[int, ...] = ()  # unexplained changes of the following error
     changes: tuple[tuple[ChangeHypothesis, int], ...] = ()  # detected steps, and when
     alarms: tuple[Event, ...] = ()
-    alarmed: bool = False  # since the last reset
+    alarmed: bool = False  # since the last reset or baseline
     open: ChangeHypothesis | None = None  # a significant change whose kind is not settled
     weighed: tuple[int, int] = (-1, -1)  # the last suspicion that was weighed, and when
 
@@ -136,8 +135,9 @@ def initial_state(space: StateSpace) -> TrackState:
 
 def step(state: TrackState, k: int) -> TrackState:
     """Return the state after log k from that after the log before."""
-    steps = state.space.history.steps
-    if k and any(one.kind == "reset" and one.first == k for one in steps):
+    history = state.space.history
+    resets = [one.first for one in history.steps if one.kind == "reset"]
+    if k and (k in history.baselines or k in resets):
         bank = restart(state.space, state.bank, anew=True)
         state = replace(state, bank=bank, start=k, first=k, alarmed=False)
     state = _filter(state, k)
@@ -312,8 +312,8 @@ def _adopted(state: TrackState, change: ChangeHypothesis, k: int) -> TrackState:
 
 
 def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
-    """Raise an alarm, once between two resets."""
-    if state.alarmed:
+    """Raise an alarm, once since a baseline or reset, of a drift from a baseline."""
+    if state.alarmed or k < state.space.history.baselines[0]:
         return state
     row = _row(state, state.published)
     m = row.drift_cov.shape[0]
@@ -329,7 +329,7 @@ def _publish(state: TrackState, k: int) -> TrackState:
     """Publish the state after log k."""
     last, own = state.checkpoints[-1], state.published
     if last.epoch.outlying.any():
-        own = undecided(state.space, last.before, last.epoch.nuisances, k)
+        own = filter_log(state.space, last.before, last.epoch.nuisances, k, undecided=True)
     return replace(state, rows=(_row(state, own), state.rows))
 
 

@@ -164,10 +164,10 @@ def _temperature(rng: np.random.Generator, n: int) -> tuple[Array, Array]:
     coefficient = TEMPERATURE_STD * rng.standard_normal(len(MODES))
     for k in range(n):
         known = temperature[:k][np.isfinite(temperature[:k])]
-        spread = max(float(np.std(known)), 1.0) if known.size else 1.0
-        unknown = TEMPERATURE_STD * spread * rng.standard_normal(len(MODES))
-        offset = temperature[k] - REFERENCE
-        effect[k] = unknown if np.isnan(offset) else coefficient * offset
+        lost = np.isnan(temperature[k])  # then it is about the mean of those before
+        spread = TEMPERATURE_STD * max(float(np.std(known)), 1.0) if lost else 0.0
+        value = np.mean(known) if lost else temperature[k]
+        effect[k] = rng.normal(coefficient * (value - REFERENCE), spread)
     return temperature, effect
 
 

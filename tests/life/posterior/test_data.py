@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import timedelta
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from lmshealth.life import constants
 from lmshealth.life.posterior.data import condense
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import LifeLikelihood
+from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.history import Step
 from tests.lives import (
     FREQUENCY,
@@ -83,6 +86,60 @@ def test_baseline_last_log_and_steps_are_not_mixed() -> None:
         assert {log for log, own in zip(short.logs, new.there, strict=True) if own} <= seen
         # The log before a step closes a group, and the first that sees it opens one.
         assert history.logs[old.first - 1] == short.logs[new.first - 1]
+
+
+def test_a_step_is_between_its_logs_in_a_condensed_life(tmp_path: Path) -> None:
+    """Not between the means of the groups before and after it."""
+    n, k = 450, 203
+    history = make_history(np.tile(np.log(FREQUENCY[:2]), (n, 1)))
+    data = LifeLikelihood.of(
+        replace(history, steps=(since("step", k, n),)), make_stage(tmp_path)
+    ).data
+    assert len(data.history.logs) < n
+    assert data.steps == (history.clock()[k - 1 : k + 1].mean(),)
+
+
+def test_covariates_of_a_group_are_those_of_its_estimates(tmp_path: Path) -> None:
+    """Daily cycles and temperatures are averaged over the logs that have an estimate.
+
+    An estimate without a temperature is left out, but not after the last known temperature.
+    """
+    n, rng = 300, np.random.default_rng(4)
+    temperature = 21 + rng.standard_normal(n)
+    temperature[[40, 299]] = np.nan
+    history = make_history(np.tile(np.log(FREQUENCY[:2]), (n, 1)), temperature=temperature)
+    hours = [timedelta(hours=5 * k) for k in range(n)]
+    history = replace(history, recorded_at=tuple(history.recorded_at[0] + h for h in hours))
+    data = LifeLikelihood.of(history, make_stage(tmp_path)).data
+    known, cos, _ = data.regressors
+    assert [one.name for one in data.regressors[1:]] == [
+        "temperature_c:day-cos",
+        "temperature_c:day-sin",
+    ]
+    group = int(np.searchsorted([int(log[:3]) for log in data.history.logs], 40))
+    last, before = (int(data.history.logs[k][:3]) for k in (group, group - 1))
+    own = [k for k in range(before + 1, last + 1) if k != 40]
+    assert len(own) == 1
+    wave = regressors(history.covariates, data.stage, history.recorded_at)[1].values
+    assert known.values[group] == pytest.approx(np.mean(temperature[own] - 21))
+    assert cos.values[group] == pytest.approx(np.mean(wave[own]))
+    assert np.flatnonzero(known.unknown).tolist() == [len(data.history.logs) - 1]
+    assert np.isfinite(data.history.ln_frequency[-1]).all()
+
+
+def test_the_daily_lag_is_in_the_covariance_of_a_life(tmp_path: Path) -> None:
+    """Logs of one life at other times of the day have another covariance, by the cycles alone."""
+    stage = make_stage(tmp_path)
+    history = make_history(np.tile(np.log(FREQUENCY[:2]), (6, 1)), temperature=21 + np.arange(6.0))
+    times = tuple(t + timedelta(hours=5 * k) for k, t in enumerate(history.recorded_at))
+    one, other = (
+        LifeLikelihood.of(own, stage).covariance.fixed
+        for own in (history, replace(history, recorded_at=times))
+    )
+    waves = regressors(history.covariates, stage, times)[1:]
+    added = sum(w.prior_std**2 * np.outer(w.values, w.values) for w in waves)
+    np.testing.assert_allclose(other - one, np.kron(np.eye(2), added), atol=1e-12)
+    assert np.abs(other - one).max() > 1e-7
 
 
 @pytest.fixture(scope="module")

@@ -99,18 +99,18 @@ def test_a_history_without_length_has_ticks_of_nothing(stage: Stage) -> None:
     assert (StateSpace(history, None).ticks == 0).all()
 
 
-def test_covariates_are_about_their_reference_and_0_where_unknown(
+def test_covariates_are_about_their_reference_and_their_mean_where_unknown(
     history: History, stage: Stage
 ) -> None:
     """Offsets and their squares are in the measurement matrix of ln f only."""
     space = StateSpace(history, stage)
-    temperature = history.covariates["temperature_c"]
-    for k in (0, 3):
-        offset = 0.0 if np.isnan(temperature[k]) else temperature[k] - 21
+    offset = history.covariates["temperature_c"] - 21
+    means = np.mean(offset[:3]), np.mean(offset[:3] ** 2)
+    for k, (value, square) in {0: (offset[0], offset[0] ** 2), 3: means}.items():
         matrix = space.matrix(k)
         for i, mode in enumerate([0, 1, 0, 1]):
-            assert matrix[i, space.regressor(0).start + mode] == offset
-            assert matrix[i, space.regressor(1).start + mode] == offset**2
+            assert matrix[i, space.regressor(0).start + mode] == pytest.approx(value)
+            assert matrix[i, space.regressor(1).start + mode] == pytest.approx(square)
             assert matrix[i, space.regressor(0).start + 1 - mode] == 0
         assert (matrix[4:, space.regressor(0).start : space.first_bias] == 0).all()
 
@@ -124,6 +124,11 @@ def test_unknown_covariates_widen_ln_f(history: History, stage: Stage) -> None:
     assert unknown[3] == pytest.approx(spread[0] ** 2 + spread[1] ** 2)
     assert unknown[8] == pytest.approx((0.0005 * np.nanstd(payload[:8])) ** 2)
     assert (np.delete(unknown, [3, 8]) == 0).all()
+    # Before its first value nothing is known of a covariate.
+    late = {"temperature_c": np.where(np.arange(temperature.size) < 2, np.nan, temperature)}
+    first = StateSpace(replace(history, covariates=late), stage).observations[0].extra
+    assert first is not None
+    assert first[0] == pytest.approx(0.03**2)
 
 
 def test_without_a_stage_covariates_are_about_their_median(history: History) -> None:
