@@ -136,7 +136,7 @@ def test_interrupted_time_is_reported(tmp_path: Path, monkeypatch: pytest.Monkey
     study.conclude({"passed": {"it is": True}})
     record = json.loads((tmp_path / "result.json").read_text())
     assert record["question"] == "Is it so?"
-    assert summary._duration(record["recorded"]) == "0 s, after 3 min before"
+    assert summary._duration(record["recorded"]) == "0 s and 3 min of kept trials"
 
 
 def test_quick_form_records_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

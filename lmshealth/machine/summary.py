@@ -129,7 +129,8 @@ def _class_of(assessment: Assessment) -> str:
         events = undeclared_events(assessment.track, assessment.history.baseline, "step")
         lone = assessment.health.lone_modes if assessment.health else ()
         alone = {one.mode for one in lone if one.probability >= LONE_NAMED}
-        return "outside" if events and {one.mode for one in events} <= alone else "alarm"
+        moved = {one.mode for one in events} | set(assessment.alarmed)
+        return "outside" if events and moved <= alone else "alarm"
     known = {OUTSIDE_MAP: "outside", "healthy": "healthy", **dict.fromkeys(NO_HEALTH, "open")}
     found = known.get(verdict, "loss")
     if assessment.drifted or (assessment.left_out and found in ("healthy", "open")):

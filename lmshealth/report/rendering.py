@@ -56,7 +56,8 @@ def _environment() -> Any:
                 super().dump_bytecode(bucket)
 
     try:
-        compiled: Any = Compiled()
+        versions = f"{metadata.version('lmshealth')}-{jinja2.__version__}"
+        compiled: Any = Compiled(pattern=f"__lmshealth_{versions}_%s.cache")
     except (OSError, RuntimeError):  # no such folder
         compiled = None
     pages = jinja2.Environment(

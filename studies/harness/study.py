@@ -3,9 +3,9 @@
 A trial is a function of the arguments that distinguish it from other trials. Its value is appended
 as one line of JSON to a file under ``studies/.kept``, with the digest of all code that it depends
 on. All values pass through JSON, so that an interrupted study has the same result as one that ran
-without interruption. Of values of other code a sample, spread over all of them, is computed again:
-where it agrees, run times apart, the others are taken over, and the record counts both; where one
-differs, all are computed again.
+without interruption. Of values of other code a random sample is computed again: where it agrees,
+run times apart, the others are taken over, and the record counts both; where one differs, all are
+computed again.
 """
 
 from __future__ import annotations
@@ -163,18 +163,20 @@ class Trials:
         asked = list(dict.fromkeys(tasks))
         old = [task for task in asked if kept.get(json.dumps(task), {}).get("code", code) != code]
         if old:
-            sample = _spread(old) if self._takes_over else old
+            sample = _sample(old) if self._takes_over else old
             # An interrupted sample is repeated whole: its values are kept once all are known.
             pairs = zip(sample, _compute(work, sample, pool), strict=True)
             again = {json.dumps(task): _row(name, task, code, *done) for task, done in pairs}
             if all(alike(row["value"], kept[key]["value"]) for key, row in again.items()):
-                kept |= {key: kept[key] | {"code": code} for key in map(json.dumps, old)}
-                self.repeated += len(sample)
-                self.taken_over += len(old)
+                confirmed = {"code": code, "confirmed_by": len(sample)}
+                kept |= {key: kept[key] | confirmed for key in map(json.dumps, old)}
             else:
                 kept = {key: row for key, row in kept.items() if row["code"] == code}
             kept |= again
             _rewrite(self._path, name, kept)
+        by = [kept[key].get("confirmed_by") for key in map(json.dumps, asked) if key in kept]
+        self.taken_over += sum(n is not None for n in by)
+        self.repeated += max((n for n in by if n is not None), default=0)
         self.kept_s += sum(kept[key]["seconds"] for key in map(json.dumps, tasks) if key in kept)
         missing = [task for task in asked if json.dumps(task) not in kept]
         for task, done in zip(missing, _compute(work, missing, pool), strict=True):
@@ -204,10 +206,12 @@ def _timed(work: Work, task: tuple[Any, ...]) -> tuple[Any, float]:
     return value, round(time.perf_counter() - start, 2)
 
 
-def _spread(tasks: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
-    """Return the trials of a sample, evenly spread over all."""
-    n = max(_LEAST_REPEATED, len(tasks) // _REPEATED)
-    return tasks[:: max(len(tasks) // n, 1)]
+def _sample(tasks: list[tuple[Any, ...]]) -> list[tuple[Any, ...]]:
+    """Return the trials of a random sample, and one of each kind that a text in the task names."""
+    order = np.random.default_rng(len(tasks)).permutation(len(tasks)).tolist()
+    kinds = {tuple(x for x in tasks[k] if isinstance(x, str)): k for k in reversed(order)}
+    chosen = {*order[: max(_LEAST_REPEATED, len(tasks) // _REPEATED)], *kinds.values()}
+    return [tasks[k] for k in sorted(chosen)]
 
 
 def alike(one: Any, other: Any) -> bool:

@@ -156,7 +156,7 @@ def section(record: Record, folder: Path) -> Iterator[str]:
 def _duration(made: dict[str, Any]) -> str:
     """Format the run time, with that of kept trials, and what confirms those of earlier code."""
     kept, taken_over = made.get("kept_s", 0.0), made.get("taken_over", 0)
-    more = f", after {_time(kept)} before" if kept else ""
+    more = f" and {_time(kept)} of kept trials" if kept else ""
     if taken_over:
         more += f" ({made['repeated']} of {taken_over:,} trials of earlier code repeated and equal)"
     return _time(made["wall_s"]) + more

@@ -76,7 +76,7 @@ def stage_with(name: str, *, baseline: int = 5, model_std: float | None = None) 
     spec = stage.description.map
     assert spec is not None
     if model_std is not None:
-        spec = msgspec.structs.replace(spec, model_std=model_std)
+        spec = msgspec.structs.replace(spec, model_std=model_std, common_std=0.0)
     first = msgspec.structs.replace(stage.description.baseline, logs=baseline)
     description = msgspec.structs.replace(stage.description, map=spec, baseline=first)
     return replace(stage, description=description)
@@ -148,14 +148,15 @@ def called(
     drift = stage.drift(x[None], modes)[0] + np.sqrt(variance) * rng.standard_normal(variance.size)
     # Points over all that the data allow, the posterior being no wider than a linear one by much.
     assert stage.modal_map is not None
-    cov = np.linalg.inv(identifiability_of(stage).precision(variance))
+    # An error that all modes have in common scales a loss, and decides nothing about its sign.
+    own_errors = replace(identifiability_of(stage), common_std=0.0)
+    cov = np.linalg.inv(own_errors.precision(variance))
     steps = np.stack(np.meshgrid(*[np.linspace(-7, 7, N_GRID)] * x.size), -1).reshape(-1, x.size)
     points = x + steps @ np.linalg.cholesky(cov).T
     points = points[stage.modal_map.inside(points)]
     predicted = stage.drifts(points, modes)
     parts = []
     assert stage.description.map is not None
-    # An error that all modes have in common scales a loss, and decides nothing about its sign.
     own = stage.description.map.model_std
     for scale, weight in MAP_ERRORS:
         total = variance + (scale * own) ** 2 * np.sum(predicted[1:] ** 2, axis=0)

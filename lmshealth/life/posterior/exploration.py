@@ -182,7 +182,7 @@ class _Exploration:
         Of a probable one of an update the weights must be reliable too.
         """
         (density, draws), rng = self.found[k], self.generators[k]
-        if updated and draws.pareto_k >= constants.MAX_PARETO_K:
+        if updated and not draws.pareto_k < constants.MAX_PARETO_K:
             start = draws.resampled(rng, _N_ROUGH)
             draws = importance_sample(density.log_probability, start, rng, 3 * n)
         self.found[k] = density, draw_to_ess(density.log_probability, draws, rng, min_ess)

@@ -49,8 +49,9 @@ class WeightedDraws(ReadOnly):
 
     @property
     def pareto_k(self) -> float:
-        """Shape of the generalised Pareto distribution of the largest weights, NaN of too few.
+        """Shape of the generalised Pareto distribution of the largest weights.
 
+        NaN of too few, and where hardly any is positive.
         The posterior mean by [Zhang2009], with the weak prior of [Vehtari2024]; that of arviz,
         whose import costs more time than an update.
         """

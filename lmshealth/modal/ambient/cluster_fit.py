@@ -48,6 +48,8 @@ _MOST_LINE_ROUNDS = 4
 _MOST_SLOPES = 400_000
 # Loss of log likelihood without a mode, all others fixed, below which it is fitted without.
 _DOUBTFUL = 200.0
+# Shift by a coloured force, in standard deviations, from which on that for a white one counts.
+_FAR = 4.0
 # The bins of a first fit resolve this part of the median bandwidth.
 _FINER = 2.0
 # Bins made for an expected bandwidth suffice for one that is narrower by this factor.
@@ -93,8 +95,14 @@ class _Optimum:
 
     @property
     def n_counted(self) -> int:
-        """Number of unknowns without those in quadrature, which have priors."""
+        """Number of unknowns without those in quadrature, whose prior is in `penalised`."""
         return self.p.size - len(self.likelihood.layout.quadrature)
+
+    @property
+    def penalised(self) -> float:
+        """Negative log likelihood with the prior of the unknowns in quadrature."""
+        off = self.likelihood.layout.quadrature
+        return self.misfit + 0.5 * float(np.sum((self.p / self.likelihood.prior_std)[off] ** 2))
 
     @property
     def poles(self) -> FloatArray:
@@ -195,7 +203,7 @@ def _fit_and_prune(data: ClusterData, targets: tuple[Target, ...]) -> _Optimum:
             less = solved(targets[:i] + targets[i + 1 :])
             # Twice the log evidence (BIC) for the mode.
             extra = optimum.n_counted - less.n_counted
-            evidence = 2 * (less.misfit - optimum.misfit) - extra * np.log(n_ordinates)
+            evidence = 2 * (less.penalised - optimum.penalised) - extra * np.log(n_ordinates)
             if lost or evidence < least:
                 worst, least = less, evidence
         if worst is None:
@@ -282,7 +290,8 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
 
     They span the shapes φ, and (1 + G G*)⁻¹ φ, which avoids what is foreign, at the ordinates; both
     in units of the noise, in which nothing else distinguishes directions. There are as many as
-    leave each mode its share of φ* (1 + G G*)⁻¹ φ in the mean of the ordinates.
+    leave each mode its share of φ* (1 + G G*)⁻¹ φ in the mean of the ordinates, and those of the
+    parts of the shapes in quadrature.
     """
     shapes = _in_phase(moved)
     shapes = shapes / np.linalg.norm(shapes.real, axis=0)
@@ -294,9 +303,8 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
         if s.foreign is not None
     ]
     if not foreign:
-        u, s, _ = np.linalg.svd(np.column_stack([phi, turned]), full_matrices=False)
-        return np.asarray(u[:, (s > _TURNED) | (np.arange(s.size) < phi.shape[1])])
-    columns = [phi, turned]
+        return _with_directions(np.linalg.svd(phi, full_matrices=False)[0], turned)
+    columns = [phi]
     for g in foreign:
         best = phi - g @ _share(g, phi)
         best = best / np.linalg.norm(best, axis=1, keepdims=True)
@@ -307,8 +315,15 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
     for n in range(phi.shape[1], u.shape[1]):
         shares = [_seen(u[:, :n], phi, g) / all_ for g, all_ in zip(foreign, whole, strict=True)]
         if np.concatenate(shares).mean(axis=0).min() > _SEEN:
-            return np.asarray(u[:, :n])
-    return np.asarray(u)
+            return _with_directions(u[:, :n], turned)
+    return _with_directions(u, turned)
+
+
+def _with_directions(basis: FloatArray, columns: FloatArray) -> FloatArray:
+    """Return an orthonormal basis with what columns, ``(n, n_columns)``, clearly have beside it."""
+    rest = columns - basis @ (basis.T @ columns)
+    u, s, _ = np.linalg.svd(rest, full_matrices=False)
+    return np.column_stack([basis, u[:, s > _TURNED]])
 
 
 def _share(g: ComplexArray, phi: FloatArray) -> ComplexArray:
@@ -595,9 +610,13 @@ def _averaged(
     averaged = with_mean(colour.mean, cov)
     # Which modes are found does not depend on the average: where it is not credible the estimate
     # for a white force remains, and covers both.
-    lost = [_incredible(averaged, i, one, duration) is not None for i, one in enumerate(targets)]
-    back = np.where(lost * 2, modes.estimate - colour.mean, 0.0)
-    averaged = with_mean(colour.mean + back, cov + np.outer(back, back))
+    why = [_incredible(averaged, i, one, duration) for i, one in enumerate(targets)]
+    lost = np.array([one is not None for one in why] * 2)
+    moved = modes.estimate - colour.mean
+    back = np.where(lost, moved, 0.0)
+    # A spectrum that moves a mode so far is more than the bumps describe: both are covered.
+    apart = np.where(lost | (moved**2 > _FAR**2 * np.diag(cov)), moved, 0.0)
+    averaged = with_mean(colour.mean + back, cov + np.outer(apart, apart))
     if colour.probability <= constants.COLOURED:
         return averaged
     return replace(averaged, flags=tuple(f"{flag} coloured".strip() for flag in modes.flags))
@@ -608,8 +627,8 @@ def _unit_shapes(shapes: ComplexArray | FloatArray) -> FloatArray:
 
     Of what is not in phase with that the real part remains.
     """
-    shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    return np.asarray(_in_phase(shapes.T.astype(np.complex128)).real.T)
+    real = _in_phase(shapes.T.astype(np.complex128)).real.T
+    return np.asarray(real / np.linalg.norm(real, axis=1, keepdims=True))
 
 
 def _fitted(data: ClusterData, expected: ComplexArray) -> FittedSpectrum:

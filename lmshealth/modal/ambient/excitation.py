@@ -23,8 +23,6 @@ _STEPS = 501
 # Bumps to either side of a mode, their width and distance in half-power bandwidths, and least
 # distance of two in widths.
 _BUMPS, _WIDTH, _APART = 3, 1.5, 0.5
-# Shift by a coloured force, in standard deviations, from which on that for a white one counts.
-_FAR = 4.0
 # Log evidence over that of a white force below which a coloured one is not fitted.
 _UNLIKELY = -4.0
 
@@ -142,11 +140,7 @@ def average_colours(
     apart = np.array([one.mean for one in found]) - mean
     cov = np.tensordot(weight, [one.cov for one in found], axes=1)
     cov = cov + (weight[:, None] * apart).T @ apart
-    # A spectrum that moves a mode so far is more than the bumps describe: both are covered.
-    moved = mean - flat.mean
-    far = np.where(moved**2 > _FAR**2 * np.diag(cov), moved, 0.0)
-    cov = cov + np.outer(far, far)
-    return Colour(white.mean + moved, cov / ratio, 1.0 - float(weight[0]))
+    return Colour(white.mean + mean - flat.mean, cov / ratio, 1.0 - float(weight[0]))
 
 
 def _of_same_modes(coloured: Marginal, white: Marginal) -> Marginal:

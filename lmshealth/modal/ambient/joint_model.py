@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
+from lmshealth.modal import constants
 from lmshealth.modal.ambient.whittle import receptance, response
 
 T = TypeVar("T", np.float64, np.complex128)
@@ -22,8 +23,6 @@ _LEAST_GAIN, _HALVINGS = 0.3, 5
 _MEDIAN_SQUARE = 0.455
 # Mean of the residual over the floor below which a channel has less noise than any floor.
 _LITTLE = 0.5
-# Standard deviations of the priors of the part of a shape in quadrature, over its norm.
-_QUADRATURE = 0.3
 # In units of the median density of a channel. Channels of hardly any noise would else be judged by
 # the errors of the model, and the selection of modes by the rounding of the processor.
 LEAST_FLOOR = 1e-4
@@ -125,10 +124,8 @@ class JointModel:
 
     def of_channels(self, kept: Sequence[int]) -> JointModel:
         """Return the model of some of the channels."""
-        floor, (phi, rho) = (
-            self.floor[list(kept)],
-            (own[list(kept)] for own in (self.phi, self.rho)),
-        )
+        order = list(kept)
+        floor, phi, rho = self.floor[order], self.phi[order], self.rho[order]
         return replace(self, data=self.data.of_channels(kept), floor=floor, phi=phi, rho=rho)
 
     def on(self, data: BandData) -> JointModel:
@@ -155,6 +152,8 @@ class JointModel:
             seen = seen - data.foreign[:, n:, :n]
         normal = np.einsum("kia,kja->ij", weighted, unit.conj())
         right = np.einsum("kia,kca->ic", weighted, seen.conj())
+        if not self.turned:
+            normal, right = (np.asarray(one.real, np.complex128) for one in (normal, right))
         phi = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), right).conj().T
         floor = np.full((more, self.floor.shape[1]), 0.5)
         return replace(
@@ -278,7 +277,7 @@ class JointModel:
     def _quadrature(self) -> FloatArray:
         """Precision of the prior of the part of each shape in quadrature, ``(n_modes,)``."""
         power = np.sum(np.abs(self.phi) ** 2, axis=0)
-        return np.asarray(1 / (_QUADRATURE**2 * power + 1e-300))
+        return np.asarray(1 / (constants.PRIOR_QUADRATURE[1] ** 2 * power + 1e-300))
 
     def nearest(self, f: float) -> list[int]:
         """Return the three modes nearest to a frequency in units of their bandwidths."""
@@ -349,7 +348,7 @@ class JointModel:
         others = np.arange(self.f.size) != i
         now = self.r[i, others]
         unit = np.array([1.0, 1j] if self.turned else [1.0])
-        # E changes with r_ij as b_i b_j*, so that of its imaginary part u is turned back.
+        # E changes with r_ij as b_i b_j* = v u*: the unit of u is conjugated.
         u = np.concatenate([one.conj() * self._b[:, :, others] for one in unit], axis=2)
         gradient, fisher = self._score(self._b[:, :, i], u)
         parts = np.concatenate([now.real, now.imag] if self.turned else [now.real])

@@ -116,8 +116,9 @@ def one(kind: str, life: int) -> Row:
 def assuming(stage: Stage, share: float) -> Stage:
     """Return the same stage with a share of the error of its map."""
     assert stage.description.map is not None
-    less = share * stage.description.map.model_std
-    spec = msgspec.structs.replace(stage.description.map, model_std=less)
+    spec = stage.description.map
+    less = {"model_std": share * spec.model_std, "common_std": share * spec.common_std}
+    spec = msgspec.structs.replace(spec, **less)
     return replace(stage, description=msgspec.structs.replace(stage.description, map=spec))
 
 
