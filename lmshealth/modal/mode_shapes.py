@@ -2,8 +2,8 @@
 
 The fit of a cluster publishes the part of its shapes in phase. Here the shape of a mode is φ = R v,
 v the eigenvector of the largest λ in A v = λ R v: A is the sum of the cross spectra over the
-half-power band, R that of the noise and of the other modes by the fit. Without other modes it is the
-first singular vector at the peak, as in frequency domain decomposition.
+half-power band, R that of the noise and of the other modes by the fit. Without other modes it is
+the first singular vector at the peak, as in frequency domain decomposition.
 """
 
 from collections.abc import Sequence
