@@ -74,9 +74,6 @@ _STYLE: dict[str, Any] = {
 }
 _DASHED: Any = (0, (5, 3))  # of baselines
 _KM = 1000.0
-# In points: the edge of a figure, a line of text, and what lies between an axis, its numbers and
-# its title.
-_EDGE, _LINE, _AXIS = 3.0, 10.0, 11.0
 _DPI = 200  # of images in a figure: enough for zooming and printing
 _LEVELS = np.array(constants.BAND_LEVELS)
 _GRID_POINTS = 72
@@ -182,45 +179,13 @@ def _write_decimals(figure: Figure) -> None:
 def _fix_layout(figure: Figure) -> None:
     """Lay out, and round all positions: the solver rounds differently each time."""
     engine: Any = figure.get_layout_engine()
-    own = figure.axes[0].get_legend() if len(figure.axes) == 1 else None
-    if own is None:
-        engine.execute(figure)
-    else:
-        _place(figure.axes[0], own, 72 * figure.get_size_inches())
+    engine.execute(figure)
     figure.set_layout_engine("none")
     for part in figure.subfigs:
         part.bbox_relative.set_points(part.bbox_relative.get_points().round(6))
     for ax in figure.axes:
         x, y, width, height = (round(edge, 6) for edge in ax.get_position().bounds)
         ax.set_position((x, y, width, height))
-
-
-def _place(ax: Axes, above: Any, size: FloatArray) -> None:
-    """Place axes that are alone in a figure of a size in points, below their legend.
-
-    That is where the solver places them too, which lays out all texts two times more.
-    """
-    from matplotlib.font_manager import FontProperties
-    from matplotlib.textpath import text_to_path
-
-    font, measured = FontProperties(size=_LINE), text_to_path.get_text_width_height_descent
-
-    def widths(labels: Sequence[Any]) -> FloatArray:
-        texts = [label.get_text() or " " for label in labels]
-        return np.array([measured(text, font, "$" in text)[0] for text in texts])
-
-    left = _EDGE + _LINE + _AXIS + float(widths(ax.get_yticklabels(which="both")).max())
-    bottom = _EDGE + 2 * _LINE + _AXIS
-    rows = -(-len(above.get_texts()) // above._ncols)
-    top = _EDGE + (0.5 + 1.5 * rows) * _LINE
-    # The last number may end beyond the axes.
-    low, high = ax.get_xlim()
-    length = size[0] - left - _EDGE
-    ticks, reach = ax.get_xticks(), widths(ax.get_xticklabels()) / 2
-    ends = (length * (ticks - low) / (high - low) + reach)[ticks <= high]
-    right = _EDGE + max(float(ends.max(initial=0.0)) - length, 0.0)
-    x, y = np.array([left, size[0] - right]) / size[0], np.array([bottom, size[1] - top]) / size[1]
-    ax.set_position((x[0], y[0], x[1] - x[0], y[1] - y[0]))
 
 
 # Hints are written as addresses of links: the only text per point that matplotlib supports.
