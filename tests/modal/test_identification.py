@@ -558,9 +558,11 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         band: tuple[float, float],
         noise: np.ndarray,
         static: float,
+        *,
+        turned: bool,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, targets, band, noise, static)
+        return fit_modes(view, targets, band, noise, static, turned=turned)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen

@@ -70,6 +70,7 @@ class ClusterData:
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
     static: float = 0.0  # static response of modes that is expected
+    turned: bool = False  # whether shapes and forces may have parts in quadrature
 
     @property
     def duration(self) -> float:
@@ -122,13 +123,16 @@ def fit_modes(
     band: tuple[float, float],
     noise: FloatArray,
     static: float = 0.0,
+    *,
+    turned: bool = False,
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
 
     ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, ``static`` the
-    expected static response of the modes over their shapes.
+    expected static response of the modes over their shapes, ``turned`` whether the search found
+    parts in quadrature.
     """
-    data = replace(prepare(spectra, targets, band, noise), static=static)
+    data = replace(prepare(spectra, targets, band, noise), static=static, turned=turned)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -466,7 +470,7 @@ def _solve(
         narrowest=_COLLAPSED / data.duration,
     )
     p = likelihood.minimise(start)
-    if not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
+    if data.turned and not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
         likelihood = likelihood.with_quadrature()
         lay = likelihood.layout
         begin = lay.shapes.start + lay.shape_in_phase

@@ -133,9 +133,10 @@ def search(
         spectra = spectra.select([c for c in range(len(spectra.channels)) if c not in fewer])
         first = _informative(spectra, low, high)
     if model.quadrature_sigmas() > constants.QUADRATURE_SIGMAS[0]:
-        model, harmonics, after, poles = _explain(
-            searched, low, high, suspected, hints, turned=True
-        )
+        # More modes are no explanation of those that move out of phase.
+        again = _explain(searched, low, high, suspected, hints, turned=True)
+        if again[0].f.size <= model.f.size and again[0].misfit < model.misfit:
+            model, harmonics, after, poles = again
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
     model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
