@@ -47,7 +47,7 @@ TESTS = {
             for how in ("average of settings", "as published")
         ),
     ),
-    "test_a_second_source_does_no_harm": Part(40, ("drift, two sources",)),
+    "test_a_second_source_does_no_harm": Part(60, ("drift, two sources",)),
     "test_modes_that_cross_are_not_swapped": Part(30, ("swaps, named by order", "swaps, unnamed")),
     "test_healthy_lives_raise_no_alarms": Part(100, ("alarms",), control=10),
     "test_drifts_of_damaged_lives_cover": Part(100, ("drift, damaged lives",)),
