@@ -107,9 +107,9 @@ def judge(
     >>> health = lmshealth.infer(history, stage, seed=1, chains=False)
     >>> judgement = lmshealth.judge(stage, history, health)
     >>> print(f"{judgement.verdict}, {judgement.probability:.0%}")
-    both, 99%
+    both, 95%
     >>> judgement.why.split(".")[0]
-    'Guide preload is at 72 % of its baseline value (90 %: 69 to 75 %)'
+    'Guide preload is at 71 % of its baseline value (90 %: 64 to 76 %)'
     >>> lmshealth.judge(stage, history, None).why
     'The logs do not contain enough information for the health parameters.'
     """

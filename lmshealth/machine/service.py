@@ -73,7 +73,7 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     >>> prognosis = lmshealth.prognose(examples.history(), stage, seed=0, chains=False)
     >>> service = lmshealth.decide(prognosis, stage.description.decision)
     >>> service.kind, service.by.strftime("%B %Y"), service.max_risk
-    ('by', 'August 2026', 0.05)
+    ('by', 'July 2026', 0.05)
     >>> service.risk <= 0.05
     True
     """

@@ -292,8 +292,8 @@ def fit_life(
     ['hertz-wear', 'loosening']
     >>> for name, median in zip(life.parameters, np.median(life.health, axis=(0, 1))):
     ...     print(f"{name}: {median:.0%}")
-    guide_preload: 72%
-    mount_stiffness: 87%
+    guide_preload: 71%
+    mount_stiffness: 89%
     """
     likelihood = LifeLikelihood.of(history, stage, min_logs)
     # Arrays are small: threads inside linear algebra would only wait for one another.

@@ -427,6 +427,8 @@ def _refined(data: ClusterData, optimum: _Optimum) -> _Optimum:
         blocks = make_blocks(data, least, f.tolist())
     likelihood = replace(optimum.likelihood, blocks=blocks)
     p = likelihood.minimise(optimum.p)
+    if not np.isfinite(likelihood.value(p)):  # a pole as narrow as rounding, in single bins
+        return optimum
     return _Optimum(optimum.targets, likelihood, p, likelihood.data_value(p), f, least)
 
 
