@@ -277,7 +277,11 @@ def main() -> None:
     answer = {"sentences": sentences, "odds": odds, "control": control, "events": events,
               "alarms": dict(alarms), "late": len(late), "passed": passed, "false": wrong,
               "table": table}  # fmt: skip
-    study.conclude(answer, quick_may_fail=True)
+    early = (
+        "two services are due now, at a risk of 5 %, more than a month before the limit: these "
+        "machines are those of the map, and the description allows for a type that differs by 13 %"
+    )
+    study.conclude(answer, not_met={"no sentence is false": early}, quick_may_fail=True)
 
 
 def tabled(rows: list[Row], shift: int = 0) -> tuple[list[Row], list[str]]:
