@@ -38,6 +38,9 @@ LEAST, WIDEST = 0.90, 1.25
 UNSTEADY = "bursts", "log-normal", "ramp"
 # Worlds of which the control may hold: forces that are half independent hardly show a delay.
 MILD = "steady", "delayed"
+NOT_MET = {
+    "no flag where the model holds": "flags are of a probability of 0.99: a log of 150 has one"
+}
 
 
 def main() -> None:
@@ -53,7 +56,7 @@ def main() -> None:
         for world in WORLDS
     }
     record = {"worlds": worlds, "passed": verdicts(worlds)}
-    study.conclude(record, quick_may_fail=True)
+    study.conclude(record, not_met=NOT_MET, quick_may_fail=True)
 
 
 def examine(world: str, k: int, n_logs: int = LOGS_OF_MACHINE) -> list[Row]:
