@@ -124,6 +124,8 @@ def chosen(quick: bool) -> Iterator[tuple[Any, str]]:
 def read_found(out: Path) -> Found:
     """Read what the run wrote."""
     refused = pd.read_csv(out / "refused.csv", dtype=str, keep_default_na=False)
+    # The manifest lists few of the logs: a notice, with which a log is analysed all the same.
+    refused = refused[refused["reason"] != "not-listed"]
     modes = pd.read_csv(out / "modes.csv", dtype=str, keep_default_na=False)
     found = Found(defaultdict(set), defaultdict(set), set(modes["log"]))
     columns = refused[["log", "detail", "mode", "channel", "reason"]]
