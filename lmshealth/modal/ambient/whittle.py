@@ -270,12 +270,9 @@ class Likelihood:
 
     def value(self, p: FloatArray) -> float:
         """Negative log posterior up to a constant."""
-        with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
-            total = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
-            total += self.data_value(p)
-            if np.isfinite(total):
-                return total
-        return np.inf
+        with np.errstate(over="ignore"):
+            prior = 0.5 * float(np.sum(((p - self.start) / self.prior_std) ** 2))
+        return prior + self.data_value(p)
 
     def derivatives(self, p: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Exact gradient and Hessian of `value`, shapes ``(n_unknowns,)`` and square."""
@@ -287,8 +284,12 @@ class Likelihood:
         return gradient, hessian
 
     def data_value(self, p: FloatArray) -> float:
-        """Negative log likelihood without the priors."""
-        return sum(point.misfit for point in self._at(p))
+        """Negative log likelihood without the priors; infinite where E is singular or overflows."""
+        with np.errstate(over="ignore", invalid="ignore"), suppress(np.linalg.LinAlgError):
+            value = sum(point.misfit for point in self._at(p))
+            if np.isfinite(value):
+                return value
+        return np.inf
 
     def expected(self, p: FloatArray) -> list[ComplexArray]:
         """Compute E of each block, shape ``(n, n_channels, n_channels)``."""
