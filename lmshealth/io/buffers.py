@@ -1,8 +1,9 @@
 """Samples of a column: in memory up to a minute of a log, beyond it in a temporary file."""
 
+import os
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import IO, ClassVar, cast
 
 import numpy as np
@@ -81,27 +82,26 @@ def smallest_step(values: FloatArray) -> float:
 class Spool:
     """Collects the samples of one column in blocks; the number expected saves copies.
 
-    The temporary file of a long column has no name and is deleted with the `Stored` of it. Where
-    ``send`` is set, in the process that reads for others, blocks go there and are not kept.
+    The temporary file of a long column has no name and is deleted with the `Stored` of it. In the
+    process that reads for others every column has a file ``name`` in ``folder``.
     """
 
-    send: "ClassVar[Callable[[Spool, np.ndarray], None] | None]" = None
+    folder: ClassVar[str] = ""
 
     def __init__(self, expected: int = 0) -> None:
-        self.expected = expected
-        self._memory = np.empty(expected if expected <= MINUTE and Spool.send is None else 0)
+        self._memory = np.empty(expected if expected <= MINUTE and not Spool.folder else 0)
         self._file: IO[bytes] | None = None
-        self.size = 0
+        self.size, self.name = 0, ""
+        if Spool.folder:
+            handle, self.name = tempfile.mkstemp(dir=Spool.folder)
+            os.close(handle)  # a file may have a thousand columns
 
     def append(self, block: np.ndarray) -> None:
         """Add the next samples, ``(n,)``, of any numeric type; a full disk is ``too-large``."""
-        if Spool.send is not None:
-            Spool.send(self, block)
-            return
         start, self.size = self.size, self.size + block.size
         # Damaged bytes may be a signalling NaN, which warns when it is widened.
         with np.errstate(invalid="ignore"):
-            if self.size > MINUTE:
+            if self.size > MINUTE or self.name:
                 self._write(self._memory[:start], np.ascontiguousarray(block, dtype=np.float64))
                 return
             if self.size > self._memory.size:
@@ -112,8 +112,8 @@ class Spool:
 
     def samples(self) -> Samples:
         """Return all samples."""
-        if Spool.send is not None:
-            return cast(Samples, self)  # a place for what was sent
+        if self.name:
+            return cast(Samples, self)  # a place for the file
         if self._file is None:
             return self._memory[: self.size]
         self._file.flush()
@@ -121,6 +121,10 @@ class Spool:
 
     def _write(self, *parts: FloatArray) -> None:
         try:
+            if self.name:
+                with open(self.name, "ab") as file:
+                    file.write(parts[-1].data)
+                return
             if self._file is None:
                 self._file = tempfile.TemporaryFile(prefix="lmshealth-")  # noqa: SIM115
             for values in parts:
@@ -134,7 +138,7 @@ class Spool:
 
 def as_samples(values: np.ndarray) -> Samples:
     """Take a column that is in memory, shape ``(n,)``; a long one is put on disk."""
-    if values.size <= MINUTE and values.dtype == np.float64 and Spool.send is None:
+    if values.size <= MINUTE and values.dtype == np.float64 and not Spool.folder:
         return values
     spool = Spool()
     spool.append(values)

@@ -3,10 +3,9 @@
 Native code can end its process by a signal, loop, or allocate what a damaged header claims. One
 process per session reads such files, one after the other. It starts with the first of them, and
 ends with this one. It is no fork, which is unsafe beside threads, and does not import the module
-``__main__`` of a user. Requests and answers pass through its standard input and output, samples
-through a temporary file that both processes map, so that no shared memory of the system is needed.
-Both are JSON and bare numbers, never pickles: a damaged file may have written into the memory of
-the sender of an answer.
+``__main__`` of a user. Requests and answers pass through its standard input and output, the samples
+of each column through a temporary file. Both are JSON and bare numbers, never pickles: a damaged
+file may have written into the memory of the sender of an answer.
 """
 
 import atexit
@@ -23,14 +22,14 @@ from importlib import import_module
 from multiprocessing.spawn import get_executable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import IO, Annotated, Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import msgspec
 import numpy as np
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
-from lmshealth.io.buffers import Spool
+from lmshealth.io.buffers import MINUTE, Samples, Spool, Stored
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
@@ -49,10 +48,8 @@ def ignore_interrupts() -> None:
 
 _START = (
     "import sys; sys.path[:] = sys.argv[1:]; "
-    "from lmshealth.io.formats.isolation import serve; serve(sys.path.pop())"
+    "from lmshealth.io.formats.isolation import serve; serve()"
 )
-# Bytes of samples that are handed over at once: they stay in the processor's cache.
-_WINDOW = 1 << 21
 _SETTING = "LMSHEALTH_MAX_SECONDS"
 # Threads of linear algebra take memory, and none is needed. What a column has freed is used for the
 # next one (glibc): taking it from the system again costs as much as a copy.
@@ -71,21 +68,13 @@ class _Request(NamedTuple):
     seconds: float
     memory: float
     library: str  # imported before these count
-
-
-class _Samples(msgspec.Struct, tag=True):
-    """Samples of a column that are in the window until a byte confirms that they are taken."""
-
-    column: int  # its number
-    dtype: str
-    size: Annotated[int, msgspec.Meta(ge=0)]
-    expected: int  # of the whole column
+    folder: str  # for the samples
 
 
 class _Content(msgspec.Struct, tag=True):
-    """What a `Content` has, with the numbers of its columns: the end of an answer."""
+    """What a `Content` has, with the names of the files of its columns."""
 
-    columns: dict[str, int]
+    columns: dict[str, str]
     metadata: dict[str, str]
     present: tuple[str, ...]
     refused: tuple[Refusal, ...]
@@ -98,13 +87,10 @@ _PARTS = _Content.__struct_fields__[1:]
 
 
 class _Refused(msgspec.Struct, tag=True):
-    """The end of an answer otherwise."""
+    """The answer otherwise."""
 
     reason: str
     detail: str
-
-
-_Answer = _Samples | _Content | _Refused
 
 
 class _Ended(Exception):
@@ -122,15 +108,17 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
     seconds = _max_seconds() + stored / constants.SLOWEST_READING
     load = f"{form.load.__module__}:{form.load.__qualname__}"
     arguments = form.name, load, str(path.absolute()), msgspec.to_builtins(columns), max_memory
-    request = _Request(*arguments, seconds, memory, form.library)
-    try:
-        return _reader.read(request)
-    except _Ended:
-        # The file before may have damaged the memory of the process.
+    # Windows may keep an empty folder.
+    with TemporaryDirectory(prefix="lmshealth-", ignore_cleanup_errors=True) as folder:
+        request = _Request(*arguments, seconds, memory, form.library, folder)
         try:
             return _reader.read(request)
-        except _Ended as error:
-            raise Unusable("corrupt", f"{error}; copy the file again") from error
+        except _Ended:
+            # The file before may have damaged the memory of the process.
+            try:
+                return _reader.read(request)
+            except _Ended as error:
+                raise Unusable("corrupt", f"{error}; copy the file again") from error
 
 
 def _max_seconds() -> float:
@@ -146,7 +134,6 @@ class _Reader:
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._window = np.empty(0, np.uint8)
         self.process: Any = None  # a `subprocess.Popen`
 
     def read(self, request: _Request) -> Content:
@@ -169,42 +156,27 @@ class _Reader:
 
     def _start(self) -> None:
         """Start the process, and wait until it is ready."""
-        # Windows keeps the file until the process has ended.
-        with TemporaryDirectory(prefix="lmshealth-", ignore_cleanup_errors=True) as folder:
-            file = os.path.join(folder, "window")
-            self._window = np.asarray(np.memmap(file, np.uint8, "w+", shape=_WINDOW))
-            python = os.fsdecode(get_executable() or sys.executable)
-            self.process = subprocess.Popen(
-                [python, "-P", "-c", _START, *sys.path, file],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env=os.environ | _ENVIRONMENT,
-            )
-            self.process.stdout.readline()
+        python = os.fsdecode(get_executable() or sys.executable)
+        self.process = subprocess.Popen(
+            [python, "-P", "-c", _START, *sys.path],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            env=os.environ | _ENVIRONMENT,
+        )
+        self.process.stdout.readline()
 
     def _exchange(self, request: _Request) -> Content:
-        """Send a request and receive samples and content, or raise the refusal."""
-        requests, answers = self.process.stdin, self.process.stdout
-        requests.write(json.dumps(request).encode() + b"\n")
-        requests.flush()
-        spools: dict[int, Spool] = {}
-        while True:
-            answer = msgspec.convert(json.loads(answers.readline()), _Answer)
-            if isinstance(answer, _Refused):
-                raise Unusable(answer.reason, answer.detail)
-            if isinstance(answer, _Content):
-                read = {name: spools.get(k, Spool()) for name, k in answer.columns.items()}
-                columns = {name: spool.samples() for name, spool in read.items()}
-                return Content(columns, *(getattr(answer, name) for name in _PARTS))
-            dtype = np.dtype(answer.dtype)
-            if dtype.kind not in "fiu":
-                raise ValueError(f"samples are of type {dtype}")
-            if answer.column not in spools:
-                spools[answer.column] = Spool(answer.expected)
-            spools[answer.column].append(np.frombuffer(self._window, dtype, answer.size))
-            requests.write(b"\n")
-            requests.flush()
+        """Send a request and receive the content, or raise the refusal."""
+        self.process.stdin.write(json.dumps(request).encode() + b"\n")
+        self.process.stdin.flush()
+        line = self.process.stdout.readline()
+        answer = msgspec.convert(json.loads(line), _Content | _Refused)
+        if isinstance(answer, _Refused):
+            raise Unusable(answer.reason, answer.detail)
+        files = {name: Path(request.folder, Path(own).name) for name, own in answer.columns.items()}
+        columns = {name: _received(file) for name, file in files.items()}
+        return Content(columns, *(getattr(answer, name) for name in _PARTS))
 
     def _end(self, patience: float = 0.0) -> int:
         """Wait some seconds for its end, or end it; return its status, negative for a signal."""
@@ -235,6 +207,15 @@ class _Reader:
         self._lock, self.process = threading.Lock(), None
 
 
+def _received(file: Path) -> Samples:
+    """Return the samples of a file that is about to be deleted: in memory, or beyond it open."""
+    size = file.stat().st_size // 8
+    if size <= MINUTE:
+        return np.fromfile(file, dtype=np.float64)
+    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_TEMPORARY", 0)
+    return Stored(os.fdopen(os.open(file, flags), "rb"), size)
+
+
 def _reason(status: int, request: _Request, spent: float) -> Exception:
     """Find out why the process ended."""
     if spent >= request.seconds:
@@ -256,16 +237,14 @@ if hasattr(os, "register_at_fork"):
 # In the process
 
 
-def serve(file: str) -> None:
-    """Read files until standard input ends; samples are handed over in the mapped file."""
+def serve() -> None:
+    """Read files until standard input ends."""
     ignore_interrupts()
     faulthandler.disable()
-    answers = os.fdopen(os.dup(1), "wb")
+    answers = os.fdopen(os.dup(1), "w", encoding="ascii")
     # What a library prints is no answer.
     os.dup2(os.open(os.devnull, os.O_WRONLY), 1)
-    window = np.asarray(np.memmap(file, np.uint8, "r+", shape=_WINDOW))
-    answers.write(b"\n")
-    answers.flush()
+    print(file=answers, flush=True)
     while line := sys.stdin.buffer.readline():
         request = _Request(*json.loads(line))
         with suppress(ImportError):  # the function of the format refuses the file
@@ -274,40 +253,23 @@ def serve(file: str) -> None:
         # A thread that no library can hold ends the process.
         with open(os.devnull, "w") as nowhere:
             faulthandler.dump_traceback_later(request.seconds, exit=True, file=nowhere)
-            _respond(request, answers, window)
+            # Texts of a file may hold lone surrogates, which msgspec does not write.
+            print(json.dumps(msgspec.to_builtins(_answer(request))), file=answers, flush=True)
             faulthandler.cancel_dump_traceback_later()
 
 
-def _respond(request: _Request, answers: IO[bytes], window: np.ndarray) -> None:
-    """Send the samples of each column while they are read, then the content or the refusal."""
-    numbers: dict[object, int] = {}
-
-    def write(answer: _Answer) -> None:
-        # Texts of a file may hold lone surrogates, which msgspec does not write.
-        answers.write(json.dumps(msgspec.to_builtins(answer)).encode() + b"\n")
-
-    def send(spool: Spool, block: np.ndarray) -> None:
-        number = numbers.setdefault(spool, len(numbers))
-        place = window.view(block.dtype)
-        for start in range(0, block.size, place.size):
-            part = block[start : start + place.size]
-            place[: part.size] = part
-            write(_Samples(number, block.dtype.str, part.size, spool.expected))
-            answers.flush()
-            sys.stdin.buffer.read(1)
-
-    Spool.send = send
+def _answer(request: _Request) -> _Content | _Refused:
+    """Read a file; its samples are put into files of the folder."""
+    Spool.folder = request.folder
     try:
         module, name = request.load.split(":")
         load: Load = getattr(import_module(module), name)
         columns, path = msgspec.convert(request.columns, ColumnMap), Path(request.path)
         content = load_by(request.form, load, path, columns, request.max_memory)
-        spools = content.columns.items()
-        own = {name: numbers.setdefault(spool, len(numbers)) for name, spool in spools}
-        write(_Content(own, *(getattr(content, name) for name in _PARTS)))
+        files = {name: cast(Spool, own).name for name, own in content.columns.items()}
+        return _Content(files, *(getattr(content, name) for name in _PARTS))
     except Unusable as error:
-        write(_Refused(error.reason, error.detail))
-    answers.flush()
+        return _Refused(error.reason, error.detail)
 
 
 def _limit_memory(allowed: float) -> None:
