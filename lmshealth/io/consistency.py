@@ -63,24 +63,11 @@ def compare(
 ) -> Findings:
     """Compare what a log states more than once.
 
-    Parameters
-    ----------
-    position, velocity : Samples, optional
-        Set position in m and set velocity in m/s, ``(n_samples,)`` each.
-    nominal : float, optional
-        Speed of the metadata in m/s.
-    measured : sequence of Samples
-        Usable channels, ``(n_samples,)`` each.
-    sample_rate : float
-        In Hz, of time stamps or metadata.
-    breaks : ndarray
-        Samples before which time stamps are interrupted.
-
-    Raises
-    ------
-    Unusable
-        ``rate`` where the set velocity contradicts the sample rate; ``dropped`` or ``repeated``
-        where that happens too often to cut the record.
+    Set position and set velocity are in m and m/s, ``(n_samples,)`` each, as the usable channels
+    are; ``nominal`` is the speed of the metadata in m/s, the sample rate that of time stamps or
+    metadata in Hz; before the samples ``breaks`` time stamps are interrupted. `Unusable`: ``rate``
+    where the set velocity contradicts the sample rate; ``dropped`` or ``repeated`` where that
+    happens too often to cut the record.
     """
     size = measured[0].size
     ranges = np.concatenate([_repeats(measured), _held(measured)])
@@ -343,20 +330,12 @@ def _held(measured: Sequence[Samples]) -> IntArray:
     held = held[np.diff(held, axis=1)[:, 0] >= least]
     n_held = count(held)
     chance = max(int(same.sum()) - n_held, 1) / max(size - n_held, 1)
+    # A slower clock holds samples for most of the time, and never for long.
+    slow = n_held > size / 2 and np.diff(held, axis=1).max(initial=0) < constants.SLOW_CLOCK
     by_chance = -np.log(chance) * least < constants.CHANCE
-    if (
-        by_chance
-        or not len(held)
-        or _is_slow(held, size)
-        or not _jump_at_ends(measured, held, same)
-    ):
+    if not len(held) or by_chance or slow or not _jump_at_ends(measured, held, same):
         return NO_RANGES
     return np.asarray(held)
-
-
-def _is_slow(held: IntArray, size: int) -> bool:
-    """Return whether samples are held for most of the time, never for long: by a slower clock."""
-    return count(held) > size / 2 and np.diff(held, axis=1).max() < constants.SLOW_CLOCK
 
 
 def _jump_at_ends(measured: Sequence[Samples], held: IntArray, same: BoolArray) -> bool:

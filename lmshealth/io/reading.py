@@ -17,7 +17,7 @@ from lmshealth.io import constants
 from lmshealth.io import time_axis as timing
 from lmshealth.io.buffers import Samples, count, in_unit
 from lmshealth.io.column_map import ColumnMap, ColumnsGiven, Role, Signal, column_map
-from lmshealth.io.consistency import Findings, compare
+from lmshealth.io.consistency import compare
 from lmshealth.io.formats.content import Content, frequency_column, over_frequency
 from lmshealth.io.formats.registry import load
 from lmshealth.io.log import Channel, ChannelKind, Log, Metadata, Refusal, parse_metadata
@@ -174,51 +174,34 @@ def _to_log(
     reference = references[0] if references else None
     gone = _missing(*reference, refused) if reference else None
     missing += [] if gone is None else [gone]
-    found = _compared(references, channels, metadata.velocity, axis, refused)
+    # A set point over a rate that varies is no witness of one rate.
+    witness = {} if axis.clocks else {one.signal.role: one.values for one in references}
+    position, velocity = map(witness.get, reversed(_REFERENCES))
+    measured = [channel.values for channel in channels]
+    found = compare(position, velocity, metadata.velocity, measured, axis.sample_rate, axis.breaks)
+    for why, channel_name, note in found.notes:
+        refused += _listed(channel_name, {why: note})
     breaks = np.union1d(axis.breaks, found.dropped)
     ranges = timing.pieces(channels[0].values.size, [*missing, found.repeated], breaks)
     if not ranges:
         raise Unusable("no-signal", f"no two samples in a row are complete; {_why(refused)}")
     channels = _without_copies(channels, ranges, refused)
-    velocity = reference.values if reference and gone is not None else None
+    set_point = reference.values if reference and gone is not None else None
     if axis.clocks:
-        channels, velocity, ranges = _at_one_rate(channels, velocity, ranges, axis)
-    if reference and velocity is not None and reference.signal.role == "reference_position":
-        velocity = timing.set_velocity(velocity, ranges, axis.sample_rate)
+        channels, set_point, ranges = _at_one_rate(channels, set_point, ranges, axis)
+    if reference and set_point is not None and reference.signal.role == "reference_position":
+        set_point = timing.set_velocity(set_point, ranges, axis.sample_rate)
     return Log(
         name=name,
         digest=digest,
         metadata=metadata,
         sample_rate=axis.sample_rate,
         channels=tuple(channels),
-        reference_velocity=velocity,
+        reference_velocity=set_point,
         pieces=ranges,
         refused=tuple(replace(refusal, log=name) for refusal in refused),
         guessed=content.guessed,
     )
-
-
-def _compared(
-    references: Sequence[_Series],
-    channels: Sequence[Channel],
-    nominal: float | None,
-    axis: TimeAxis,
-    refused: list[Refusal],
-) -> Findings:
-    """Compare what a log states more than once; add what is found to the refusals."""
-    # A set point over a rate that varies is no witness of one rate.
-    witness = {} if axis.clocks else {one.signal.role: one.values for one in references}
-    found = compare(
-        witness.get("reference_position"),
-        witness.get("reference_velocity"),
-        nominal,
-        [channel.values for channel in channels],
-        axis.sample_rate,
-        axis.breaks,
-    )
-    for why, channel, note in found.notes:
-        refused += _listed(channel, {why: note})
-    return found
 
 
 def _series(content: Content, columns: ColumnMap) -> list[_Series]:

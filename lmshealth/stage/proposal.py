@@ -9,13 +9,13 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
-from functools import cached_property
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
+from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_text
 from lmshealth._private.toml import quoted
 from lmshealth.errors import BadLog, BadStage
@@ -91,25 +91,16 @@ class Guess(NamedTuple):
 class _Column:
     """A column of the file: name, unit, samples, and what the first minute of them shows.
 
-    ``moments`` is whether they are moments, read as times in s since the first.
+    ``moments`` is whether they are moments, read as times in s since the first. Extremes and steps
+    are the least value, the mean and the largest value; NaN where no sample is a number.
     """
 
     def __init__(self, name: str, unit: str, samples: Samples, *, moments: bool = False) -> None:
         self.name, self.unit, self.samples, self.moments = name, unit, samples, moments
         self.first = samples[:MINUTE]
         self._finite = self.first[np.isfinite(self.first)]
-
-    @cached_property
-    def extremes(self) -> tuple[float, float, float]:
-        """Least value, mean and largest value; NaN where no sample is a number."""
-        x = self._finite
-        return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
-
-    @cached_property
-    def steps(self) -> tuple[float, float, float]:
-        """Least, mean and largest difference of consecutive samples."""
-        x = np.diff(np.where(np.isfinite(self.first), self.first, np.nan))
-        return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
+        self.extremes = _extremes(self._finite)
+        self.steps = _extremes(np.diff(np.where(np.isfinite(self.first), self.first, np.nan)))
 
     @property
     def is_even(self) -> bool:
@@ -123,6 +114,10 @@ class _Column:
         n_levels = np.unique(self._finite).size
         n = int(np.count_nonzero(np.diff(self._finite > self.extremes[1])))
         return n if n_levels >= constants.FEWEST_LEVELS else 0
+
+
+def _extremes(x: FloatArray) -> tuple[float, float, float]:
+    return (float(x.min()), float(x.mean()), float(x.max())) if x.size else (np.nan,) * 3
 
 
 def propose(
@@ -143,7 +138,6 @@ def propose(
     label = shown(path)
 
     def read(columns: dict[str, str], units: dict[str, str | float] | None = None) -> Content:
-        """Read columns of the file under names of the contract."""
         how = ColumnMap(columns=columns, units=units or {}, layouts=layouts)
         return load(path, how, max_memory)
 
@@ -201,24 +195,24 @@ def _columns(load_by: _Load) -> tuple[Content, list[_Column], list[Guess]]:
     """Read all columns as they are; those that hold no such series of numbers are left out."""
     content = load_by(_NO_COLUMN)
     read: dict[str, _Column] = {}
-    tried: set[str] = set()
+    units: dict[str, str] = {}
     for _ in range(_DEPTH):
         pairs = [(text, _UNIT.fullmatch(text)) for text in content.present]
-        units = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
-        new = [name for name in units if name not in tried]
+        every = {m["name"] if m else text: m["unit"] if m else "" for text, m in pairs}
+        new, units = [name for name in every if name not in units], every
         for found, moments in _contents(load_by, new):
             # A struct is opened by its name.
             there = max(content.present, found.present, key=len)
             content = replace(content, metadata=content.metadata | found.metadata, present=there)
             for name in set(new) & set(found.columns):
                 read[name] = _Column(name, units[name], found.columns[name], moments=moments)
-        tried |= set(new)
     columns = [read[name] for name in units if name in read]
     sizes = [one.samples.size for one in columns if one.samples.size > 1]
     size = max(sizes, key=lambda n: (sizes.count(n), n), default=0)
     kept = [one for one in columns if one.samples.size == size]
-    others = [name for name in units if name not in [one.name for one in kept]]
-    rest = [Guess(listed(others), "", f"text, or not {size} numbers")] if others else []
+    others = units.keys() - {one.name for one in kept}
+    names = listed(name for name in units if name in others)
+    rest = [Guess(names, "", f"text, or not {size} numbers")] if others else []
     return content, kept, rest
 
 
@@ -277,12 +271,12 @@ def _times(
     return found
 
 
-class _Contradiction(Unusable):
-    """Times that give another sample rate than the file or the user states."""
-
-
 class _Question(Unusable):
     """Times whose unit nothing states."""
+
+
+class _Contradiction(Unusable):
+    """Times that give another sample rate than the file or the user states."""
 
 
 def _rate_of(load_by: _Load, one: _Column, unit: str) -> tuple[float, str]:
@@ -364,12 +358,13 @@ def _unit_of(one: _Column) -> str:
     if one.moments:
         return "s"
     own = unit_key(one.unit, "time") or (one.unit if one.unit in _LONG_UNITS else "")
-    return own or (_time_unit(one.name) if one.unit in _RAW_UNITS else None) or ""
+    return own or (_time_unit(one.name) if one.unit in _RAW_UNITS else "")
 
 
-def _time_unit(name: str) -> str | None:
-    """Return the unit of times that the name of a column holds."""
-    return next((unit for unit, words in _TIME_UNITS.items() if re.search(words, name, re.I)), None)
+def _time_unit(name: str) -> str:
+    """Return the unit of times that the name of a column holds; empty where it holds none."""
+    named = (unit for unit, words in _TIME_UNITS.items() if re.search(words, name, re.I))
+    return next(named, "")
 
 
 def _guesses(columns: list[_Column]) -> list[Guess]:
