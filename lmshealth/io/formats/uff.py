@@ -1,6 +1,6 @@
 """UFF58: time records and frequency responses at nodal degrees of freedom, in ASCII or binary.
 
-pyuff reads the data sets 58 from a copy that holds no others: it drops a data set that is cut off,
+pyuff reads the lines of a data set 58. Data sets are found here: pyuff drops one that is cut off,
 and pairs tags wrongly where a line of another data set ends like one.
 """
 
@@ -10,7 +10,6 @@ from contextlib import suppress
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +35,6 @@ _BEGIN = re.compile(rb"[\s\x1a]*?^    -1[ \t]*\r?\n", re.MULTILINE)
 _END = re.compile(rb"^    -1[ \t\x1a]*(?:\r?\n|\Z)", re.MULTILINE)
 # Binary numbers need not end with their line.
 _BINARY_END = re.compile(rb"    -1[ \t\x1a]*(?:\r|\n|\Z)")
-_TAG = b"    -1\n"
 _FUNCTION, _N_RECORDS = 58, 11
 
 # Codes of the headers.
@@ -49,13 +47,11 @@ _DIRECTIONS = ("", "X", "Y", "Z", "RX", "RY", "RZ")
 _HERTZ = ("", "none", "Hz", "hz", "hertz", "1/s")
 _SECONDS = ("", "none", "s", "sec", "second", "seconds")
 _UNEVEN, _EVEN = 0, 1
-# Most bytes of a header, and those that fill up a block of binary numbers.
+# Most bytes of a header, and those that fill up a block of numbers.
 _HEADER, _FILL = 4096, b"\0 \r\n\x1a"
-# Columns of the values in a row by type of the ordinate and spacing of the abscissa; those of
-# single precision take 13 each.
-_SINGLE = (2, 5)
-_WIDTHS: dict[tuple[int, int], tuple[int, ...]] = {(4, _EVEN): (20,) * 4, (6, _EVEN): (20,) * 4}
-_WIDTHS |= {(4, _UNEVEN): (13, 20) * 2, (6, _UNEVEN): (13, 20, 20)}
+# Behind the last row of text: its last number may be followed by none.
+_BLANKS = b" " * 19
+_SINGLE = (2, 5)  # types of the ordinate of single precision
 
 # Date in the third line of a header.
 _DATE = re.compile(r"(\d\d?)-([A-Za-z]{3})-(?:\d\d)?(\d\d)\s+(\d\d?):(\d\d):(\d\d)")
@@ -67,26 +63,23 @@ Header = dict[str, Any]
 
 
 def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
-    with TemporaryDirectory(prefix="lmshealth-") as folder:
-        file = _File(path, Path(folder), max_memory)
-        names = _names(file.headers)
-        asked = set(columns.columns.values()) & set(names)
-        if not asked and not any(map(_is_time_record, file.headers)):
-            raise _no_time_records(file.headers, names, file.others)
-        dates = _dates(file.headers)
-        described = [_describe(*named) for named in zip(file.headers, names, dates, strict=True)]
-        chosen, content = choose(described, columns)
-        read, stamps, n_stamped = dict[str, Samples](), None, 0
-        for name, k in chosen.items():
-            header = file.headers[k]
-            if not _is_time_record(header):
-                kind = header["func_type"]
-                raise not_numeric(name, f"no time record but the function type {kind}")
-            time, values = file.numbers(k, name, _SECONDS)
-            read[name] = as_samples(values)
-            if header["abscissa_spacing"] == _UNEVEN:
-                stamps = time if stamps is None else stamps
-                n_stamped += np.array_equal(time, stamps)
+    sets, others = _read_sets(path, max_memory)
+    headers = [one.header for one in sets]
+    names = _names(headers)
+    if not set(columns.columns.values()) & set(names) and not any(map(_is_time_record, headers)):
+        raise _no_time_records(headers, names, others)
+    described = [_describe(*named) for named in zip(headers, names, _dates(headers), strict=True)]
+    chosen, content = choose(described, columns)
+    read, stamps, n_stamped = dict[str, Samples](), None, 0
+    for name, k in chosen.items():
+        if not _is_time_record(headers[k]):
+            kind = headers[k]["func_type"]
+            raise not_numeric(name, f"no time record but the function type {kind}")
+        time, values = sets[k].numbers(name, _SECONDS, max_memory)
+        read[name] = as_samples(values)
+        if headers[k]["abscissa_spacing"] == _UNEVEN:
+            stamps = time if stamps is None else stamps
+            n_stamped += np.array_equal(time, stamps)
     if stamps is not None:
         if n_stamped < len(read):
             detail = "the records have different time stamps; needed the same for all"
@@ -109,24 +102,20 @@ class Function(NamedTuple):
 def load_functions(path: Path, max_memory: float) -> list[Function]:
     """Read the frequency responses and coherences of a file; the unit is as the file has it."""
     functions = []
-    with TemporaryDirectory(prefix="lmshealth-") as folder:
-        file = _File(path, Path(folder), max_memory)
-        kinds = (_RESPONSE, _COHERENCE)
-        used = [k for k, header in enumerate(file.headers) if header["func_type"] in kinds]
-        names = _names([file.headers[k] for k in used])
-        for k, name in zip(used, names, strict=True):
-            header = file.headers[k]
-            coherence = header["func_type"] == _COHERENCE
-            if header["ord_data_type"] not in (_REAL if coherence else _COMPLEX):
-                raise not_numeric(name, "no complex numbers: export real and imaginary parts")
-            axis, values = file.numbers(k, name, _HERTZ)
-            output, force = (_dof(header, role) for role in ("rsp", "ref"))
-            if output == force == "0":
-                output, force = name, ""
-            units = [header[f"{side}_axis_units_lab"].strip() for side in ("ordinate", "orddenom")]
-            unit = "/".join(f"({one})" for one in units if one not in ("", "NONE"))
-            values = values.astype(complex)
-            functions.append(Function(output, force, axis, values, coherence, unit))
+    kinds = (_RESPONSE, _COHERENCE)
+    sets = [one for one in _read_sets(path, max_memory)[0] if one.header["func_type"] in kinds]
+    for one, name in zip(sets, _names([one.header for one in sets]), strict=True):
+        header = one.header
+        coherence = header["func_type"] == _COHERENCE
+        if header["ord_data_type"] not in (_REAL if coherence else _COMPLEX):
+            raise not_numeric(name, "no complex numbers: export real and imaginary parts")
+        axis, values = one.numbers(name, _HERTZ, max_memory)
+        output, force = (_dof(header, role) for role in ("rsp", "ref"))
+        if output == force == "0":
+            output, force = name, ""
+        units = [header[f"{side}_axis_units_lab"].strip() for side in ("ordinate", "orddenom")]
+        unit = "/".join(f"({text})" for text in units if text not in ("", "NONE"))
+        functions.append(Function(output, force, axis, values.astype(complex), coherence, unit))
     return functions
 
 
@@ -137,56 +126,55 @@ def _dof(header: Header, role: str) -> str:
     return f"{header[f'{role}_node']}" + (f"{'+' if code > 0 else '-'}{axis}" if code else "")
 
 
-class _File:
-    """The data sets 58 of a file, and what pyuff reads of their headers.
+class _DataSet(NamedTuple):
+    """A data set 58: its lines, and what pyuff reads of its header.
 
-    ``headers`` have the place of the data set among all data sets, too, from 1; ``others`` are the
-    numbers of the other data sets.
+    The header has the place among all data sets, too, from 1.
     """
 
-    def __init__(self, path: Path, folder: Path, max_memory: float) -> None:
-        with library("UFF58", "pyuff"):
-            import pyuff
-        check_memory("the file", _FILE_MEMORY * path.stat().st_size, max_memory)
-        self._max_memory = max_memory
-        every = list(_data_sets(path.read_bytes()))
-        found = {place: lines for place, number, lines in every if number == _FUNCTION}
-        self.others = sorted({number for _, number, _ in every} - {_FUNCTION})
-        self._sizes = [len(lines) for lines in found.values()]
-        copy = folder / "functions.uff"
-        with copy.open("wb") as stream:
-            stream.writelines(_TAG + _without_padding(lines) + _TAG for lines in found.values())
-        self._file = pyuff.UFF(str(copy))
-        if self._file.get_n_sets() != len(found):
-            raise Unusable("corrupt", "a header contains the tag of a data set; export it again")
-        self.headers: list[Header] = [{"place": place} for place in found]
-        for k, header in enumerate(self.headers):
-            header |= self._read(k, header_only=True)
+    lines: bytes
+    header: Header
 
-    def _read(self, k: int, *, header_only: bool = False) -> Header:
-        try:
-            read: Header = self._file.read_sets(k, header_only=header_only)
-            return read
-        except Exception as error:  # pyuff raises nothing more specific
-            raise _malformed(self.headers[k]["place"]) from error
-
-    def numbers(self, k: int, name: str, units: Sequence[str]) -> tuple[FloatArray, np.ndarray]:
-        """Read abscissa and ordinate of a data set, ``(n_samples,)`` each.
+    def numbers(
+        self, name: str, units: Sequence[str], max_memory: float
+    ) -> tuple[FloatArray, np.ndarray]:
+        """Read abscissa and ordinate, ``(n_samples,)`` each.
 
         The abscissa must be in one of the units, of which the third is quoted.
         """
-        header = self.headers[k]
-        unit = header["abscissa_axis_units_lab"].strip()
+        unit, n = self.header["abscissa_axis_units_lab"].strip(), self.header["num_pts"]
         if unit.lower() not in units:
             raise Unusable("unit", f"the abscissa of {name!r} is in {unit!r}; needed {units[2]}")
-        if header["abscissa_spacing"] not in (_UNEVEN, _EVEN):
-            raise _malformed(header["place"])
-        check_memory(f"data set {name[:80]!r}", _SET_MEMORY * self._sizes[k], self._max_memory)
-        read = self._read(k)
-        n_found, n = read["data"].size, header["num_pts"]
-        if n_found != n:
-            raise Unusable("corrupt", f"{name!r}: {n_found} of {n} samples are there")
-        return read["x"], read["data"]
+        if self.header["abscissa_spacing"] not in (_UNEVEN, _EVEN):
+            raise _malformed(self.header["place"])
+        check_memory(f"data set {name[:80]!r}", _SET_MEMORY * len(self.lines), max_memory)
+        read = _parsed(self.lines, self.header["place"])
+        x, values = read["x"], read["data"]
+        behind = [values[n:], x[n:]] if self.header["abscissa_spacing"] == _UNEVEN else [values[n:]]
+        if n < 1 or values.size < n or any(map(np.any, behind)):  # zeros are padding
+            raise Unusable("corrupt", f"{name!r}: {values.size} of {n} samples are there")
+        return x[:n], values[:n]
+
+
+def _parsed(lines: bytes, place: int, *, header_only: bool = False) -> Header:
+    """Let pyuff read a data set, or its header."""
+    from pyuff.datasets.dataset_58 import _extract58
+
+    try:
+        return {"place": place, **_extract58(b"    -1\n" + lines, header_only=header_only)}
+    except Exception as error:  # pyuff raises nothing more specific
+        raise _malformed(place) from error
+
+
+def _read_sets(path: Path, max_memory: float) -> tuple[list[_DataSet], list[int]]:
+    """Find the data sets 58 of a file and read their headers; list the numbers of the others."""
+    with library("UFF58", "pyuff"):
+        import pyuff  # noqa: F401
+    check_memory("the file", _FILE_MEMORY * path.stat().st_size, max_memory)
+    every = list(_data_sets(path.read_bytes()))
+    found = [(place, lines) for place, number, lines in every if number == _FUNCTION]
+    sets = [_DataSet(lines, _parsed(lines, place, header_only=True)) for place, lines in found]
+    return sets, sorted({number for _, number, _ in every} - {_FUNCTION})
 
 
 def _data_sets(content: bytes) -> Iterator[tuple[int, int, bytes]]:
@@ -200,79 +188,37 @@ def _data_sets(content: bytes) -> Iterator[tuple[int, int, bytes]]:
         if not number[0].strip().isdigit() or not int(number[0]):
             raise corrupt(f"data set {place} has no number")
         is_function = int(number[0]) == _FUNCTION
-        is_binary = is_function and _is_binary(content[at : at + 7])
-        layout = _layout(content[at : at + _HEADER]) if is_binary else None
+        is_binary = is_function and content[at + 6 : at + 7].lower() == b"b"
+        n_bytes, is_counted = _binary_size(content[at : at + _HEADER]) if is_binary else (0, False)
         # Samples may contain the bytes of a tag.
-        after = at + layout.end if layout and layout.is_counted else at
+        after = at + is_counted * n_bytes
         end = (_BINARY_END if is_binary else _END).search(content, after)
         if end is None:
             raise corrupt("the last data set is cut off")
         lines = content[at : end.start()] if is_function else b""
         if is_function and lines.count(b"\n") < 1 + _N_RECORDS:
             raise _malformed(place)
-        yield place, int(number[0]), lines
+        if is_binary and (is_counted or not lines[n_bytes:].strip(_FILL)):
+            lines = lines[:n_bytes]
+        yield place, int(number[0]), lines if is_binary else lines.rstrip(_FILL) + _BLANKS
         at = end.end()
     if content[at:].strip(b" \t\r\n\x1a"):
         raise corrupt(f"no data set begins at byte {at}")
 
 
-class _Layout(NamedTuple):
-    """How the header of a data set states that its values are stored.
+def _binary_size(lines: bytes) -> tuple[int, bool]:
+    """Return the bytes of a data set of binary numbers by its header, and whether that counts them.
 
-    ``widths`` are the columns of the values in a row of text. ``is_counted`` is whether a header of
-    binary numbers states that they take the bytes up to ``end``.
+    The largest number where the header is malformed.
     """
-
-    start: int
-    end: int
-    n_values: int
-    widths: tuple[int, ...]
-    is_counted: bool
-
-
-def _layout(lines: bytes) -> _Layout | None:
-    """Read the layout of a data set 58 from its header; None where that is malformed."""
     head = lines.splitlines(keepends=True)[: 1 + _N_RECORDS]
-    start = sum(map(len, head))
     try:
         kind, n, spacing = (int(head[7][k : k + 10]) for k in (0, 10, 20))
-        n *= 1 + (kind in _COMPLEX) + (spacing == _UNEVEN)
-        n_bytes = n * (4 if kind in _SINGLE else 8)
-        is_counted = _is_binary(lines) and int(lines[31:43]) == n_bytes
+        n_numbers = n * (1 + (kind in _COMPLEX) + (spacing == _UNEVEN))
+        n_bytes = n_numbers * (4 if kind in _SINGLE else 8)
+        return sum(map(len, head)) + n_bytes, 0 < n_bytes == int(lines[31:43])
     except (IndexError, ValueError):
-        return None
-    widths = (13,) * 6 if kind in _SINGLE else _WIDTHS.get((kind, spacing), ())
-    return _Layout(start, start + n_bytes, n, widths, is_counted) if n > 0 and widths else None
-
-
-def _without_padding(lines: bytes) -> bytes:
-    """Leave out what follows the stated number of samples of a data set, if it is padding.
-
-    Padding are zeros and blanks, and of binary numbers any bytes where the header states the number
-    of bytes without them. Other data sets stay as they are, and are refused by their number.
-    """
-    if (layout := _layout(lines)) is None:
-        return lines
-    if _is_binary(lines):
-        is_padding = layout.is_counted or not lines[layout.end :].strip(_FILL)
-        is_whole = len(lines) >= layout.end
-        return lines[: layout.end] + b"\n" if is_padding and is_whole else lines
-    rows = lines[layout.start :].splitlines()
-    n_whole, last = divmod(layout.n_values - 1, len(layout.widths))
-    width = sum(layout.widths[: last + 1])
-    end, after = rows[n_whole : n_whole + 1], rows[n_whole + 1 :]
-    try:
-        padding = b" ".join([*(row[width:] for row in end), *after])
-        if any(float(word) != 0 for word in padding.split()):
-            return lines
-    except ValueError:
-        return lines
-    rows = [*rows[:n_whole], *(row[:width] for row in end)]
-    return lines[: layout.start] + b"".join(row + b"\n" for row in rows)
-
-
-def _is_binary(lines: bytes) -> bool:
-    return lines[6:7].lower() == b"b"
+        return len(lines), False
 
 
 def _malformed(place: int) -> Unusable:
