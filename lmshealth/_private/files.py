@@ -97,11 +97,9 @@ _tidy = cache(remove_abandoned)  # once per process: a run writes many files
 
 @contextmanager
 def _locked(part: Path, create: int = 0) -> Iterator[None]:
-    """Hold the lock of a file, which ends with the process; `OSError` if another one has it.
-
-    Windows needs none: it removes no file that is open. On a file system without locks nothing is
-    removed.
-    """
+    """Hold the lock of a file, which ends with the process; `OSError` if another one has it."""
+    # Windows needs none: it removes no file that is open. On a file system without locks
+    # nothing is removed.
     if fcntl is None:
         yield
         return

@@ -114,10 +114,7 @@ def _literal(value: Any) -> str:
 
 
 def _example(kind: Any) -> Any:
-    """Return a valid value by the examples of the schema.
-
-    A struct has its required keys, and those with an example of their own.
-    """
+    """Return a valid value by the examples of the schema."""
     if stated := _examples(kind):
         return stated[0]
     if item := _item(kind):

@@ -288,10 +288,8 @@ def _regression(
 
 
 def _stuck(values: Samples, low: float, high: float, sign: float) -> int:
-    """Count the samples at the maximum that clipping explains (CHECKS.md, "Method"), else 0.
-
-    A signal of few steps is accepted. ``sign`` -1 examines the minimum.
-    """
+    """Count the samples at the maximum that clipping explains (CHECKS.md, "Method"), else 0."""
+    # A signal of few steps is accepted. ``sign`` -1 examines the minimum.
     n_at = n_adjacent = 0
     below = low
     for _, block in blocks(values):
@@ -400,10 +398,8 @@ def _beyond(values: Samples, order: int, limit: float) -> IntArray:
 
 
 def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Samples, int]:
-    """Bring each sample within half a turn of its prediction; return how many were off.
-
-    None is changed, and 0 returned, unless all are then as the prediction expects.
-    """
+    """Bring each sample within half a turn of its prediction; return how many were off."""
+    # None is changed, and 0 returned, unless all are then as the prediction expects.
     spool, a, squares, n = Spool(values.size), model.filter, 0.0, 0
     before = np.full(_ORDER, model.mean)
     for _, block in blocks(values):
@@ -438,10 +434,8 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
 
 
 def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> None:
-    """Refuse (``wrapped``) a channel that holds all levels of a counter but for a few.
-
-    Unlike vibration it has as many samples at both ends of its range as elsewhere.
-    """
+    """Refuse (``wrapped``) a channel that holds all levels of a counter but for a few."""
+    # Unlike vibration it has as many samples at both ends of its range as elsewhere.
     near = (rough.high - rough.low) / 100
     x = _sample(values, constants.SHAPE_SAMPLES)
     if x.size < constants.FEWEST_FOR_SHAPE or not 0 < left < near:

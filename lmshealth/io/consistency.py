@@ -183,10 +183,8 @@ def _isolated(position: Samples, own: _Blocks) -> IntArray:
 
 
 def _jumps(position: Samples, own: _Blocks) -> IntArray:
-    """Find jumps of a coarse position at constant velocity, beyond what its step explains.
-
-    It explains nothing where blocks are whole numbers of steps, at the usual velocity.
-    """
+    """Find jumps of a coarse position at constant velocity, beyond what its step explains."""
+    # It explains nothing where blocks are whole numbers of steps, at the usual velocity.
     ahead = np.abs(own.expected)
     moving = np.sort(ahead[ahead > 0])
     if not moving.size:
@@ -209,11 +207,10 @@ def _jumps(position: Samples, own: _Blocks) -> IntArray:
 
 
 def _without_beat(own: _Blocks, dropped: IntArray) -> tuple[IntArray, tuple[float, float] | None]:
-    """Fit the displacements without the blocks of jumps; return jumps and `_slope`.
-
-    A set position of another clock jumps where the clocks are a sample apart, and so does one in
-    steps slightly below its increment: with the jumps it moves by the velocity, without them not.
-    """
+    """Fit the displacements without the blocks of jumps; return jumps and `_slope`."""
+    # A set position of another clock jumps where the clocks are a sample apart, and so does
+    # one in steps slightly below its increment: with the jumps it moves by the velocity,
+    # without them not.
     way = own.way.copy()
     way[np.minimum((dropped - 1) // _LENGTH, way.size - 1)] = np.nan
     fit = _slope(own._replace(way=way))
@@ -259,11 +256,9 @@ def _speed_notes(own: _Blocks, nominal: float, rate: float) -> Iterator[tuple[st
 
 
 def _slope(own: _Blocks) -> tuple[float, float] | None:
-    """Fit displacements by position to those by velocity; return slope and standard error.
-
-    Blocks are joined, the more the better where that leaves enough of them. None where too few are
-    in motion.
-    """
+    """Fit displacements by position to those by velocity; return slope and standard error."""
+    # Blocks are joined, the more the better where that leaves enough of them. None where too
+    # few are in motion.
     best = None
     for n in _JOINED:
         whole = own.way.size // n * n
@@ -277,10 +272,8 @@ def _slope(own: _Blocks) -> tuple[float, float] | None:
 
 
 def _fit(way: FloatArray, expected: FloatArray, step: float) -> tuple[float, float] | None:
-    """Regress sizes of displacements on expected ones and on their change, outliers left out.
-
-    A velocity that a filter delays is off by a multiple of its change.
-    """
+    """Regress sizes of displacements on expected ones and on their change, outliers left out."""
+    # A velocity that a filter delays is off by a multiple of its change.
     there = np.isfinite(way + expected) & (expected > 0)
     usual = np.quantile(expected[there], 0.9) if there.any() else 0.0
     there &= expected > constants.MOVING * usual
@@ -312,12 +305,11 @@ def _rounding(velocity: Samples, expected: FloatArray) -> float:
 
 
 def _held(measured: Sequence[Samples]) -> IntArray:
-    """Find stretches in which all of several channels hold one value, ``(n, 2)``, ascending.
-
-    A driver that loses its data may write zeros, or the last sample: signals jump at the ends of a
-    stretch. They do not where a machine stands still, and its channels are coarse. A record that is
-    held for most of its time, and never for long, has another clock.
-    """
+    """Find stretches in which all of several channels hold one value, ``(n, 2)``, ascending."""
+    # A driver that loses its data may write zeros, or the last sample: signals jump at the
+    # ends of a stretch. They do not where a machine stands still, and its channels are
+    # coarse. A record that is held for most of its time, and never for long, has another
+    # clock.
     size, least = measured[0].size, constants.SHORTEST_REPEAT - 1
     if len(measured) < 2:
         return NO_RANGES
@@ -353,10 +345,9 @@ def _jump_at_ends(measured: Sequence[Samples], held: IntArray, same: BoolArray) 
 
 
 def _repeats(measured: Sequence[Samples]) -> IntArray:
-    """Find stretches that are equal to earlier ones in all channels, ``(n, 2)``, ascending.
-
-    Samples are selected by their own hash, so that a copy of a stretch has those of the original.
-    """
+    """Find stretches that are equal to earlier ones in all channels, ``(n, 2)``, ascending."""
+    # Samples are selected by their own hash, so that a copy of a stretch has those of the
+    # original.
     middle = measured[0].size // 2
     levels = [np.unique(one[middle : middle + 512]).size for one in measured]
     if max(levels) < constants.FEWEST_LEVELS:
@@ -417,11 +408,9 @@ def _equal(measured: Sequence[Samples], start: int, stop: int, lag: int) -> np.n
 
 
 def _by_chance(measured: Sequence[Samples], start: int, stop: int, lag: int) -> bool:
-    """Return whether a range may repeat another one, a lag before it, by chance.
-
-    It may where few levels occur in it, or, as in a tone of few digits, where samples beside it
-    equal those a lag before, too.
-    """
+    """Return whether a range may repeat another one, a lag before it, by chance."""
+    # It may where few levels occur in it, or, as in a tone of few digits, where samples
+    # beside it equal those a lag before, too.
     n, size = stop - start, measured[0].size
     tried = [(start + k, stop, k) for k in _LAGS if k < n]
     tried += [(max(lag, start - n), start, lag), (stop, min(size, stop + n), lag)]

@@ -79,11 +79,9 @@ def read_sheet(path: Path, needed: Sequence[str]) -> Iterator[Row]:
 
 
 def _records(lines: list[str]) -> Iterator[tuple[str, list[str], str]]:
-    """Yield place, cells and trouble of each record.
-
-    A new reader starts at the line after every record: an open quote would else include all rows
-    up to the next one without an error.
-    """
+    """Yield place, cells and trouble of each record."""
+    # A new reader starts at the line after every record: an open quote would else include all
+    # rows up to the next one without an error.
     at = 0
     while at < len(lines):
         some = lines[at : at + constants.LONGEST_CELL]

@@ -269,11 +269,9 @@ def _missing(signal: Signal, values: Samples, refused: list[Refusal]) -> IntArra
 def _measured(
     signal: Signal, values: Samples, axis: TimeAxis, added: IntArray, refused: list[Refusal]
 ) -> tuple[Samples, IntArray] | None:
-    """Check the samples of a channel, and repair what is repaired exactly.
-
-    Return its samples and the ranges that remain missing; None if it cannot be used. What was
-    found is added to ``refused``.
-    """
+    """Check the samples of a channel, and repair what is repaired exactly."""
+    # Return its samples and the ranges that remain missing; None if it cannot be used. What
+    # was found is added to ``refused``.
     notes = dict[str, str]()
     try:
         gone, notes["gaps"] = checks.missing_ranges(values, added)

@@ -177,11 +177,9 @@ def _mean_interval(time: Samples, breaks: IntArray) -> float:
 
 
 def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, str, float]:
-    """Find gaps and odd intervals by the median interval of a group and of its neighbours.
-
-    Return breaks, the intervals before them in s, their counts as a text, and four times the usual
-    deviation of an interval from its group in s.
-    """
+    """Find gaps and odd intervals by the median interval of a group and of its neighbours."""
+    # Return breaks, the intervals before them in s, their counts as a text, and four times
+    # the usual deviation of an interval from its group in s.
     middles, spreads = [], []
     starts = range(0, time.size - 1, BLOCK)  # in whole groups but the last
     for steps in (np.diff(time[at : at + BLOCK + 1]) for at in starts):
@@ -220,10 +218,8 @@ def _interruptions(time: Samples, slack: float) -> tuple[IntArray, FloatArray, s
 
 
 def _clock(time: Samples, start: int, stop: int, least: int) -> tuple[Clock, FloatArray]:
-    """Fit the clock of a stretch: a spline through means of at least so many stamps.
-
-    Return time over the index of a sample, and the mean intervals in s between the knots.
-    """
+    """Fit the clock of a stretch: a spline through means of at least so many stamps."""
+    # Return time over the index of a sample, and the mean intervals in s between the knots.
     from scipy.interpolate import make_interp_spline
 
     n = stop - start

@@ -130,10 +130,8 @@ def _peaks(power: FloatArray) -> list[int]:
 
 
 def _peak_ordinate(rest: ComplexArray, at: int) -> float:
-    """Interpolate the ordinate of a sinusoid from three transforms.
-
-    At δ above its highest ordinate they are proportional to 1/δ, 1/(1 - δ) and -1/(1 + δ).
-    """
+    """Interpolate the ordinate of a sinusoid from three transforms."""
+    # At δ above its highest ordinate they are proportional to 1/δ, 1/(1 - δ) and -1/(1 + δ).
     below, own, above = rest[[max(0, at - 1), at, min(at + 1, len(rest) - 1)]]
     channel = int(np.argmax(np.abs(own)))
     ratio = float(((above - below)[channel] / own[channel]).real)
@@ -161,11 +159,9 @@ def _contrast(power: FloatArray) -> FloatArray:
 def _fit(
     rest: ComplexArray, places: FloatArray, choice: tuple[int, ...]
 ) -> tuple[ComplexArray, ComplexArray, FloatArray] | None:
-    """Fit several sinusoids by the fewest polynomials of a choice that suffice.
-
-    Coefficients of the first one, ``(n_terms, n_channels)``, its part of ``rest``, and power of its
-    surroundings, ``(n_channels,)``; None where no polynomial explains it.
-    """
+    """Fit several sinusoids by the fewest polynomials of a choice that suffice."""
+    # Coefficients of the first one, ``(n_terms, n_channels)``, its part of ``rest``, and
+    # power of its surroundings, ``(n_channels,)``; None where no polynomial explains it.
     apart = np.abs(np.arange(len(rest)) - places[:, None])
     widest = _half_width(choice[-1])
     # Around the other sinusoids the noise is fitted, too.

@@ -153,11 +153,9 @@ def _windows(blocks: Iterator[FloatArray], starts: list[int]) -> list[ComplexArr
 def _line_test(
     transform: ComplexArray, n: int, first: int, stop: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Return the ratio of the power explained by a sine to the rest, and its squared amplitude.
-
-    A taper sin(πk(j+1)/(n+1)) is the difference of two transforms, k half ordinates apart on
-    either side: one padded transform, shape ``(..., size)``, holds all tapers.
-    """
+    """Return the ratio of the power explained by a sine to the rest, and its squared amplitude."""
+    # A taper sin(πk(j+1)/(n+1)) is the difference of two transforms, k half ordinates apart
+    # on either side: one padded transform, shape ``(..., size)``, holds all tapers.
     norm = np.sqrt(0.5 / (n + 1))
     mean: ComplexArray = np.zeros(1, dtype=complex)
     total, weights = np.zeros(1), 0.0
@@ -185,10 +183,8 @@ def _noise_evidence(ratio: FloatArray) -> FloatArray:
 
 
 def _resonance_evidence(ratio: FloatArray, width: float) -> FloatArray:
-    """Return -ln p of the ratio at the peak of a resonance, its width in ordinates (README.md).
-
-    Off the peak, in wider resonances and in more noise p is smaller.
-    """
+    """Return -ln p of the ratio at the peak of a resonance, its width in ordinates (README.md)."""
+    # Off the peak, in wider resonances and in more noise p is smaller.
     correlation = toeplitz(np.exp(-np.pi * width * np.arange(_WINDOW) / _WINDOW))
     root = np.linalg.cholesky(_tapers() @ correlation @ _tapers().T)
     weight = _tapers().sum(axis=1)
@@ -457,10 +453,8 @@ def _kind(frequency: float, fundamentals: list[tuple[float, str]], resolution: f
 
 
 def _with_orders(detections: Sequence[tuple[Line, float, float]]) -> list[Line]:
-    """Name the unknown lines that have the same wavelength at another velocity.
-
-    Each line has its velocity in m/s and the resolution of its frequency in Hz.
-    """
+    """Name the unknown lines that have the same wavelength at another velocity."""
+    # Each line has its velocity in m/s and the resolution of its frequency in Hz.
     named = []
     for line, velocity, resolution in detections:
         kind = line.kind

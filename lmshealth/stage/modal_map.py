@@ -227,10 +227,9 @@ def _products(a: FloatArray, b: FloatArray) -> FloatArray:
 def _choose_sizes(
     unit: FloatArray, values: FloatArray, grid: list[int]
 ) -> tuple[list[int], FloatArray]:
-    """Choose the coefficients of each axis with the least error at inner grid points left out.
-
-    The largest error of each mode is returned, too, ``(n_modes,)`` (README.md, "Modal map").
-    """
+    """Choose the coefficients of each axis with the least error at inner grid points left out."""
+    # The largest error of each mode is returned, too, ``(n_modes,)`` (README.md, "Modal
+    # map").
     interior = np.all(np.abs(unit) < 1 - 1e-9, axis=1)
     best: tuple[list[int], FloatArray] | None = None
     for degree in range(1, min(max(grid) - 1, _MAX_DEGREE) + 1):

@@ -280,10 +280,7 @@ class _Contradiction(Unusable):
 
 
 def _rate_of(load_by: _Load, one: _Column, unit: str) -> tuple[float, str]:
-    """Return the sample rate in Hz that `read_log` finds in times, and their unit.
-
-    Without a unit it is that of times in s, unless they are counted from an epoch.
-    """
+    """Return the sample rate in Hz that `read_log` finds in times, and their unit."""
     target, scale = _time_target(unit or "s")
     content = load_by({target: one.name}, scale)
     factor = parse_column(target, scale.get(target)).factor
@@ -306,11 +303,9 @@ def _time_target(unit: str) -> tuple[str, dict[str, str | float]]:
 
 
 def _in_unit(one: _Column, found: float, unit: str, rate: float | None, content: Content) -> Guess:
-    """Guess the unit of times that give a rate in Hz in their unit, or in s if it is not stated.
-
-    `_Contradiction` where the sample rate of another source does not agree, `_Question` where
-    neither it nor a duration chooses between units.
-    """
+    """Guess the unit of times that give a rate in Hz in their unit, or in s if it is not stated."""
+    # `_Contradiction` where the sample rate of another source does not agree, `_Question`
+    # where neither it nor a duration chooses between units.
     rates = {unit: found} if unit else {u: found / factor for u, factor in SI_TIMES.items()}
     rates = {u: hz for u, hz in rates.items() if _RATES[0] <= hz <= _RATES[1]} or rates
     how = f"in {unit}" if unit else f"in steps of {one.steps[1]:.6g}"

@@ -335,11 +335,9 @@ def choose(channels: Sequence[Described], columns: ColumnMap) -> tuple[dict[str,
 
 
 def _aligned(channels: Sequence[Described], rate: float | None) -> list[int | None]:
-    """Return by how many samples each channel starts after that to which most others fit.
-
-    None for a channel that is a fraction of a sample off, or so far that less than
-    `constants.LEAST_COMMON` of its record would be left.
-    """
+    """Return by how many samples each channel starts after that to which most others fit."""
+    # None for a channel that is a fraction of a sample off, or so far that less than
+    # `constants.LEAST_COMMON` of its record would be left.
     starts = [0.0 if channel.start is None else channel.start for channel in channels]
     fits: list[list[int | None]] = []
     for start in dict.fromkeys(starts):
@@ -487,10 +485,9 @@ def without_epoch(content: Content, columns: ColumnMap) -> Content:
 
 
 def _since_first(time: Samples, unit: float) -> tuple[Samples, tuple[str, ...], dict[str, str]]:
-    """Convert ticks or days since an epoch to times since the first, in a unit in s.
-
-    Other times stay as they are. Return what was taken for what, and the moment of the first ticks.
-    """
+    """Convert ticks or days since an epoch to times since the first, in a unit in s."""
+    # Other times stay as they are. Return what was taken for what, and the moment of the
+    # first ticks.
     first = next((block for _, block in blocks(time)), np.zeros(1))
     start, step = float(first[0]), float(np.ptp(first)) / max(first.size - 1, 1)
     ticks = (one[1:] for one in _TICKS if abs(start) >= one[0] and abs(start) * unit > _LATEST)

@@ -171,10 +171,8 @@ def _is_remark(line: bytes, dialect: Dialect) -> bool:
 
 
 def _is_cut(rows: bytes, dialect: Dialect) -> bool:
-    """Return whether the last number of the last row has fewer digits than all above it have.
-
-    The first row is not counted. -6.133e-0 may be the beginning of -6.133e-05.
-    """
+    """Return whether the last number of the last row has fewer digits than all above it have."""
+    # The first row is not counted. -6.133e-0 may be the beginning of -6.133e-05.
     fields = (fields_of(row.decode("latin-1"), dialect.delimiter) for row in rows.split(b"\n")[1:])
     full = [own[-1].strip(' "') for own in fields if len(own) == len(dialect.channels)]
     parts = [_PARTS.split(text.lstrip("+-")) for text in full if text]
@@ -189,11 +187,9 @@ def _is_cut(rows: bytes, dialect: Dialect) -> bool:
 def _without_headers(
     blocks: Iterable[bytes], header: Sequence[bytes], dialect: Dialect, segments: Segments
 ) -> Iterator[bytes]:
-    """Yield blocks without the headers of later segments; the first one is given.
-
-    `Unusable` (``format``) for segments without one column of times, which places them in time,
-    with or without headers of their own, and for segments of other columns.
-    """
+    """Yield blocks without the headers of later segments; the first one is given."""
+    # `Unusable` (``format``) for segments without one column of times, which places them in
+    # time, with or without headers of their own, and for segments of other columns.
     mark = dialect.delimiter.encode()
     pairs = (line.rstrip().removeprefix(_BOM).partition(mark) for line in header)
     keys = {key: value for key, _, value in pairs}
@@ -278,11 +274,9 @@ class _File:
 def _numbers(
     text: Text, places: dict[str, int], dialect: Dialect, columns: ColumnMap
 ) -> dict[str, Samples]:
-    """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty.
-
-    Moments are read in the columns of times only, since the first of them.
-    Empty lines are left out where time stamps place the rows, and at the end.
-    """
+    """Read the wanted columns, ``(n_rows,)`` each, NaN where a field is empty."""
+    # Moments are read in the columns of times only, since the first of them. Empty lines are
+    # left out where time stamps place the rows, and at the end.
     import pandas as pd
 
     times = {name: SinceFirst(name, columns) for name in places if columns.is_time(name)}

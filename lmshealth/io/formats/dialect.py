@@ -220,10 +220,9 @@ def _candidates(lines: Sequence[str], skip: int, layout: CsvLayout) -> Iterator[
 
 
 def _first_row(split: Sequence[tuple[int, list[str]]], number: re.Pattern[str]) -> int | None:
-    """Find the first line of numbers with as many fields as most such lines.
-
-    Lines of keys and values, and of numbered channels, have fewer numbers than half of the rows.
-    """
+    """Find the first line of numbers with as many fields as most such lines."""
+    # Lines of keys and values, and of numbered channels, have fewer numbers than half of the
+    # rows.
     shares = [_share(fields, number) for _, fields in split]
     sizes = {k: len(split[k][1]) for k, share in enumerate(shares) if share > _LEAST_SHARE}
     each = [*sizes.values()]
@@ -286,10 +285,8 @@ def _check_thousands(lines: Sequence[str], delimiter: str) -> None:
 def _names(
     lines: Sequence[str], skip: int, found: _Rows, most: int, columns: ColumnMap
 ) -> tuple[list[str], list[str], int | None]:
-    """Name the columns, with their units, and return the line of the names, if there is one.
-
-    A row has ``most`` fields, of which the last may be empty and without a name.
-    """
+    """Name the columns, with their units, and return the line of the names, if there is one."""
+    # A row has ``most`` fields, of which the last may be empty and without a name.
     n, header = found.n_fields, columns.csv.header
     if isinstance(header, list):
         if len(header) != n:

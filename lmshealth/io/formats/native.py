@@ -125,10 +125,8 @@ def _check_header(item: Any, name: str) -> None:
 
 
 def _check_blocks(item: Any, values: np.ndarray, at: int) -> None:
-    """Refuse (``corrupt``) compressed blocks that are read as zeros and are stored as more.
-
-    The library does so where it finds no block because a key of its index is damaged.
-    """
+    """Refuse (``corrupt``) compressed blocks that are read as zeros and are stored as more."""
+    # The library does so where it finds no block because a key of its index is damaged.
     if item.chunks is None or item.compression is None:
         return
     n = item.chunks[0]
@@ -294,10 +292,8 @@ def _chosen(names: list[str], columns: ColumnMap) -> set[str]:
 def _testlab(
     path: Path, variables: list[tuple[str, tuple[int, ...], str]], max_memory: float
 ) -> list[tuple[Described, np.ndarray]]:
-    """Read the time records that Siemens Testlab exports: structs of x_values and y_values.
-
-    Values are in the unit that the struct states, ``(n_samples,)`` each.
-    """
+    """Read the time records that Siemens Testlab exports: structs of x_values and y_values."""
+    # Values are in the unit that the struct states, ``(n_samples,)`` each.
     matlab: Any = import_module("scipy.io.matlab")
     channels: list[tuple[Described, np.ndarray]] = []
     for variable, shape, kind in variables:

@@ -95,10 +95,8 @@ def _load(path: Path, columns: ColumnMap, max_memory: float) -> Content:
 
 
 def _segments(path: Path) -> list[int]:
-    """Follow the segments to the end of the file, and list the bytes of their samples.
-
-    What is refused as ``corrupt`` is where npTDMS would stop reading, and ignore the rest.
-    """
+    """Follow the segments to the end of the file, and list the bytes of their samples."""
+    # What is refused as ``corrupt`` is where npTDMS would stop reading, and ignore the rest.
     size, at = path.stat().st_size, 0
     found: list[int] = []
     with path.open("rb") as stream:
@@ -122,10 +120,8 @@ def _segments(path: Path) -> list[int]:
 
 
 def _parts(path: Path) -> dict[str, list[_Part]]:
-    """Read the clock of each channel in each segment, by the path of the channel.
-
-    npTDMS keeps the properties of the last segment. Segments of one clock are joined.
-    """
+    """Read the clock of each channel in each segment, by the path of the channel."""
+    # npTDMS keeps the properties of the last segment. Segments of one clock are joined.
     from nptdms.reader import TdmsReader
 
     found: dict[str, list[_Part]] = {}
@@ -164,10 +160,8 @@ def _stamps(channels: Sequence[Sequence[_Part]]) -> Samples | None:
 
 
 def _starts(parts: Mapping[str, Sequence[_Part]]) -> dict[str, float | None]:
-    """Return the time in s of the first sample of each channel since that of the earliest.
-
-    None for a channel that states none.
-    """
+    """Return the time in s of the first sample of each channel since that of the earliest."""
+    # None for a channel that states none.
     first = {name: own[0] for name, own in parts.items() if own}
     moments = {
         name: part.start.as_datetime64("ns")

@@ -270,10 +270,7 @@ def _dates(headers: Sequence[Header]) -> list[float]:
 
 
 def _describe(header: Header, name: str, date: float) -> Described:
-    """Describe a data set; all but time records of real numbers have no unit of a signal.
-
-    The date is that of `_dates`.
-    """
+    """Describe a data set; all but time records of real numbers have no unit of a signal."""
     unit = header["ordinate_axis_units_lab"].strip()
     unit = "" if unit == "NONE" else unit
     if not _is_time_record(header):
