@@ -29,7 +29,7 @@ import numpy as np
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
-from lmshealth.io.buffers import MINUTE, Samples, Spool, Stored
+from lmshealth.io.buffers import Spool, received
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
 from lmshealth.io.log import Refusal
@@ -174,8 +174,8 @@ class _Reader:
         answer = msgspec.convert(json.loads(line), _Content | _Refused)
         if isinstance(answer, _Refused):
             raise Unusable(answer.reason, answer.detail)
-        files = {name: Path(request.folder, Path(own).name) for name, own in answer.columns.items()}
-        columns = {name: _received(file) for name, file in files.items()}
+        files = {name: os.path.basename(own) for name, own in answer.columns.items()}
+        columns = {name: received(os.path.join(request.folder, own)) for name, own in files.items()}
         return Content(columns, *(getattr(answer, name) for name in _PARTS))
 
     def _end(self, patience: float = 0.0) -> int:
@@ -205,15 +205,6 @@ class _Reader:
         if self.process is not None:
             self.process.returncode = 0  # so that it is not waited for
         self._lock, self.process = threading.Lock(), None
-
-
-def _received(file: Path) -> Samples:
-    """Return the samples of a file that is about to be deleted: in memory, or beyond it open."""
-    size = file.stat().st_size // 8
-    if size <= MINUTE:
-        return np.fromfile(file, dtype=np.float64)
-    flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_TEMPORARY", 0)
-    return Stored(os.fdopen(os.open(file, flags), "rb"), size)
 
 
 def _reason(status: int, request: _Request, spent: float) -> Exception:

@@ -18,10 +18,9 @@ from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, describe, gzipped, load_by, without_epoch
 from lmshealth.io.formats.csv import CSV
-from lmshealth.io.formats.instruments import RTX, TRACE
+from lmshealth.io.formats.instruments import RTX, TDMS, TRACE
 from lmshealth.io.formats.isolation import read_isolated
 from lmshealth.io.formats.native import HDF5, MAT, PARQUET
-from lmshealth.io.formats.tdms import TDMS
 from lmshealth.io.formats.uff import UFF
 from lmshealth.io.refusal import Unusable, corrupt, listed
 
