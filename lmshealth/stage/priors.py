@@ -73,10 +73,10 @@ class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
     std: Annotated[float, within(*constants.VALUE, 0.3)]
 
     def __post_init__(self) -> None:
-        if not (np.isfinite(self.mean) and 0 < self.std < np.inf):
-            raise ValueError(f"normal needs a finite mean and a finite std above 0, got {self}")
-        if self.std < constants.LEAST_WIDTH * abs(self.mean):
-            raise ValueError(f"normal needs a std that its mean does not round to 0, got {self}")
+        if not constants.LEAST_WIDTH * abs(self.mean) < self.std < np.inf:
+            raise ValueError(
+                f"normal needs a finite std above the rounding of its mean, got {self}"
+            )
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density."""
@@ -111,10 +111,8 @@ class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     high: Annotated[float, within(-constants.VALUE[1], constants.VALUE[1], 1.0)]
 
     def __post_init__(self) -> None:
-        if not -np.inf < self.low < self.high < np.inf:
-            raise ValueError(f"uniform needs finite ends with high above low, got {self}")
-        if self.high - self.low < constants.LEAST_WIDTH * max(-self.low, self.high):
-            raise ValueError(f"uniform needs ends that rounding does not make equal, got {self}")
+        if not constants.LEAST_WIDTH * max(-self.low, self.high) < self.high - self.low < np.inf:
+            raise ValueError(f"uniform needs finite ends with high well above low, got {self}")
 
     def log_density(self, x: FloatArray) -> FloatArray:
         """Return the log density, -inf outside."""

@@ -18,6 +18,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
+from dataclasses import dataclass, replace
 from importlib import import_module
 from multiprocessing.spawn import get_executable
 from pathlib import Path
@@ -25,14 +26,12 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple, cast
 
 import msgspec
-import numpy as np
 
 from lmshealth.errors import LmshealthError
 from lmshealth.io import constants
 from lmshealth.io.buffers import Spool, received
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.formats.content import Content, Format, Load, load_by
-from lmshealth.io.log import Refusal
 from lmshealth.io.refusal import Unusable
 
 # Signals by which a user, a supervisor or a terminal that is closed ends a program.
@@ -71,26 +70,11 @@ class _Request(NamedTuple):
     folder: str  # for the samples
 
 
-class _Content(msgspec.Struct, tag=True):
-    """What a `Content` has, with the names of the files of its columns."""
+@dataclass(frozen=True, slots=True, eq=False)
+class _Received(Content):
+    """A content with the names of the files of its columns."""
 
-    columns: dict[str, str]
-    metadata: dict[str, str]
-    present: tuple[str, ...]
-    refused: tuple[Refusal, ...]
-    guessed: tuple[str, ...]
-    late: dict[str, int]
-
-
-# All of it but the columns.
-_PARTS = _Content.__struct_fields__[1:]
-
-
-class _Refused(msgspec.Struct, tag=True):
-    """The answer otherwise."""
-
-    reason: str
-    detail: str
+    columns: Any
 
 
 class _Ended(Exception):
@@ -171,12 +155,13 @@ class _Reader:
         self.process.stdin.write(json.dumps(request).encode() + b"\n")
         self.process.stdin.flush()
         line = self.process.stdout.readline()
-        answer = msgspec.convert(json.loads(line), _Content | _Refused)
-        if isinstance(answer, _Refused):
-            raise Unusable(answer.reason, answer.detail)
-        files = {name: os.path.basename(own) for name, own in answer.columns.items()}
+        answer = msgspec.convert(json.loads(line), tuple[_Received | None, str, str])
+        content, *refusal = answer
+        if content is None:
+            raise Unusable(*refusal)
+        files = {name: os.path.basename(own) for name, own in content.columns.items()}
         columns = {name: received(os.path.join(request.folder, own)) for name, own in files.items()}
-        return Content(columns, *(getattr(answer, name) for name in _PARTS))
+        return replace(content, columns=columns)
 
     def _end(self, patience: float = 0.0) -> int:
         """Wait some seconds for its end, or end it; return its status, negative for a signal."""
@@ -249,18 +234,18 @@ def serve() -> None:
             faulthandler.cancel_dump_traceback_later()
 
 
-def _answer(request: _Request) -> _Content | _Refused:
-    """Read a file; its samples are put into files of the folder."""
+def _answer(request: _Request) -> tuple[Content | None, str, str]:
+    """Read a file, its samples into files of the folder; return content, or reason and detail."""
     Spool.folder = request.folder
     try:
         module, name = request.load.split(":")
         load: Load = getattr(import_module(module), name)
         columns, path = msgspec.convert(request.columns, ColumnMap), Path(request.path)
         content = load_by(request.form, load, path, columns, request.max_memory)
-        files = {name: cast(Spool, own).name for name, own in content.columns.items()}
-        return _Content(files, *(getattr(content, name) for name in _PARTS))
+        files: Any = {name: cast(Spool, own).name for name, own in content.columns.items()}
+        return replace(content, columns=files), "", ""
     except Unusable as error:
-        return _Refused(error.reason, error.detail)
+        return None, error.reason, error.detail
 
 
 def _limit_memory(allowed: float) -> None:
