@@ -62,9 +62,6 @@ _CERTAIN_RATE = 100.0
 # Sample rates in Hz of records of vibrations. Even numbers without a name are times if the rate
 # that they give in a unit is so near to that of another source.
 _RATES, _NEAR = (1.0, 1e7), 0.1
-_DURATION = re.compile(r"duration|dauer|dur[ée]e|total.?time|length", re.IGNORECASE)
-# Largest relative difference between a duration that a file states and that of its times.
-_LIKE_DURATION = 0.01
 # A date in the name of a file, with or without a time.
 _DATE = re.compile(
     r"(?<!\d)(?P<y>20\d\d)(?P<sep>[-_]?)(?P<m>\d\d)(?P=sep)(?P<d>\d\d)"
@@ -151,7 +148,7 @@ def propose(
         if rate and stated and abs(rate / stated - 1) > constants.AGREEMENT:
             detail = f"the file states {stated:.8g} Hz, --sample-rate is {rate:.8g} Hz"
             raise Unusable("time", f"{detail}; leave the option out, or correct the file")
-        times = _times(read, columns, content, rate or stated)
+        times = _times(read, columns, rate or stated)
         others = [one for one in columns if one.name not in times]
         guesses = [*times.values(), *_guesses(others), *rest]
         if not any(g.target.startswith(("delta_e", "acc")) for g in guesses):
@@ -233,9 +230,7 @@ def _contents(load_by: _Load, names: Sequence[str]) -> Iterator[tuple[Content, b
                 yield found, True
 
 
-def _times(
-    load_by: _Load, columns: list[_Column], content: Content, rate: float | None
-) -> dict[str, Guess]:
+def _times(load_by: _Load, columns: list[_Column], rate: float | None) -> dict[str, Guess]:
     """Guess which column holds the times: the first that states its unit, has a name, or is even.
 
     Others of them are not read. `Unusable` (``time``) where times contradict the sample rate in Hz,
@@ -258,7 +253,7 @@ def _times(
             continue
         unit = stated[one.name]
         try:
-            found[one.name] = _in_unit(one, *_rate_of(load_by, one, unit), rate, content)
+            found[one.name] = _in_unit(one, *_rate_of(load_by, one, unit), rate)
         except _Contradiction:
             raise
         except _Question as question:
@@ -302,10 +297,10 @@ def _time_target(unit: str) -> tuple[str, dict[str, str | float]]:
     return (f"time_{unit}", {}) if scale is None else ("time", {"time": scale})
 
 
-def _in_unit(one: _Column, found: float, unit: str, rate: float | None, content: Content) -> Guess:
+def _in_unit(one: _Column, found: float, unit: str, rate: float | None) -> Guess:
     """Guess the unit of times that give a rate in Hz in their unit, or in s if it is not stated."""
     # `_Contradiction` where the sample rate of another source does not agree, `_Question`
-    # where neither it nor a duration chooses between units.
+    # where it does not choose between units.
     rates = {unit: found} if unit else {u: found / factor for u, factor in SI_TIMES.items()}
     rates = {u: hz for u, hz in rates.items() if _RATES[0] <= hz <= _RATES[1]} or rates
     how = f"in {unit}" if unit else f"in steps of {one.steps[1]:.6g}"
@@ -321,12 +316,8 @@ def _in_unit(one: _Column, found: float, unit: str, rate: float | None, content:
             detail = f"times {one.name!r} give {readings}, the stated sample rate is {rate:.6g} Hz"
             raise _Contradiction("time", f"{detail}; correct it, or write a column map by hand")
     elif not unit:
-        fits = [u for u, hz in rates.items() for span in _durations(content)
-                if abs((one.samples.size - 1) / hz / span - 1) <= _LIKE_DURATION]  # fmt: skip
-        witness = ", as the file states a duration"
-        if not fits and found >= _CERTAIN_RATE:
-            fits, witness = ["s"], ", taken as s"
-    if len(set(fits)) != 1:
+        fits, witness = ["s"] if found >= _CERTAIN_RATE else [], ", taken as s"
+    if len(fits) != 1:
         detail = f"column {one.name!r} ascends {how} and nothing states its unit: {readings}"
         step = 'give the right one as --sample-rate HZ, or map it by hand: time_us = "…"'
         raise _Question("time", f"{detail}; {step}")
@@ -334,18 +325,6 @@ def _in_unit(one: _Column, found: float, unit: str, rate: float | None, content:
     why = f"times {how}{'' if unit else witness}: {rates[fits[0]]:.6g} Hz"
     factor = "".join(f"{factor!r}  # s per {fits[0]}" for factor in scale.values())
     return Guess(one.name, target, why, factor)
-
-
-def _durations(content: Content) -> list[float]:
-    """Return the durations in s that the metadata state."""
-    found = []
-    for key, text in content.metadata.items():
-        number = re.match(r"\s*((?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?)(?![\d.:])\s*([a-zµμ]*)", text)
-        if _DURATION.search(key) and number:
-            unit = unit_key(number[2], "time") or _time_unit(key) or "s"
-            scale = _LONG_UNITS.get(number[2]) or SI_TIMES[unit]
-            found.append(float(number[1]) * scale)
-    return [span for span in found if span > 0]
 
 
 def _unit_of(one: _Column) -> str:

@@ -218,7 +218,7 @@ def test_the_proposed_rate_is_that_of_the_log(
 def test_a_unit_that_nothing_states_is_asked_for(
     tmp_path: Path, name: str, step: float, n_units: int
 ) -> None:
-    """Without a witness both readings are shown; the rate or a duration chooses between them."""
+    """Without a witness both readings are shown, and the rate chooses between them."""
     stamps = step * np.arange(2000)
     path = write(tmp_path / "a.csv", f"{name},b,c", stamps, NOISE[0], NOISE[1])
     path.write_text(path.read_text().partition("\n")[2] if not name else path.read_text())
@@ -229,12 +229,6 @@ def test_a_unit_that_nothing_states_is_asked_for(
     for rate in readings[:2]:
         text, _ = propose(path, rate=rate)
         log = read_log(path, columns=decode(text.encode(), ColumnMap))
-        assert log.sample_rate == pytest.approx(rate, rel=1e-4)
-        timed = tmp_path / "b.csv"
-        timed.write_text(f"# Duration: {1999 / rate:.6g} s\n" + path.read_text())
-        text, guesses = propose(timed)
-        assert "duration" in guesses[0].why
-        log = read_log(timed, columns=decode(text.encode(), ColumnMap))
         assert log.sample_rate == pytest.approx(rate, rel=1e-4)
 
 
@@ -307,20 +301,6 @@ def test_files_of_others(
     assert log.sample_rate == pytest.approx(rate, rel=1e-5) and len(log.channels) == n_channels
     times = [g.why for g in guesses if g.target.startswith("time")]
     assert all(f"{log.sample_rate:.6g} Hz" in why for why in times)
-
-
-@pytest.mark.parametrize("duration", ["00.05.00", "1.2.3 s", "...", "00:00:30", "30.0 s"])
-def test_durations_of_any_form_end_nothing(tmp_path: Path, duration: str) -> None:
-    """What is no number states no duration; one that is decides the unit of the times."""
-    samples = np.random.default_rng(0).normal(size=3000)
-    rows = "".join(f"{k},{x:.6f}\n" for k, x in zip(range(0, 30_000, 10), samples, strict=True))
-    path = tmp_path / "a.csv"
-    path.write_text(f"# Duration: {duration}\ntime,acc_x_m_s2\n{rows}")
-    if duration == "30.0 s":
-        assert "time_ms" in str(propose(path))
-        return
-    with pytest.raises(BadLog, match="nothing states its unit"):
-        propose(path)
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
