@@ -26,15 +26,12 @@ class ModeCheck:
 
     mode: ModeSpec
     informs: bool  # whether health is inferred from it: it is tracked and on the map
-    # map_frequency, limit_frequency: on the map, in Hz: at the baseline, and with every
-    # parameter at its limit. NaN without a map; the second also without limits, or where they
-    # lie outside the map.
+    # On the map, in Hz: at the baseline, and with every parameter at its limit. NaN without a map;
+    # the second also without limits, or where they lie outside the map.
     map_frequency: float = np.nan
     limit_frequency: float = np.nan
-    # surrogate_error, reached: largest error of ln f at grid points left out of the fit, and
-    # standard deviation that typical logs reach of its drift.
-    surrogate_error: float = np.nan
-    reached: float = np.nan
+    surrogate_error: float = np.nan  # largest error of ln f at grid points left out of the fit
+    reached: float = np.nan  # standard deviation that typical logs reach of its drift
 
     @property
     def searched(self) -> tuple[float, float]:
@@ -48,8 +45,7 @@ class ParameterCheck(ReadOnly):
     """Range of the map and identifiability of one parameter; ``std`` is of its logarithm."""
 
     spec: ParameterSpec
-    # low, high, below, above, quantiles: range of the map, prior probability outside either
-    # end, and its 0.5, 5, 95 and 99.5 %.
+    # Range of the map, 0.5, 5, 95 and 99.5 % of the prior, and its probability outside either end.
     low: float
     high: float
     quantiles: tuple[float, ...]
@@ -58,15 +54,11 @@ class ParameterCheck(ReadOnly):
     # Identified by typical logs (``identifiable``), by ``longer-logs`` only, ``together`` with
     # other parameters as one combination, or ``not-identifiable``.
     verdict: Verdict
-    # prior_std, usual_std, endless_std: in the prior, after typical logs, and after unlimited
-    # ones.
     prior_std: float
-    usual_std: float
-    endless_std: float
-    # exact_map_std, known_std: after typical logs, were the map exact; after unlimited logs,
-    # were the other parameters known: also that of the combination.
-    exact_map_std: float
-    known_std: float
+    usual_std: float  # after typical logs
+    endless_std: float  # after unlimited ones
+    exact_map_std: float  # after typical logs, were the map exact
+    known_std: float  # after unlimited logs, were the others known: also of the combination
     change_std: float  # of a small change since the baseline, as `lmshealth plan` has it
     # Of the parameters in the combination, its own being 1, shape ``(n_parameters,)``.
     exponents: FloatArray
@@ -93,20 +85,16 @@ class StageCheck(ReadOnly):
     name: str
     modes: tuple[ModeCheck, ...]
     parameters: tuple[ParameterCheck, ...]
-    # informative, unused: modes in the order of the sensitivities, and modes of the map that
-    # are not described.
-    informative: tuple[str, ...]
-    # slopes, limit_slopes: d ln f / d ln parameter at the baseline and with every parameter
-    # at its limit, NaN where there is none, shape ``(n_modes, n_parameters)``.
+    informative: tuple[str, ...]  # modes in the order of the sensitivities
+    # d ln f / d ln parameter at the baseline and with every parameter at its limit, NaN where there
+    # is none, shape ``(n_modes, n_parameters)``.
     slopes: FloatArray
     limit_slopes: FloatArray
     # Of the ln parameters after typical logs, shape ``(n_parameters, n_parameters)``.
     correlation: FloatArray
-    # n_logs, model_std: number of typical logs; relative standard deviation of the map's
-    # sensitivities, NaN without.
-    n_logs: int
-    model_std: float
-    unused: tuple[str, ...]
+    n_logs: int  # typical ones
+    model_std: float  # relative, of the map's sensitivities; NaN without
+    unused: tuple[str, ...]  # modes of the map that are not described
 
 
 def check_stage(stage: Stage) -> StageCheck:
