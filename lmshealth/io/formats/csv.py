@@ -61,11 +61,9 @@ _WORD = re.compile(r"[^\W\d_]{3}")
 
 
 def encoding_of(head: bytes) -> str:
-    """Return the encoding of a text: its byte order mark, UTF-8, or a statistical guess."""
-    marks = {codecs.BOM_UTF32_LE: "utf-32", codecs.BOM_UTF32_BE: "utf-32"}
-    marks |= {codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
-    if marked := next((name for mark, name in marks.items() if head.startswith(mark)), None):
-        return marked
+    """Return the encoding of a text: UTF-8 or UTF-16, or a statistical guess."""
+    if head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        return "utf-16"
     # Without a mark: Latin letters in two bytes each, of which one is zero.
     for first, name in ((1, "utf-16-le"), (0, "utf-16-be")):
         if len(head) > 3 and any(head) and head[first::2].count(0) > 0.9 * len(head[first::2]):
@@ -235,7 +233,7 @@ def parse_text(stream: Any, columns: ColumnMap) -> Content:
     """
     encoding = columns.csv.encoding or encoding_of(stream.read(_HEAD_BYTES))
     guessed = [f"{encoding} text"] if encoding != "utf-8" else []
-    if encoding.startswith(("utf-16", "utf-32")):
+    if encoding.startswith("utf-16"):
         stream, encoding = codecs.EncodedFile(stream, "utf-8", encoding), "utf-8"
     stream.seek(0)
     text, lines = Text(stream), list[str]()
@@ -322,7 +320,7 @@ def _numbers(
 def _spooled(
     tables: Iterable[Any], places: dict[str, int], times: Mapping[str, SinceFirst]
 ) -> dict[str, Samples]:
-    """Collect the columns of tables, block by block."""
+    """Collect the columns of tables, block by block; empty rows at the end are left out."""
     taken = {name: Spool() for name in places}
     n_rows = n_blank = 0
     for table in tables:
@@ -355,14 +353,10 @@ def _first_text(values: list[object], n_before: int) -> str:
     return "text"
 
 
-_BINARY = (GZIP, b"PAR1", b"\x89HDF")
-
-
 def _is_text(head: bytes) -> bool:
     """Return whether a file may begin so."""
-    return (
-        encoding_of(head).startswith(("utf-16", "utf-32")) or b"\0" not in head
-    ) and not head.startswith(_BINARY)
+    is_binary = head.startswith((GZIP, b"PAR1", b"\x89HDF"))
+    return encoding_of(head).startswith("utf-16") or not (b"\0" in head or is_binary)
 
 
 CSV = Format("CSV", (".csv", ".lvm"), _is_text, _load)

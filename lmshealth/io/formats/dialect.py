@@ -300,7 +300,6 @@ def _names(
         return [str(i) for i in range(n)], [""] * n, None
     # Names differ; a line of the names that the column map has needs no other sign.
     own = [one for one in heads if mapped and mapped <= set(one[1])]
-    stated = bool(own)
     unlike = [one for one in heads if all(one[1]) and len(set(one[1])) == len(one[1])]
     unlike = [one for one in unlike if not all(map(_is_unit, one[1]))] or unlike
     own += sorted(unlike, key=lambda one: sum(map(str.isdecimal, one[1])))
@@ -309,8 +308,6 @@ def _names(
         found_there = f"row 1 has {n} fields, the line of names {len(names)}"
         raise corrupt(f"{found_there}; or list the names by header under [csv] of the column map")
     k = heads.index((where, names))
-    if not stated and k + 1 < len(heads) and any(names) and all(map(_is_unit, names)):
-        k, (where, names) = k + 1, heads[k + 1]
     # Below the names, or else in any other line.
     others = [fields for _, fields in (*heads[max(k - 1, 0) : k], *heads) if fields is not names]
     fitting = (one for one in others if len(one) == len(names) and all(map(_is_unit, one)))
