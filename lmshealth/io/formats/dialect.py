@@ -114,11 +114,6 @@ def find_dialect(lines: Sequence[str], columns: ColumnMap) -> Dialect:
         found = _Rows(0.0, False, 0, begin + 1, n_fields, delimiter, decimal)
     above = lines[skip : found.first]
     if layout.delimiter is None and layout.decimal is None:
-        title = above[-1].strip() if above else ""
-        is_pair = found.n_fields == 2 and found.delimiter == ","
-        if is_pair and "," not in title and columns.target(title) is not None:
-            # One name over rows such as "1,5".
-            found = found._replace(delimiter=";", decimal=",", n_fields=1)
         _check_thousands(lines[found.first :], found.delimiter)
     _check_no_row_before(above, found)
     n_first = len(fields_of(lines[found.first], found.delimiter)) if found.share else 0
