@@ -174,11 +174,7 @@ def missing_ranges(values: Samples, added: IntArray = NO_RANGES) -> tuple[IntArr
     are so many that they would cut the other channels to pieces.
     """
     most = constants.LARGEST_MAGNITUDE
-    found = [buffers.runs(~(np.abs(block) < most), at) for at, block in blocks(values)]
-    bounds = np.concatenate(found, axis=None)
-    # A range that ends at the edge of a block continues in the next.
-    twice = np.flatnonzero(np.diff(bounds) == 0)
-    ranges = np.delete(bounds, np.concatenate([twice, twice + 1])).reshape(-1, 2)
+    ranges = buffers.runs(np.concatenate([~(np.abs(block) < most) for _, block in blocks(values)]))
     if not ranges.size:
         return ranges, ""
     n_missing, n_ranges = count(ranges), len(ranges)

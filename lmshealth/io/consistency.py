@@ -87,11 +87,7 @@ def compare(
 
 
 def _moved(
-    position: Samples,
-    velocity: Samples | None,
-    nominal: float | None,
-    rate: float,
-    known: IntArray,
+    position: Samples, velocity: Samples | None, nominal: float | None, rate: float, known: IntArray
 ) -> tuple[IntArray, list[tuple[str, str, str]]]:
     """Compare a set position with itself, and the rate with it; return unknown jumps, and notes."""
     notes: list[tuple[str, str, str]] = []

@@ -11,15 +11,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray, IntArray
 from lmshealth.io import buffers, constants
-from lmshealth.io.buffers import (
-    BLOCK,
-    NO_RANGES,
-    Samples,
-    Spool,
-    blocks,
-    count,
-    runs,
-)
+from lmshealth.io.buffers import BLOCK, NO_RANGES, Samples, Spool, blocks, count, runs
 from lmshealth.io.log import expect_possible
 from lmshealth.io.refusal import Unusable
 
