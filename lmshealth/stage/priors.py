@@ -61,10 +61,6 @@ class Lognormal(_Distribution, frozen=True, tag="lognormal", tag_field="kind"):
         """Return the distribution of which `standard` has this mean and standard deviation."""
         return Lognormal(self.median * float(np.exp(self.sigma * mean)), self.sigma * std)
 
-    def widened(self, factor: float) -> Lognormal:
-        """Return one with the same median and ``factor`` times the sigma."""
-        return Lognormal(self.median, factor * self.sigma)
-
 
 class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
     """Normal distribution."""
@@ -99,10 +95,6 @@ class Normal(_Distribution, frozen=True, tag="normal", tag_field="kind"):
         """Return the distribution of which `standard` has this mean and standard deviation."""
         return Normal(self.mean + self.std * mean, self.std * std)
 
-    def widened(self, factor: float) -> Normal:
-        """Return one with the same mean and ``factor`` times the std."""
-        return Normal(self.mean, factor * self.std)
-
 
 class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     """Uniform distribution between low and high."""
@@ -126,11 +118,6 @@ class Uniform(_Distribution, frozen=True, tag="uniform", tag_field="kind"):
     def probability(self, x: FloatArray) -> FloatArray:
         """Return probabilities below x, elementwise."""
         return np.clip((np.asarray(x) - self.low) / (self.high - self.low), 0.0, 1.0)
-
-    def widened(self, factor: float) -> Uniform:
-        """Return one with the same centre and ``factor`` times the width."""
-        middle, half = (self.low + self.high) / 2, (self.high - self.low) / 2
-        return Uniform(middle - factor * half, middle + factor * half)
 
 
 Prior = Lognormal | Normal | Uniform
@@ -197,8 +184,3 @@ class JointPrior:
     def draw(self, rng: np.random.Generator, n: int) -> FloatArray:
         """Draw ln parameters, shape ``(n, n_parameters)``."""
         return self.quantile(rng.uniform(1e-12, 1 - 1e-12, (n, len(self.priors))))
-
-    def widened(self, factor: float) -> JointPrior:
-        """Return one whose priors are wider by a factor, in the same box."""
-        priors = tuple(prior.widened(factor) for prior in self.priors)
-        return JointPrior(self.names, priors, self.low, self.high)
