@@ -11,8 +11,8 @@ from typing import Any, Literal
 
 import numpy as np
 
+from lmshealth._private import load_plug_ins
 from lmshealth._private.arrays import freeze
-from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth._private.result import Result
 from lmshealth.io import constants
 from lmshealth.io.buffers import Samples

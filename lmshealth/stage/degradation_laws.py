@@ -7,8 +7,8 @@ import msgspec
 import numpy as np
 from scipy.special import expit, log_expit
 
+from lmshealth._private import load_plug_ins
 from lmshealth._private.arrays import FloatArray
-from lmshealth._private.plug_ins import load_plug_ins
 from lmshealth._private.tables import fact
 from lmshealth._private.toml import within
 from lmshealth.stage import constants

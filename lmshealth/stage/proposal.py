@@ -243,7 +243,7 @@ def _times(load_by: _Load, columns: list[_Column], rate: float | None) -> dict[s
     unnamed = [one for one in columns if one.name.isdecimal() and one.is_even]
     named.sort(key=lambda one: not stated[one.name])
     found: dict[str, Guess] = {}
-    open_question: Unusable | None = None
+    open_question = ""
     for one in dict.fromkeys((*named, *unnamed)):
         low, mean, _ = one.steps
         if not (low >= 0 and mean > 0) or role_of(one.name) not in (None, "time"):
@@ -251,27 +251,17 @@ def _times(load_by: _Load, columns: list[_Column], rate: float | None) -> dict[s
         if any(guess.target for guess in found.values()):
             found[one.name] = Guess(one.name, "", "times, as another column")
             continue
-        unit = stated[one.name]
         try:
-            found[one.name] = _in_unit(one, *_rate_of(load_by, one, unit), rate)
-        except _Contradiction:
-            raise
-        except _Question as question:
-            open_question = open_question or question
-            found[one.name] = Guess(one.name, "", question.detail)
+            found_rate, unit = _rate_of(load_by, one, stated[one.name])
         except Unusable as error:
             found[one.name] = Guess(one.name, "", f"times that cannot be used: {error.detail}")
+            continue
+        guess = found[one.name] = _in_unit(one, found_rate, unit, rate)
+        if rate is None and not guess.target:
+            open_question = open_question or guess.why
     if open_question and not any(guess.target for guess in found.values()):
-        raise open_question
+        raise Unusable("time", open_question)
     return found
-
-
-class _Question(Unusable):
-    """Times whose unit nothing states."""
-
-
-class _Contradiction(Unusable):
-    """Times that give another sample rate than the file or the user states."""
 
 
 def _rate_of(load_by: _Load, one: _Column, unit: str) -> tuple[float, str]:
@@ -299,8 +289,8 @@ def _time_target(unit: str) -> tuple[str, dict[str, str | float]]:
 
 def _in_unit(one: _Column, found: float, unit: str, rate: float | None) -> Guess:
     """Guess the unit of times that give a rate in Hz in their unit, or in s if it is not stated."""
-    # `_Contradiction` where the sample rate of another source does not agree, `_Question`
-    # where it does not choose between units.
+    # Where neither decides, the times are not read and the reason asks for the rate; `Unusable`
+    # (``time``) where the sample rate of another source does not agree.
     rates = {unit: found} if unit else {u: found / factor for u, factor in SI_TIMES.items()}
     rates = {u: hz for u, hz in rates.items() if _RATES[0] <= hz <= _RATES[1]} or rates
     how = f"in {unit}" if unit else f"in steps of {one.steps[1]:.6g}"
@@ -314,13 +304,13 @@ def _in_unit(one: _Column, found: float, unit: str, rate: float | None) -> Guess
             return Guess(one.name, "", f"ascends {how}, which are no times at {rate:.6g} Hz")
         if not fits:
             detail = f"times {one.name!r} give {readings}, the stated sample rate is {rate:.6g} Hz"
-            raise _Contradiction("time", f"{detail}; correct it, or write a column map by hand")
+            raise Unusable("time", f"{detail}; correct it, or write a column map by hand")
     elif not unit:
         fits, witness = ["s"] if found >= _CERTAIN_RATE else [], ", taken as s"
     if len(fits) != 1:
         detail = f"column {one.name!r} ascends {how} and nothing states its unit: {readings}"
         step = 'give the right one as --sample-rate HZ, or map it by hand: time_us = "…"'
-        raise _Question("time", f"{detail}; {step}")
+        return Guess(one.name, "", f"{detail}; {step}")
     target, scale = _time_target(fits[0])
     why = f"times {how}{'' if unit else witness}: {rates[fits[0]]:.6g} Hz"
     factor = "".join(f"{factor!r}  # s per {fits[0]}" for factor in scale.values())

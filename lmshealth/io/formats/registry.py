@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from lmshealth._private.plug_ins import load_plug_ins
+from lmshealth._private import load_plug_ins
 from lmshealth.io import constants
 from lmshealth.io.buffers import Stored
 from lmshealth.io.column_map import ColumnMap

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from lmshealth._private import plug_ins
+import lmshealth._private as plug_ins
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import as_samples
 from lmshealth.io.column_map import ColumnMap
