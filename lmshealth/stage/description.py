@@ -459,15 +459,6 @@ def load_stage(reference: str | Path, *, follow_links: bool = False) -> Stage:
     return Stage(description=description, modal_map=modal_map, digest=digest.hexdigest())
 
 
-def _check_lone_mode(path: Path, each: float, n_modes: int) -> None:
-    """Refuse probabilities of modes that move alone, of which one does, above 1 together."""
-    if each * n_modes > 1:
-        raise BadStage(
-            f"{path}: life.lone_mode: {n_modes} modes with {each:g} each have a probability above "
-            f"1 together; needed is at most {1 / n_modes:.3g}"
-        )
-
-
 def _check_map(path: Path, description: Description, modal_map: ModalMap) -> None:
     """Refuse a description that contradicts its map."""
     ends = np.array([modal_map.low, modal_map.high])
@@ -493,21 +484,24 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
             f"tracked [[mode]] ({described})"
         )
-    _check_lone_mode(path, description.life.lone_mode, len(known))
+    if (each := description.life.lone_mode) * len(known) > 1:
+        raise BadStage(
+            f"{path}: life.lone_mode: {len(known)} modes with {each:g} each have a probability "
+            f"above 1 together; needed is at most {1 / len(known):.3g}"
+        )
     at = np.exp(modal_map.ln_frequency(np.log([[p.baseline for p in description.parameter]]))[0])
     free = {
         name.casefold(): (name, f)
         for name, f in zip(modal_map.modes, at.tolist(), strict=True)
         if name not in described
     }
-    for k, mode in enumerate(description.mode):
-        if not mode.tracked or mode.name in modal_map.modes:
-            continue
+    absent = [mode for mode in description.mode if mode.tracked and mode not in known]
+    for mode in absent:
         for near in get_close_matches(mode.name.casefold(), free):
             name, f = free[near]
             if abs(f / mode.frequency_hz - 1) <= mode.search:
                 raise BadStage(
-                    f"{path}: mode[{k}].name: {mode.name!r} is not on the map, whose {name!r} at "
+                    f"{path}: mode[{described.index(mode.name)}].name: {mode.name!r} is not on the map, whose {name!r} at "
                     f"{f:.4g} Hz no [[mode]] describes; write {name!r}, or, if these are two "
                     "modes, describe both"
                 )

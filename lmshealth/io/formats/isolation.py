@@ -95,14 +95,12 @@ def read_isolated(form: Format, path: Path, columns: ColumnMap, max_memory: floa
     # Windows may keep an empty folder.
     with TemporaryDirectory(prefix="lmshealth-", ignore_cleanup_errors=True) as folder:
         request = _Request(*arguments, seconds, memory, form.library, folder)
+        with suppress(_Ended):  # the file before may have damaged the memory of the process
+            return _reader.read(request)
         try:
             return _reader.read(request)
-        except _Ended:
-            # The file before may have damaged the memory of the process.
-            try:
-                return _reader.read(request)
-            except _Ended as error:
-                raise Unusable("corrupt", f"{error}; copy the file again") from error
+        except _Ended as error:
+            raise Unusable("corrupt", f"{error}; copy the file again") from error
 
 
 def _max_seconds() -> float:
@@ -155,8 +153,7 @@ class _Reader:
         self.process.stdin.write(json.dumps(request).encode() + b"\n")
         self.process.stdin.flush()
         line = self.process.stdout.readline()
-        answer = msgspec.convert(json.loads(line), tuple[_Received | None, str, str])
-        content, *refusal = answer
+        content, *refusal = msgspec.convert(json.loads(line), tuple[_Received | None, str, str])
         if content is None:
             raise Unusable(*refusal)
         files = {name: os.path.basename(own) for name, own in content.columns.items()}
