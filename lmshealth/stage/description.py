@@ -501,7 +501,7 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             name, f = free[near]
             if abs(f / mode.frequency_hz - 1) <= mode.search:
                 raise BadStage(
-                    f"{path}: mode[{described.index(mode.name)}].name: {mode.name!r} is not on the map, whose {name!r} at "
-                    f"{f:.4g} Hz no [[mode]] describes; write {name!r}, or, if these are two "
-                    "modes, describe both"
+                    f"{path}: mode[{described.index(mode.name)}].name: {mode.name!r} is not on "
+                    f"the map, whose {name!r} at {f:.4g} Hz no [[mode]] describes; write {name!r}, "
+                    "or, if these are two modes, describe both"
                 )
