@@ -38,10 +38,12 @@ Samples = FloatArray | Stored
 
 
 def received(file: str) -> Samples:
-    """Return the samples of a file that is about to be deleted: in memory, or beyond it open."""
+    """Return the samples of a file that is about to be deleted: mapped, or of long ones open."""
     size = os.path.getsize(file) // 8
     if size <= MINUTE:
-        return np.fromfile(file, dtype=np.float64)
+        # Windows does not delete a file that is mapped.
+        is_mapped = size and os.name != "nt"
+        return np.asarray(np.memmap(file, float, "c")) if is_mapped else np.fromfile(file, float)
     flags = os.O_RDONLY | getattr(os, "O_BINARY", 0) | getattr(os, "O_TEMPORARY", 0)
     return Stored(os.fdopen(os.open(file, flags), "rb"), size)
 

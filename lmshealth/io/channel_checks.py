@@ -174,9 +174,10 @@ def missing_ranges(values: Samples, added: IntArray = NO_RANGES) -> tuple[IntArr
     are so many that they would cut the other channels to pieces.
     """
     most = constants.LARGEST_MAGNITUDE
-    ranges = buffers.runs(np.concatenate([~(np.abs(block) < most) for _, block in blocks(values)]))
-    if not ranges.size:
-        return ranges, ""
+    marked = np.concatenate([~(np.abs(block) < most) for _, block in blocks(values)])
+    if not marked.any():
+        return NO_RANGES, ""
+    ranges = buffers.runs(marked)
     n_missing, n_ranges = count(ranges), len(ranges)
     note = f"{n_missing} of {values.size} samples are missing (NaN) in {n_ranges} ranges"
     # Gaps of the time are common to all channels, and were counted there.
