@@ -17,7 +17,7 @@ from lmshealth.io.log import Refusal, covariates
 from lmshealth.machine.status import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.tracking.track import Track, mode_columns
+from lmshealth.tracking.track import Smoothed, Track, mode_columns
 
 if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.machine.assessment import Assessment
@@ -29,7 +29,6 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
     from lmshealth.stage.identifiability import Plan
-    from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 

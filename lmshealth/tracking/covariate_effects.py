@@ -10,8 +10,7 @@ from lmshealth.tracking import constants
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.track import Effect, Track, accepted_estimates
+from lmshealth.tracking.track import Effect, Track, accepted_estimates, smooth
 
 
 @dataclass(frozen=True, slots=True, eq=False)

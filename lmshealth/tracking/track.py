@@ -2,7 +2,7 @@
 
 All modes share one state space, because their estimates may be correlated, and one bank of filters.
 Declared steps are in the model from the start; a detected step is added, and the logs from it on
-are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
+are filtered again from the checkpoint before it. No epoch uses later logs; `smooth` does.
 """
 
 from collections.abc import Sequence
@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, ndtr
 
-from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
@@ -22,16 +22,15 @@ from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filters.change_detection import Event
-from lmshealth.tracking.filters.published_filter import Nuisances
+from lmshealth.tracking.filters.published_filter import Nuisances, smooth_states
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.filters.track_state import (
     Epoch,
     TrackState,
     degrees_of_freedom,
     initial_state,
-    lagged_products,
+    running_sums,
     step,
-    unrolled,
     widening,
 )
 from lmshealth.tracking.history import History, Step
@@ -189,19 +188,14 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     `nis` and `dof` have the shape ``(n_epochs,)``, standardised innovations ``(n_epochs, n)``, NaN
     where there is none.
     """
-    judged = dof > 0
-    total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
+    ends = (float(own[-1:].sum()) for own in running_sums(nis, dof, innovations))
+    total, degrees, products, std, correlation = ends
     tail = float(chdtrc(degrees, total)) if degrees else 0.5
-    sums, counts = lagged_products(innovations)
-    n = int(counts.sum())
-    scale = float(np.sqrt(np.sum(sums**2)))
-    size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
-    correlation = float(sums.sum()) / n / max(size, 1e-12) if n else 0.0
     return Consistency(
         nis=total / degrees if degrees else 1.0,
-        p_value=float(2 * min(tail, 1 - tail)),
+        p_value=2 * min(tail, 1 - tail),
         autocorrelation=correlation,
-        autocorrelation_p_value=float(2 * ndtr(-abs(sums.sum()) / scale)) if scale else 1.0,
+        autocorrelation_p_value=float(2 * ndtr(-abs(products) / std)) if std else 1.0,
     )
 
 
@@ -262,7 +256,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
 def _published(state: TrackState) -> Track:
     """Return the track of the logs up to a state."""
     space, sources = state.space, state.space.sources
-    history, epochs, rows = space.history, state.epochs(), unrolled(state.rows)
+    history, epochs, rows = space.history, state.epochs(), state.rows
     mean = np.array([row.mean for row in rows])
     drift, drift_cov = _drifts(space, mean, np.array([row.drift_cov for row in rows]))
     factor = widening(state)
@@ -445,3 +439,44 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
         )
         refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
     return refused
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Smoothed(ReadOnly):
+    """Modes at every epoch given all logs; fields are as in `Track`, ``(n_epochs, n_modes)``."""
+
+    ln_frequency: FloatArray
+    ln_frequency_std: FloatArray
+    ln_damping: FloatArray
+    ln_damping_std: FloatArray
+    drift: FloatArray
+    drift_std: FloatArray
+
+
+def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
+    """Smooth a history by the Rauch-Tung-Striebel recursion of its published filter [Rauch1965].
+
+    The steps and nuisances of its track are in the model; the stage is that of `track`.
+    `ValueError` for a track without nuisances, which `track` did not make.
+    """
+    if followed.nuisances is None:
+        raise ValueError(f"the track of {followed.stage} has no nuisances: filter it by `track`")
+    space = StateSpace(history, stage, followed.steps)
+    mean, cov = smooth_states(space, followed.nuisances)
+    contrast = space.drift
+    size = contrast.shape[1]
+    drift = mean[:, :size] @ contrast.T
+    variance = np.einsum("mi,kij,mj->km", contrast, cov[:, :size, :size], contrast)
+    early = np.arange(len(history.logs)) < history.baselines[0]
+    drift[early], variance[early] = np.nan, np.nan
+    std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * followed.widening[:, None]
+    unseen = space.damping.start + np.flatnonzero(np.isnan(followed.ln_damping).all(axis=0))
+    mean[:, unseen], std[:, unseen] = np.nan, np.nan
+    return Smoothed(
+        ln_frequency=mean[:, space.level],
+        ln_frequency_std=std[:, space.level],
+        ln_damping=mean[:, space.damping],
+        ln_damping_std=std[:, space.damping],
+        drift=drift,
+        drift_std=np.sqrt(np.maximum(variance, 0.0)) * followed.widening[:, None],
+    )

@@ -34,8 +34,7 @@ from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
 from lmshealth.tracking.filters.change_detection import Event
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.smoother import Smoothed
-from lmshealth.tracking.track import Effect, Track
+from lmshealth.tracking.track import Effect, Smoothed, Track
 from tests.lives import health_of
 from tests.signals import write_archive_stage
 

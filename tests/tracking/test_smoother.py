@@ -10,8 +10,7 @@ import pytest
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filters import state_space
-from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.track import track
+from lmshealth.tracking.track import smooth, track
 from tests.lives import (
     PRELOAD,
     TWO,

@@ -6,7 +6,6 @@ a detected step makes one whose last logs are filtered again from the checkpoint
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import TypeVar, Union
 
 import numpy as np
 from scipy.special import chdtri, ndtri
@@ -41,10 +40,6 @@ from lmshealth.tracking.filters.published_filter import (
 )
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import Step
-
-Item = TypeVar("Item")
-Chain = Union[tuple[Item, "Chain[Item]"], None]  # noqa: UP007, it names itself
-"""The last item and the chain of all before it: a sequence that grows without a copy."""
 
 # Logs after which no running-in goes on: three times the slowest decay.
 _RUN_IN = 3 * max(logs for logs, _ in constants.RUNNING_IN_LOGS)
@@ -100,8 +95,8 @@ class TrackState:
     bank: FilterBank  # from which the next log is predicted
     published: Gaussian  # state of the published filter
     checkpoints: tuple[Checkpoint, ...] = ()  # the last logs
-    settled: "Chain[Epoch]" = None  # epochs of the logs before them, which are not filtered again
-    rows: "Chain[Published]" = None  # what is published of every log
+    settled: tuple[Epoch, ...] = ()  # of the logs before them, which are not filtered again
+    rows: tuple[Published, ...] = ()  # what is published of every log
     start: int = 0  # first log of the regime
     first: int = 1  # first log of its windows of innovations
     credit: int = 0  # logs that may be filtered again for other nuisances
@@ -115,16 +110,7 @@ class TrackState:
 
     def epochs(self) -> list[Epoch]:
         """Return the epochs of all logs."""
-        return [*unrolled(self.settled), *(one.epoch for one in self.checkpoints)]
-
-
-def unrolled(chain: "Chain[Item]") -> list[Item]:
-    """Return the items of a chain, the first one first."""
-    items: list[Item] = []
-    while chain is not None:
-        item, chain = chain
-        items.append(item)
-    return items[::-1]
+        return [*self.settled, *(one.epoch for one in self.checkpoints)]
 
 
 def initial_state(space: StateSpace) -> TrackState:
@@ -172,7 +158,7 @@ def _filter(state: TrackState, k: int) -> TrackState:
     sums = add_to_sums(sums, found.rows, innovation)
     checkpoints, settled = state.checkpoints, state.settled
     if len(checkpoints) == N_CHECKPOINTS:
-        settled, checkpoints = (checkpoints[0].epoch, settled), checkpoints[1:]
+        settled, checkpoints = (*settled, checkpoints[0].epoch), checkpoints[1:]
     return replace(
         state,
         bank=bank,
@@ -233,8 +219,7 @@ def _reopened(state: TrackState, window: int) -> TrackState:
 def _worst_window(state: TrackState) -> tuple[int, float]:
     """Return the first log of the window with the largest mean innovation, and its size."""
     offset = state.checkpoints[0].index + 1
-    sums = [one.sums for one in state.checkpoints]
-    window, size = worst_window(sums, state.first - offset)
+    window, size = worst_window([one.sums for one in state.checkpoints], state.first - offset)
     return window + offset, size
 
 
@@ -330,7 +315,7 @@ def _publish(state: TrackState, k: int) -> TrackState:
     last, own = state.checkpoints[-1], state.published
     if last.epoch.outlying.any():
         own = filter_log(state.space, last.before, last.epoch.nuisances, k, undecided=True)
-    return replace(state, rows=(_row(state, own), state.rows))
+    return replace(state, rows=(*state.rows, _row(state, own)))
 
 
 def _row(state: TrackState, own: Gaussian) -> Published:
@@ -356,15 +341,25 @@ def degrees_of_freedom(space: StateSpace, innovations: FloatArray) -> FloatArray
     return np.asarray(there.sum(axis=1), dtype=float)
 
 
-def lagged_products(innovations: FloatArray) -> tuple[FloatArray, np.ndarray]:
-    """Multiply innovations by those of the log before: their sum over each log and their number.
+def running_sums(
+    nis: FloatArray, dof: FloatArray, innovations: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Return what tests of innovations need, up to each log, shape ``(n_logs,)`` each.
 
-    Series of one log may have common errors: only sums over different logs are independent.
+    They are the sums of NIS and of its degrees of freedom, the sum of products of innovations with
+    those of the log before, its standard deviation if they are independent, and their
+    autocorrelation. Series of one log may have common errors: sums over logs are independent.
     """
     products = np.full_like(innovations, np.nan)
     products[1:] = innovations[1:] * innovations[:-1]
-    there = np.isfinite(products)
-    return np.where(there, products, 0.0).sum(axis=1), there.sum(axis=1)
+    sums = np.nansum(products, axis=1)
+    square = np.cumsum(np.nansum(innovations**2, axis=1))
+    n, n_squares = (np.cumsum(np.isfinite(x).sum(axis=1)) for x in (products, innovations))
+    size = np.maximum(square / np.maximum(n_squares, 1), 1e-12)
+    total = np.cumsum(sums)
+    correlation = total / np.maximum(n, 1) / size
+    std = np.sqrt(np.cumsum(sums**2))
+    return np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof), total, std, correlation
 
 
 def widening(state: TrackState) -> FloatArray:
@@ -378,16 +373,11 @@ def widening(state: TrackState) -> FloatArray:
     innovations = np.array([one.innovations for one in epochs])
     dof = degrees_of_freedom(state.space, innovations)
     nis = np.array([one.nis for one in epochs])
-    total, degrees = np.cumsum(np.where(dof > 0, nis, 0.0)), np.cumsum(dof)
+    total, degrees, products, std, correlation = running_sums(nis, dof, innovations)
     bound = chdtri(np.maximum(degrees, 1.0), constants.WIDENING_P_VALUE)
     factor = np.where(total > bound, total / np.maximum(degrees, 1.0), 1.0)
-    sums, counts = lagged_products(innovations)
-    n = np.cumsum(counts)
-    squares = np.cumsum(np.nansum(innovations**2, axis=1))
-    count = np.cumsum(np.isfinite(innovations).sum(axis=1))
-    size = squares / np.maximum(count, 1)
-    rho = np.clip(np.cumsum(sums) / np.maximum(n, 1) / np.maximum(size, 1e-12), -0.9, 0.9)
-    bound = -ndtri(constants.WIDENING_P_VALUE) * np.sqrt(np.cumsum(sums**2))
-    factor = np.sqrt(factor * np.where(np.cumsum(sums) > bound, dependence(rho), 1.0))
+    dependent = products > -ndtri(constants.WIDENING_P_VALUE) * std
+    rho = np.clip(correlation, -0.9, 0.9)
+    factor = np.sqrt(factor * np.where(dependent, dependence(rho), 1.0))
     known = np.empty(0) if state.widening is None else state.widening
     return np.append(known, factor[known.size :])
