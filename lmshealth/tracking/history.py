@@ -430,21 +430,14 @@ def _line_up(
     for k, i, (mode, source) in assigned:
         if mode is not None and (mode, source) in places:
             pairs[k].append((places[mode, source], i))
-    # Most logs have the same estimates in the same columns: these are put there at once.
-    alike: dict[tuple[Any, ...], list[int]] = {}
-    for k, one in enumerate(estimates):
-        alike.setdefault((len(one.names), *pairs[k]), []).append(k)
     n, r = len(estimates), len(series)
     ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
     cov = np.full((n, 2 * r, 2 * r), np.nan)
-    for (size, *own), logs in alike.items():
+    for k, (one, own) in enumerate(zip(estimates, pairs, strict=True)):
         to, of = np.array(own, dtype=int).reshape(-1, 2).T
-        at, some = np.array(logs)[:, None], [estimates[k] for k in logs]
-        ln_f[at, to] = np.array([one.ln_frequency for one in some])[:, of]
-        ln_zeta[at, to] = np.array([one.ln_damping for one in some])[:, of]
-        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + size])
-        part = np.array([one.cov for one in some])[:, of[:, None], of]
-        cov[at[:, :, None], to[:, None], to] = part
+        ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(one.names)])
+        cov[k, to[:, None], to] = one.cov[of[:, None], of]
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 

@@ -282,23 +282,19 @@ class StateSpace:
         return matrix
 
     def _observations(self) -> list[Observation]:
-        """Return the estimates of each log; logs with the same rows are taken at once."""
+        """Return the estimates of each log."""
         history, r = self.history, len(self.history.series)
         values = np.hstack([history.ln_frequency, history.ln_damping])
         source = np.array([self.sources.index(one.source) for one in history.series] * 2)
         # Variance of ln f due to unknown covariates.
         unknown = sum((one.unknown for one in self.regressed), np.zeros(len(values)))
-        found: dict[int, Observation] = {}
-        patterns, place = np.unique(np.isfinite(values), axis=0, return_inverse=True)
-        for i, there in enumerate(patterns):
-            rows, logs = np.flatnonzero(there), np.flatnonzero(place.ravel() == i)
-            own = values[logs[:, None], rows]
-            matrices = self.fixed[logs[:, None], rows]
-            covs = history.cov[logs[:, None, None], rows[:, None], rows]
-            for j, k in enumerate(logs.tolist()):
-                extra = np.where(rows < r, unknown[k], 0.0) if unknown[k] else None
-                found[k] = Observation(rows, own[j], matrices[j], covs[j], source[rows], extra)
-        return [found[k] for k in range(len(values))]
+        found = []
+        for own, matrix, cov, more in zip(values, self.fixed, history.cov, unknown, strict=True):
+            rows = np.flatnonzero(np.isfinite(own))
+            extra = np.where(rows < r, more, 0.0) if more else None
+            errors = cov[rows[:, None], rows]
+            found.append(Observation(rows, own[rows], matrix[rows], errors, source[rows], extra))
+        return found
 
     def _process_noise(self) -> tuple[FloatArray, FloatArray]:
         """Return covariances of the parts of process noise, and their shares in every log.
