@@ -15,7 +15,6 @@ from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData
-from lmshealth.life.posterior.ensemble_sampling import Sample, sample, thin
 from lmshealth.life.posterior.exploration import Explored, LifeStart, explore, log_probability
 from lmshealth.life.posterior.likelihood import (
     NO_MODE,
@@ -25,6 +24,7 @@ from lmshealth.life.posterior.likelihood import (
     ln_health,
     scatter_prior,
 )
+from lmshealth.life.posterior.sampling import Sample, sample, thin
 from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
