@@ -7,7 +7,6 @@ logs, and an estimate gets a mode only if that mode has nearly all of the poster
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, Self
 
@@ -207,9 +206,11 @@ def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Labe
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
     detected: set[int] = set()
-    for source in range(len(set(log.sources))):
+    for source in dict.fromkeys(log.sources):
+        rows = np.flatnonzero([one == source for one in log.sources])
         # Modes that one source starts are known to the next.
-        rows, meant = _groups(state.names, log.names, log.sources)[source]
+        index = {name: i for i, name in enumerate(state.names)} | {"": -1}
+        meant = np.array([index.get(log.names[i], len(state.names)) for i in rows], dtype=int)
         own = log.measurements if rows.size == len(log.names) else log.measurements[rows]
         scan = Scan(log.epoch, rows, meant, own, np.concatenate([(1.0, 0.0), log.offsets]))
         unique = None if log.opened else _unique_assignment(state, scan)
@@ -226,17 +227,6 @@ def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Labe
     candidates = prune(state.candidates, log.epoch, confirmed, detected)
     state = replace(state, candidates=candidates, places=places | log.places)
     return state, tuple(found)
-
-
-@lru_cache(maxsize=256)
-def _groups(
-    modes: tuple[str, ...], names: tuple[str, ...], sources: tuple[str, ...]
-) -> list[tuple[IntArray, IntArray]]:
-    """Return the rows of each source, and the indices of the modes that their names mean."""
-    index = {name: i for i, name in enumerate(modes)}
-    meant = np.array([index.get(n, len(modes)) if n else -1 for n in names], dtype=int)
-    each = [np.flatnonzero(np.array(sources) == s) for s in dict.fromkeys(sources)]
-    return [(rows, meant[rows]) for rows in each]
 
 
 def _is_common_jump(

@@ -7,7 +7,6 @@ only reduce the probability of a false alarm.
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Literal
 
 import numpy as np
@@ -52,20 +51,16 @@ class Event:
     found_at: int  # the log after which it was detected
 
 
-@lru_cache(maxsize=16)
-def _columns(n_rows: int) -> FloatArray:
-    """Return the columns that each row is added to, shape ``(n_rows, n_rows + 2)``."""
-    return np.hstack([np.eye(n_rows), np.repeat(np.eye(2), n_rows // 2, axis=0)])
-
-
 def add_to_sums(sums: FloatArray, rows: np.ndarray, innovation: FloatArray) -> FloatArray:
     """Add the standardised innovations of one log to running sums, and their numbers.
 
     The shape is ``(2, n_rows + 2)``: a column per row, one for all ln f, and one for all ln ζ,
     because grease changes all dampings.
     """
-    both = np.array([innovation, np.ones(rows.size)])
-    return np.asarray(sums + both @ _columns(sums.shape[1] - 2)[rows])
+    total, n_series = sums.copy(), sums.shape[1] // 2 - 1
+    for column in (rows, -2 + rows // n_series):
+        np.add.at(total.T, column, np.column_stack([innovation, np.ones(rows.size)]))
+    return total
 
 
 def worst_window(sums: Sequence[FloatArray], first: int) -> tuple[int, float]:
@@ -87,11 +82,10 @@ def worst_window(sums: Sequence[FloatArray], first: int) -> tuple[int, float]:
 def recent_loop_change(loop_changes: Sequence[int], first: int, now: int) -> int | None:
     """Return the last log of the regime since which the following error differs, if it is recent.
 
-    `loop_changes` are those of `unexplained_loop_changes`, which locate a retuning better than
-    innovations do; `first` is the first log of the regime.
+    It locates a retuning better than innovations do; `first` is the first log of the regime.
     """
-    recent = [j for j in loop_changes if max(first, now - constants.LOOP_LOGS) <= j < now]
-    return recent[-1] if recent else None
+    since = max(first, now - constants.LOOP_LOGS)
+    return max((j for j in loop_changes if since <= j < now), default=None)
 
 
 @dataclass(frozen=True, slots=True, eq=False)

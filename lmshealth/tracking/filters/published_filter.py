@@ -13,10 +13,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, Rows, freeze
 from lmshealth.tracking import constants
-from lmshealth.tracking.filters.filter_bank import (
-    FilterBank,
-    Innovation,
-)
+from lmshealth.tracking.filters.filter_bank import FilterBank, Innovation
 from lmshealth.tracking.filters.state_space import Observation, StateSpace
 
 # Least weight of an estimate: an outlier for certain.

@@ -134,7 +134,10 @@ def step(state: TrackState, k: int) -> TrackState:
     # An older rate may hold no more, unless it is an outlier that deviates.
     if size > constants.BEGUN_GATE:
         detected = _reopened(detected, window)
-    return _publish(detected, k)
+    last, own = detected.checkpoints[-1], detected.published
+    if last.epoch.outlying.any():
+        own = filter_log(detected.space, last.before, last.epoch.nuisances, k, undecided=True)
+    return replace(detected, rows=(*detected.rows, _row(detected, own)))
 
 
 def _filter(state: TrackState, k: int) -> TrackState:
@@ -308,14 +311,6 @@ def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
     mode = state.space.history.modes[i]
     alarm = Event("alarm", k, mode, "", float(drift[i]), float(std[i]), evidence, False, k)
     return replace(state, alarms=(*state.alarms, alarm), alarmed=True)
-
-
-def _publish(state: TrackState, k: int) -> TrackState:
-    """Publish the state after log k."""
-    last, own = state.checkpoints[-1], state.published
-    if last.epoch.outlying.any():
-        own = filter_log(state.space, last.before, last.epoch.nuisances, k, undecided=True)
-    return replace(state, rows=(*state.rows, _row(state, own)))
 
 
 def _row(state: TrackState, own: Gaussian) -> Published:
