@@ -32,15 +32,8 @@ from lmshealth.errors import BadQuestion, NotConverged, NotEnoughData
 from lmshealth.life.health import health_of
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import Prognosis, identifiable_limits, prognosis_of
-from lmshealth.life.verdict import (
-    OUTSIDE_MAP,
-    degraded_below,
-    degraded_words,
-    doubt_of_names,
-)
-from lmshealth.life.verdict import (
-    judge as judge_state,
-)
+from lmshealth.life.verdict import OUTSIDE_MAP, degraded_below, degraded_words, doubt_of_names
+from lmshealth.life.verdict import judge as judge_state
 from lmshealth.machine.service import decide, remaining_days
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of

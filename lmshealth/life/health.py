@@ -301,11 +301,7 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
 
 
 def infer_drifts(
-    drifts: Drifts,
-    stage: Stage,
-    seed: int | Sequence[int],
-    *,
-    epochs: int = constants.MAX_EPOCHS,
+    drifts: Drifts, stage: Stage, seed: int | Sequence[int], *, epochs: int = constants.MAX_EPOCHS
 ) -> Health:
     """Infer the health parameters from a table of drifts, each epoch from its own drifts alone.
 

@@ -17,12 +17,7 @@ from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
-from lmshealth.tracking.contradictions import (
-    BY_CLOCK,
-    NO_MOMENT,
-    are_many,
-    without_contradictions,
-)
+from lmshealth.tracking.contradictions import BY_CLOCK, NO_MOMENT, are_many, without_contradictions
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.maintenance import RESETS, Action
 

@@ -323,9 +323,7 @@ def thin(draws: FloatArray, n: int) -> FloatArray:
 
 
 def sample(
-    log_probability: LogProbability,
-    draws: WeightedDraws,
-    seed: np.random.SeedSequence,
+    log_probability: LogProbability, draws: WeightedDraws, seed: np.random.SeedSequence
 ) -> Sample:
     """Sample a posterior by independent ensembles [ForemanMackey2013], [Vehtari2021].
 

@@ -24,13 +24,7 @@ from lmshealth.tracking.filters.change_detection import (
     weigh_changes,
     worst_window,
 )
-from lmshealth.tracking.filters.filter_bank import (
-    FilterBank,
-    initial,
-    predict,
-    restart,
-    update,
-)
+from lmshealth.tracking.filters.filter_bank import FilterBank, initial, predict, restart, update
 from lmshealth.tracking.filters.published_filter import (
     Gaussian,
     Nuisances,
