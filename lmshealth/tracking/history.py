@@ -14,7 +14,7 @@ from lmshealth._private.tables import fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
 from lmshealth.tracking.contradictions import BY_CLOCK, NO_MOMENT, are_many, without_contradictions
@@ -373,31 +373,34 @@ def _baselines(ordered: Sequence[LogEstimates], steps: Sequence[Step]) -> tuple[
 
 def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
     """Return the estimates of tracked modes of each log, with shapes over all channels."""
-    tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
+    tracked = [] if stage is None else [mode for mode in stage.modes if mode.tracked]
+    known = {mode.name for mode in tracked}
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
     estimates = []
-    for reading in ordered:
-        modes, n = reading.modes, len(reading.modes.names)
-        names = tuple(
-            name or _nearest(float(modes.frequency[i]), stage) for i, name in enumerate(modes.names)
+    for modes in (reading.modes for reading in ordered):
+        pairs = zip(modes.names, modes.frequency.tolist(), strict=True)
+        names = [name or _nearest(frequency, tracked) for name, frequency in pairs]
+        shapes = np.full((len(names), len(channels)), np.nan)
+        shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
+        kept = [i for i, name in enumerate(names) if stage is None or name in known]
+        at = np.array(kept, dtype=int)
+        both = np.concatenate([at, at + len(names)])
+        estimates.append(
+            Estimates(
+                names=tuple(names[i] for i in kept),
+                sources=tuple(modes.sources[i] for i in kept),
+                ln_frequency=modes.ln_frequency[at],
+                ln_damping=modes.ln_damping[at],
+                cov=modes.cov[both[:, None], both],
+                shapes=shapes[at],
+            )
         )
-        shapes = modes.shapes
-        if list(modes.shape_channels) != channels:
-            shapes = np.full((n, len(channels)), np.nan)
-            shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
-        columns = (modes.ln_frequency, modes.ln_damping, modes.cov, shapes)
-        one = Estimates(names, modes.sources, *columns)
-        kept = [i for i, name in enumerate(names) if tracked is None or name in tracked]
-        estimates.append(one if len(kept) == n else one.pick(kept))
     return estimates
 
 
-def _nearest(frequency: float, stage: Stage | None) -> str:
-    """Return the nearest tracked mode whose search holds a frequency in Hz, else no name."""
-    if stage is None:
-        return ""
-    tracked = [mode for mode in stage.modes if mode.tracked]
-    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in tracked]
+def _nearest(frequency: float, modes: Sequence[ModeSpec]) -> str:
+    """Return the nearest mode whose search holds a frequency in Hz, else no name."""
+    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in modes]
     near = [(away, mode.name) for away, mode in off if away <= mode.search]
     return min(near, key=lambda one: one[0], default=(0.0, ""))[1]
 

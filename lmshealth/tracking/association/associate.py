@@ -59,19 +59,6 @@ class Estimates:
         shapes = "shapes", n, self.shapes.shape[-1]
         freeze(self, ("ln_frequency ln_damping", n), ("cov", 2 * n, 2 * n), shapes)
 
-    def pick(self, chosen: Sequence[int]) -> Self:
-        """Return some of the estimates."""
-        at, n = np.array(chosen, dtype=int), len(self.names)
-        both = np.concatenate([at, at + n])
-        return type(self)(
-            tuple(self.names[i] for i in chosen),
-            tuple(self.sources[i] for i in chosen),
-            self.ln_frequency[at],
-            self.ln_damping[at],
-            self.cov[both[:, None], both],
-            self.shapes[at],
-        )
-
 
 @dataclass(frozen=True, slots=True)
 class Label:
