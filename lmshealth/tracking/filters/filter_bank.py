@@ -156,7 +156,7 @@ def update(
     given, rows = space.observations[k], space.observations[k].rows
     if not rows.size:
         return bank, Innovation(rows, np.empty(0), np.empty((0, 0)), np.empty(0), np.empty(0))
-    matrix, scales = space.observed_matrix(k), bank.hyperparameters.scales[:, given.source]
+    matrix, scales = space.matrix(k)[rows], bank.hyperparameters.scales[:, given.source]
     errors = given.cov * (scales[:, :, None] * scales[:, None])
     # One product of all states with the matrix instead of one each. Its last row is the innovation
     # with the opposite sign.

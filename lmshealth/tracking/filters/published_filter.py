@@ -78,8 +78,13 @@ def select_nuisances(space: StateSpace, bank: FilterBank, found: Innovation, k: 
     enters as noise of its size.
     """
     own, share, changing = bank.hyperparameters, bank.weight, bank.hyperparameters.groups[1]
-    walk, *scales = np.exp(share @ own.log_walks)
-    settling, wander, kept = share @ own.variances
+    with np.errstate(divide="ignore"):
+        walks = np.log(np.column_stack([own.level_walk**2, own.scales]))
+    walk, *scales = np.exp(share @ walks)
+    size = own.wander_variance
+    settling, wander, kept = share @ np.column_stack(
+        [own.settling**2, size, size * own.wander_keep]
+    )
     # Their weights among themselves: against those of healthy filters they may be 0.
     odds = np.exp(bank.log_weight[changing] - bank.log_weight[changing].max(initial=-np.inf))
     running_in, moved = np.zeros(()), np.zeros(())
@@ -143,7 +148,7 @@ def filter_log(
     given, rows = space.observations[k], space.observations[k].rows
     if not rows.size:
         return Gaussian(mean, cov)
-    matrix, errors = space.observed_matrix(k), _errors(given, own)
+    matrix, errors = space.matrix(k)[rows], _errors(given, own)
     if undecided:
         half = (given.values - matrix @ mean) ** 2 / 2
         half[own.weight[rows] >= 0.5] = 0.0
@@ -186,7 +191,7 @@ def _transition(space: StateSpace, own: Nuisances, k: int) -> tuple[FloatArray, 
     if k == 0:
         noise[space.wander, space.wander] = own.wander * space.wander_cov
     elif space.seen[k]:
-        move[space.level, space.rate] = space.ticks[k] * space.single
+        move[space.level, space.rate] = space.ticks[k] * np.eye(space.n_modes)
         move[space.wander, space.wander] *= own.wander_keep
         walk, fresh = own.rate_walk, (1 - own.wander_keep**2) * own.wander
         parts = (own.level_walk, own.settling, walk, walk, walk, fresh, constants.DAMPING_WALK**2)

@@ -60,18 +60,6 @@ class Hyperparameters(Rows):
         return np.asarray((self.wander * np.exp(np.log(self.scales).mean(axis=1))) ** 2)
 
     @cached_property
-    def log_walks(self) -> FloatArray:
-        """Logs of the variance of the walk of ln f, then of the scales, ``(n, 1 + n_sources)``."""
-        with np.errstate(divide="ignore"):
-            return np.log(np.column_stack([self.level_walk**2, self.scales]))
-
-    @cached_property
-    def variances(self) -> FloatArray:
-        """Variances of settling, of wander, and of the part of it that stays, shape ``(n, 3)``."""
-        wander = self.wander_variance
-        return np.column_stack([self.settling**2, wander, wander * self.wander_keep])
-
-    @cached_property
     def process_noise(self) -> FloatArray:
         """Variances of the parts of process noise, in the order of `_process_noise`, ``(n, 7)``."""
         drive, wander = self.rate_walk**2, (1 - self.wander_keep**2) * self.wander_variance
@@ -128,7 +116,6 @@ class Observation:
 
     rows: np.ndarray  # of ``[ln f, ln ζ]`` of all series, ``(n_rows,)``
     values: FloatArray  # ``(n_rows,)``
-    matrix: FloatArray  # measurement matrix without steps, ``(n_rows, first_step)``
     cov: FloatArray  # covariance of the errors as stated, ``(n_rows, n_rows)``
     source: np.ndarray  # index of the source of each, ``(n_rows,)``
     extra: FloatArray | None  # variances of unknown covariates, ``(n_rows,)``; None without any
@@ -186,7 +173,6 @@ class StateSpace:
             std[i] = np.sqrt(first[0]) if first.size else 0.0
         self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
-        self.single = np.eye(std.size)
         self.noise, self.noise_shares = self._process_noise()
 
     def with_step(self, step: Step) -> Self:
@@ -214,20 +200,12 @@ class StateSpace:
 
     def matrix(self, k: int) -> FloatArray:
         """Return the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
-        fixed: FloatArray = self.fixed[k]
-        if not self.steps:
-            return fixed
-        matrix = np.zeros((fixed.shape[0], self.size))
-        matrix[:, : self.first_step] = fixed
+        matrix = np.zeros((len(self.mode_of), self.size))
+        matrix[:, : self.first_step] = self.fixed[k]
         for j, (step, reading) in enumerate(self._jumps):
             if step.there[k]:
                 matrix[:, self.jump(j)] = reading
         return matrix
-
-    def observed_matrix(self, k: int) -> FloatArray:
-        """Return the measurement matrix of the estimates that log k has, ``(n_rows, size)``."""
-        own = self.observations[k]
-        return self.matrix(k)[own.rows] if self.steps else own.matrix
 
     def jump_noise(self, k: int) -> FloatArray | None:
         """Return the covariance of the jumps of the steps at log k, ``(size, size)``; None if none.
@@ -289,11 +267,11 @@ class StateSpace:
         # Variance of ln f due to unknown covariates.
         unknown = sum((one.unknown for one in self.regressed), np.zeros(len(values)))
         found = []
-        for own, matrix, cov, more in zip(values, self.fixed, history.cov, unknown, strict=True):
+        for own, cov, more in zip(values, history.cov, unknown, strict=True):
             rows = np.flatnonzero(np.isfinite(own))
             extra = np.where(rows < r, more, 0.0) if more else None
             errors = cov[rows[:, None], rows]
-            found.append(Observation(rows, own[rows], matrix[rows], errors, source[rows], extra))
+            found.append(Observation(rows, own[rows], errors, source[rows], extra))
         return found
 
     def _process_noise(self) -> tuple[FloatArray, FloatArray]:
@@ -303,7 +281,7 @@ class StateSpace:
         levels and rates, and in rates, wander, and the random walk of damping, of unit variance,
         ``(7, (5 n_modes)²)``. The shares, ``(n_logs, 7)``, are of variances per life.
         """
-        size, level, rate, single = 5 * self.n_modes, self.level, self.rate, self.single
+        size, level, rate, single = 5 * self.n_modes, self.level, self.rate, np.eye(self.n_modes)
         parts = np.zeros((7, size, size))
         parts[0, level, level], parts[6, self.damping, self.damping] = single, single
         parts[5, self.wander, self.wander] = self.wander_cov
