@@ -32,7 +32,7 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.track import Effect, Smoothed, Track
 from tests.lives import health_of

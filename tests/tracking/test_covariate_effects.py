@@ -8,10 +8,15 @@ import numpy as np
 import pytest
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import accepted_estimates, smooth, track
+from lmshealth.tracking.track import (
+    accepted_estimates,
+    covariate_shifts,
+    find_covariate_effects,
+    smooth,
+    track,
+)
 from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage, since
 
 SLOPE = np.array([-8e-4, 5e-4])
