@@ -17,7 +17,7 @@ from lmshealth.io.log import Refusal, covariates
 from lmshealth.machine.status import notices
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.tracking.track import Smoothed, Track, mode_columns
+from lmshealth.tracking.track import Track, mode_columns
 
 if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.machine.assessment import Assessment
@@ -159,7 +159,7 @@ def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
     return TABLES["refused"].rows_of(refused)
 
 
-def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
+def track_rows(track: Track, smoothed: Track | None = None) -> list[Row]:
     """Return a track, one row per epoch and mode, with columns of smoothed values."""
     columns = track.to_columns()
     if smoothed is not None:
@@ -168,7 +168,7 @@ def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
     return to_rows(columns)
 
 
-def track_tables(track: Track, smoothed: Smoothed | None = None) -> dict[str, list[Row]]:
+def track_tables(track: Track, smoothed: Track | None = None) -> dict[str, list[Row]]:
     """Return the rows of a track, its covariances, effects other than wear and events, by table."""
     modes, cov = track.modes, TABLES["track_cov"]
     return {

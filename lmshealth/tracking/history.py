@@ -102,10 +102,7 @@ class History(Result):
 
     def _expect_order(self) -> None:
         """Require moments, and the odometer where there is one, that never decrease."""
-        for name, ticks in (
-            ("recorded_at", self.seconds),
-            ("travel", self.travel if self.has_odometer else self.travel[:0]),
-        ):
+        for name, ticks in (("recorded_at", self.seconds), ("travel", self.travel)):
             back = np.flatnonzero(np.diff(ticks) < 0)
             if back.size:
                 log = self.logs[back[0] + 1]
@@ -127,13 +124,11 @@ class History(Result):
 
     def title(self) -> str:
         """Return machine, number of logs, and their time and travel."""
-        ends = (
-            ""
-            if not self.logs
-            else (f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}")
-        )
-        if self.logs and self.has_odometer:
-            ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
+        ends = ""
+        if self.logs:
+            ends = f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}"
+            if self.has_odometer:
+                ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
         return f"History of {self.stage}: {len(self.logs)} logs{ends}"
 
     def to_columns(self) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, ndtr
 
-from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
@@ -169,7 +169,7 @@ class Track(Result):
         return consistency(self.nis, self.nis_dof, self.innovations)
 
 
-def mode_columns(values: Any) -> dict[str, FloatArray]:
+def mode_columns(values: Track) -> dict[str, FloatArray]:
     """Return the columns of modes of a track, filtered or smoothed, one row per epoch and mode."""
     frequency, damping = np.exp(values.ln_frequency), np.exp(values.ln_damping)
     columns = {
@@ -442,44 +442,35 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
     return refused
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Smoothed(ReadOnly):
-    """Modes at every epoch given all logs; fields are as in `Track`, ``(n_epochs, n_modes)``."""
+def smooth(history: History, followed: Track, stage: Stage | None = None) -> Track:
+    """Return a track with its modes and drifts at every epoch given all logs [Rauch1965].
 
-    ln_frequency: FloatArray
-    ln_frequency_std: FloatArray
-    ln_damping: FloatArray
-    ln_damping_std: FloatArray
-    drift: FloatArray
-    drift_std: FloatArray
-
-
-def smooth(history: History, followed: Track, stage: Stage | None = None) -> Smoothed:
-    """Smooth a history by the Rauch-Tung-Striebel recursion of its published filter [Rauch1965].
-
-    The steps and nuisances of its track are in the model; the stage is that of `track`.
-    `ValueError` for a track without nuisances, which `track` did not make.
+    By the recursion of Rauch, Tung and Striebel of the published filter: the steps and nuisances of
+    the track are in the model; the stage is that of `track`. `ValueError` for a track without
+    nuisances, which `track` did not make.
     """
     if followed.nuisances is None:
         raise ValueError(f"the track of {followed.stage} has no nuisances: filter it by `track`")
     space = StateSpace(history, stage, followed.steps)
     mean, cov = smooth_states(space, followed.nuisances)
-    contrast = space.drift
-    size = contrast.shape[1]
-    drift = mean[:, :size] @ contrast.T
-    variance = np.einsum("mi,kij,mj->km", contrast, cov[:, :size, :size], contrast)
+    size = space.drift.shape[1]
+    drift = mean[:, :size] @ space.drift.T
+    drift_cov = space.drift @ cov[:, :size, :size] @ space.drift.T
+    for variance in (diagonal(cov), diagonal(drift_cov)):  # rounding
+        np.maximum(variance, 0.0, out=variance)
     early = np.arange(len(history.logs)) < history.baselines[0]
-    drift[early], variance[early] = np.nan, np.nan
-    std = np.sqrt(np.maximum(np.einsum("kii->ki", cov), 0.0)) * followed.widening[:, None]
+    drift[early], drift_cov[early] = np.nan, np.nan
+    std = np.sqrt(diagonal(cov)) * followed.widening[:, None]
     unseen = space.damping.start + np.flatnonzero(np.isnan(followed.ln_damping).all(axis=0))
     mean[:, unseen], std[:, unseen] = np.nan, np.nan
-    return Smoothed(
+    return replace(
+        followed,
         ln_frequency=mean[:, space.level],
         ln_frequency_std=std[:, space.level],
         ln_damping=mean[:, space.damping],
         ln_damping_std=std[:, space.damping],
         drift=drift,
-        drift_std=np.sqrt(np.maximum(variance, 0.0)) * followed.widening[:, None],
+        drift_cov=drift_cov * followed.widening[:, None, None] ** 2,
     )
 
 
