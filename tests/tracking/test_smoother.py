@@ -21,7 +21,7 @@ from tests.lives import (
     since,
 )
 from tests.oracles import Wander, batch
-from tests.tracking.filters.test_filter_bank import KNOWN, SETTINGS, one, trusted
+from tests.tracking.filters.test_kalman_filters import KNOWN, SETTINGS, one, trusted
 from tests.tracking.test_track import quiet, shown, std_of, still
 
 __all__ = ["trusted"]  # a fixture

@@ -36,7 +36,7 @@ from tests.lives import (
     since,
 )
 from tests.oracles import JUMPS, Known, Wander, binomial_band, filterpy_loop
-from tests.tracking.filters.test_filter_bank import KNOWN, SETTINGS, few, one
+from tests.tracking.filters.test_kalman_filters import KNOWN, SETTINGS, few, one
 
 __all__ = ["few"]  # a fixture
 

@@ -29,7 +29,7 @@ from lmshealth.tracking.filters.track_state import (
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
-from tests.tracking.filters.test_filter_bank import SETTINGS, one, run
+from tests.tracking.filters.test_kalman_filters import SETTINGS, one, run
 
 N_LOGS, PLACE = 40, 22
 
