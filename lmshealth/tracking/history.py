@@ -97,16 +97,12 @@ class History(Result):
             raise ValueError(f"baselines are logs {self.baselines} of {n}")
         if {one.mode for one in self.series} - set(self.modes):
             raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
-        self._expect_order()
-        self._expect_errors()
-
-    def _expect_order(self) -> None:
-        """Require moments, and the odometer where there is one, that never decrease."""
         for name, ticks in (("recorded_at", self.seconds), ("travel", self.travel)):
             back = np.flatnonzero(np.diff(ticks) < 0)
             if back.size:
                 log = self.logs[back[0] + 1]
                 raise ValueError(f"{name} runs backwards at {log}: sort the logs")
+        self._expect_errors()
 
     def _expect_errors(self) -> None:
         """Require a covariance of every estimate, with positive variances."""

@@ -60,7 +60,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
             if not step.changes_modes:
                 name = f"{step.kind}:{step.name or step.source}"
                 state[:, space.jump(j).start + m] = effects[mode, name]
-    for j, i in enumerate(space._biased()):
+    for j, i in enumerate(space.biased):
         series = history.series[i]
         state[:, space.first_bias + 2 * j] = effects[series.mode, f"bias:{series.source}"]
     r = len(history.series)

@@ -141,7 +141,11 @@ class StateSpace:
             slice(part * m, (part + 1) * m) for part in range(5)
         )
         self.first_bias = (5 + len(regressed)) * m
-        self.biased = self._biased()
+        # All series of a mode but the one detected first have a bias.
+        there = np.isfinite(history.ln_frequency)
+        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there)).tolist()
+        series = [history.columns(mode) for mode in history.modes]
+        self.biased = [i for own in series for i in own if i != min(own, key=first.__getitem__)]
         self.first_step = self.first_bias + 2 * len(self.biased)
         self.size = self.first_step + 2 * m * len(steps)
         # The mean distance between logs so far is the unit: no horizon has to be known.
@@ -233,17 +237,6 @@ class StateSpace:
         """Return the place of the jumps of a step: those of ln f, then those of ln ζ."""
         first = self.first_step + 2 * self.n_modes * j
         return slice(first, first + 2 * self.n_modes)
-
-    def _biased(self) -> tuple[int, ...]:
-        """Return the series that have a bias: all of a mode but the one detected first."""
-        there = np.isfinite(self.history.ln_frequency)
-        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there))
-        biased: list[int] = []
-        for mode in self.history.modes:
-            own = self.history.columns(mode)
-            reference = min(own, key=lambda i: (first[i], i), default=None)
-            biased += [i for i in self.history.columns(mode) if i != reference]
-        return tuple(biased)
 
     def _without_steps(self) -> FloatArray:
         """Return all measurement matrices without steps, ``(n_logs, 2 n_series, first_step)``."""
