@@ -31,8 +31,8 @@ from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
-from lmshealth.tracking.filters.change_detection import Event
 from lmshealth.tracking.filters.state_space import StateSpace
+from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History, Series, Step
 from lmshealth.tracking.track import Effect, Track
 from tests.lives import health_of, plain_nuisances

@@ -29,7 +29,7 @@ from lmshealth.life.prognosis import Prognosis
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.filters.published_filter import Nuisances
+from lmshealth.tracking.filters.kalman_filters import Nuisances
 from lmshealth.tracking.history import History, Series, Step, StepKind
 from lmshealth.tracking.track import Track
 

@@ -32,15 +32,8 @@ from lmshealth.errors import BadQuestion, NotConverged, NotEnoughData
 from lmshealth.life.health import health_of
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import Prognosis, identifiable_limits, prognosis_of
-from lmshealth.life.verdict import (
-    OUTSIDE_MAP,
-    degraded_below,
-    degraded_words,
-    doubt_of_names,
-)
-from lmshealth.life.verdict import (
-    judge as judge_state,
-)
+from lmshealth.life.verdict import OUTSIDE_MAP, degraded_below, degraded_words, doubt_of_names
+from lmshealth.life.verdict import judge as judge_state
 from lmshealth.machine.service import decide, remaining_days
 from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
@@ -233,7 +226,7 @@ def draw_outcomes(
     if lives < 1:
         raise BadQuestion(f"{lives} lives: needed is at least 1")
     identifiability_of(stage)  # refuses a description without parameters or map
-    kinds = [_life(stage, schedule, seed, (None, k)).kind for k in range(lives)]
+    kinds = [_kind(stage, schedule, seed, (None, k)) for k in range(lives)]
     least = int(np.ceil(constants.LEAST_OF_KIND * lives))
     tasks: list[tuple[Kind | None, int]] = [(None, k) for k in range(lives)]
     for kind in KINDS:
@@ -247,19 +240,20 @@ def draw_outcomes(
             yield outcome, len(tasks)
 
 
-def _rng(seed: int, task: tuple[Kind | None, int]) -> np.random.Generator:
+def _seeds(seed: int, task: tuple[Kind | None, int]) -> list[int]:
     kind, number = task
-    return np.random.default_rng([seed, 0 if kind is None else 1 + KINDS.index(kind), number])
+    return [seed, 0 if kind is None else 1 + KINDS.index(kind), number]
 
 
-def _life(stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int]) -> Life:
-    return draw(_rng(seed, task), stage, schedule, task[0])
+def _kind(stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int]) -> Kind:
+    """Return the kind of a life that is drawn."""
+    return draw(np.random.default_rng(_seeds(seed, task)), stage, schedule, task[0]).kind
 
 
 def _crashed(
     stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int], why: str
 ) -> LifeOutcome:
-    kind = _life(stage, schedule, seed, task).kind
+    kind = _kind(stage, schedule, seed, task)
     return LifeOutcome(kind, task[0] is None, task[1], failed=why)
 
 
@@ -267,7 +261,8 @@ def outcome_of(
     stage: Stage, schedule: Schedule, seed: int, task: tuple[Kind | None, int]
 ) -> LifeOutcome:
     """Draw a life of a kind, or of any, by its number; pass it through the chain of real logs."""
-    rng = _rng(seed, task)
+    seeds = _seeds(seed, task)
+    rng = np.random.default_rng(seeds)
     drawn = draw(rng, stage, schedule, task[0])
     base = LifeOutcome(drawn.kind, task[0] is None, task[1])
     history = drawn.history
@@ -276,8 +271,7 @@ def outcome_of(
         if doubt := doubt_of_names(stage, history, tracked):
             return msgspec.structs.replace(base, failed=doubt)
         accepted = accepted_estimates(history, tracked)
-        own = [seed, 0 if base.drawn else 1 + KINDS.index(drawn.kind), base.number]
-        posterior = fit_life(accepted, stage, own, chains=False)
+        posterior = fit_life(accepted, stage, seeds, chains=False)
         prognosis = prognosis_or_none(posterior, accepted, stage)
         health = health_of(posterior, accepted, stage, (len(history.logs) - 1,))
     except (NotEnoughData, NotConverged, LinAlgError) as why:

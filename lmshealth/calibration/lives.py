@@ -224,16 +224,21 @@ def draw(
     scatter = 0.0 if stage.description.usage.km_per_day else constants.USAGE_SCATTER
     clock = np.r_[0.0, np.cumsum(rate * schedule.every * _paces(rng, n - 1, scatter))]
     first = int(rng.integers(5, n - 5)) if rng.random() < steps else None
-    parts = _parts(rng, stage, clock, first, kind)
+    at = () if first is None else (float(clock[first - 1] + clock[first]) / 2,)
+    parts = _parts(rng, stage, clock, at, kind)
     series = tuple(Series(name, "acc") for name in names)
     if len(names) > 1 and rng.random() < second_source:
         series = (*series, Series(names[1], "delta_e"))
     covariates, declared = _covariates(rng, stage, n), _declared(rng, series, n)
     if first is not None:
         declared = (*declared, Step.found("step", first, n))
-    at = () if first is None else (float(clock[first - 1] + clock[first]) / 2,)
-    level, lone, walk = _modes(rng, stage, names, clock, (_path(stage, clock, parts), kind, at))
-    level += _covariate_effects(rng, stage, covariates, n, len(names))
+    # Health moves the modes by a map that is wrong; other causes move them too.
+    level, *alone = stage.drifts(np.log(_path(stage, clock, parts)), names)
+    for own, error in zip(alone, map_errors(rng, stage, len(names)), strict=True):
+        level = level + error * own
+    moved, lone, walk = without_health(rng, stage, clock, len(names), kind, at)
+    known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
+    level = level + moved + known + _covariate_effects(rng, stage, covariates, n, len(names))
     mode = np.array([names.index(one.mode) for one in series])
     cov = _covariance(rng, stage, schedule, mode)
     scale = rng.choice(of_life.NOISE_SCALES, p=shares(stage, "noise_scale"))
@@ -296,11 +301,14 @@ def make_history(
 
 
 def _parts(
-    rng: np.random.Generator, stage: Stage, clock: FloatArray, first: int | None, kind: Kind | None
+    rng: np.random.Generator,
+    stage: Stage,
+    clock: FloatArray,
+    steps: tuple[float, ...],
+    kind: Kind | None,
 ) -> tuple[Part, ...]:
     """Draw scenarios and deviations from their priors, until a life stays inside the map."""
     assert stage.modal_map is not None
-    steps = () if first is None else (float(clock[first - 1 : first + 1].mean()),)
     now, free = float(clock[-1]), stage.description.life.free
     scenarios = list_scenarios(stage.parameters, steps, now, free)
     if kind == "healthy":
@@ -359,27 +367,6 @@ def map_errors(rng: np.random.Generator, stage: Stage, n_modes: int) -> FloatArr
     unit = rng.standard_normal((len(stage.parameters), n_modes))
     error = own * unit + common * unit.sum(axis=1, keepdims=True)
     return np.asarray(rng.choice(scales, p=weights) * error)
-
-
-def _modes(
-    rng: np.random.Generator,
-    stage: Stage,
-    names: tuple[str, ...],
-    clock: FloatArray,
-    course: tuple[FloatArray, Kind | None, tuple[float, ...]],
-) -> tuple[FloatArray, int, float]:
-    """Return ln f of the modes: health through a map that is wrong, and drifts of other causes.
-
-    The course of a life is that of its health, ``(n_logs, n_parameters)``, its kind, and the steps
-    that the tracker reports. Returned as by `without_health`.
-    """
-    path, kind, steps = course
-    level, *alone = stage.drifts(np.log(path), names)
-    for own, error in zip(alone, map_errors(rng, stage, len(names)), strict=True):
-        level = level + error * own
-    moved, lone, walk = without_health(rng, stage, clock, len(names), kind, steps)
-    known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
-    return np.asarray(level + moved + known), lone, walk
 
 
 def without_health(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Iterable, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -203,16 +203,6 @@ def rate_rows(rates: Iterable[Rate]) -> list[dict[str, str]]:
     return rows
 
 
-def _blocks(check: CalibrationCheck) -> Iterator[Block]:
-    """Yield the parts of the page, in their order."""
-    quantities = list(dict.fromkeys(one.quantity for one in check.coverage))
-    yield _expectations(check, quantities)
-    yield _ranks(check, quantities)
-    yield _detection(check)
-    yield _controls(check, quantities)
-    yield _assumptions(check)
-
-
 def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
     """Show coverage and width of intervals by kind of life."""
     n = len(check.outcomes)
@@ -391,18 +381,8 @@ def life_rows(check: CalibrationCheck) -> list[Row]:
 
 def document(check: CalibrationCheck) -> dict[str, Any]:
     """Return the check for other programs, without the single lives."""
-    names = (
-        "stage",
-        "schedule",
-        "seed",
-        "coverage",
-        "rates",
-        "ranks",
-        "controls",
-        "p_values",
-        "passed",
-    )
     state, headline, _ = verdict_of(check)
+    names = [one.name for one in fields(check) if one.name != "outcomes"]
     content = {name: getattr(check, name) for name in names}
     return {"schema": JSON_SCHEMA, "state": state, "verdict": headline, **content}
 
@@ -422,5 +402,13 @@ def write_results(folder: Path, check: CalibrationCheck) -> Path:
     sub = f"{len(check.outcomes)} simulated lives, {n} of them with the description's probabilities"
     page = folder / PAGE
     title = f"Calibration of {check.stage}"
-    write_text(page, render_page(title, sub, verdict_of(check), list(_blocks(check))))
+    quantities = list(dict.fromkeys(one.quantity for one in check.coverage))
+    blocks = [
+        _expectations(check, quantities),
+        _ranks(check, quantities),
+        _detection(check),
+        _controls(check, quantities),
+        _assumptions(check),
+    ]
+    write_text(page, render_page(title, sub, verdict_of(check), blocks))
     return page

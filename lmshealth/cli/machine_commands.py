@@ -34,8 +34,7 @@ from lmshealth.tracking.history import (
     missing_mode_notices,
 )
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
-from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.track import accepted_estimates, outlier_refusals
+from lmshealth.tracking.track import accepted_estimates, outlier_refusals, smooth
 from lmshealth.tracking.track import track as track_modes
 
 Progress = Callable[[str, int, int], None]

@@ -301,11 +301,7 @@ def health_of(life: LifePosterior, history: History, stage: Stage, epochs: Seque
 
 
 def infer_drifts(
-    drifts: Drifts,
-    stage: Stage,
-    seed: int | Sequence[int],
-    *,
-    epochs: int = constants.MAX_EPOCHS,
+    drifts: Drifts, stage: Stage, seed: int | Sequence[int], *, epochs: int = constants.MAX_EPOCHS
 ) -> Health:
     """Infer the health parameters from a table of drifts, each epoch from its own drifts alone.
 
@@ -347,7 +343,7 @@ def infer_drifts(
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
     # Their covariances are those of a filter, which has allowed for scatter already.
     scatter = default_scatter()
-    walk, scale = _first_of(scatter.walk), _first_of(scatter.noise_scale)
+    walk, scale = ((1.0,) + (0.0,) * (len(p) - 1) for p in (scatter.walk, scatter.noise_scale))
     stage = replace(stage, scatter=replace(scatter, walk=walk, noise_scale=scale))
     histories = {k: _of_drifts(drifts, stage, k) for k in range(len(drifts.recorded_at))}
     usable = [k for k, one in histories.items() if one is not None]
@@ -377,11 +373,6 @@ def infer_drifts(
         seed=tuple(np.atleast_1d(seed).tolist()),
         **joined,
     )
-
-
-def _first_of(weights: tuple[float, ...]) -> tuple[float, ...]:
-    """Return weights of which only the first is above 0."""
-    return (1.0, *(0.0 for _ in weights[1:]))
 
 
 def _of_drifts(drifts: Drifts, stage: Stage, k: int) -> History | None:

@@ -20,7 +20,7 @@ from lmshealth.modal.constants import OFF_DAMPING, OFF_FREQUENCY
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.naming import off_description
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track, accepted_estimates
 

@@ -40,9 +40,8 @@ from lmshealth.report.text import (
     spell,
     whole_km,
 )
-from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Track
+from lmshealth.tracking.track import CovariateEffect, Track
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

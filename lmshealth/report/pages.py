@@ -48,10 +48,14 @@ from lmshealth.report.text import (
     verdict_text,
 )
 from lmshealth.stage.description import Stage
-from lmshealth.tracking import covariate_effects
-from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Effect, Track
+from lmshealth.tracking.track import (
+    CovariateEffect,
+    Effect,
+    Track,
+    covariate_shifts,
+    find_covariate_effects,
+)
 
 Item = TypeVar("Item")
 
@@ -178,7 +182,7 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
     mac = _mac(assessment)
     content |= {"modes": [], "events": [], "effects": [], "largest_drift": 0.0, "mac": mac}
     if track is not None:
-        influences = covariate_effects.find_covariate_effects(history, track, stage)
+        influences = find_covariate_effects(history, track, stage)
         content |= {
             "modes": latest_modes(track, stage, mac),
             "events": _grouped(track.events, attrgetter("kind", "epoch", "source")).values(),
@@ -303,8 +307,7 @@ def _track_pictures(
         draw["frequency", mode] = partial(figures.plot_frequencies, **lives, mode=mode)
         draw["damping", mode] = partial(figures.plot_damping, **lives, mode=mode)
     if waterfall is not None and history.has_odometer:
-        shift = covariate_effects.covariate_shifts
-        moved = None if track is None else shift(history, track, assessment.stage)
+        moved = None if track is None else covariate_shifts(history, track, assessment.stage)
         lives |= {"waterfall": waterfall, "moved": moved}
         draw["waterfall", "all"] = partial(figures.plot_waterfall, **lives)
     for one in influences:

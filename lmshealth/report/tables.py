@@ -29,7 +29,6 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
     from lmshealth.stage.identifiability import Plan
-    from lmshealth.tracking.smoother import Smoothed
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
@@ -160,7 +159,7 @@ def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
     return TABLES["refused"].rows_of(refused)
 
 
-def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
+def track_rows(track: Track, smoothed: Track | None = None) -> list[Row]:
     """Return a track, one row per epoch and mode, with columns of smoothed values."""
     columns = track.to_columns()
     if smoothed is not None:
@@ -169,7 +168,7 @@ def track_rows(track: Track, smoothed: Smoothed | None = None) -> list[Row]:
     return to_rows(columns)
 
 
-def track_tables(track: Track, smoothed: Smoothed | None = None) -> dict[str, list[Row]]:
+def track_tables(track: Track, smoothed: Track | None = None) -> dict[str, list[Row]]:
     """Return the rows of a track, its covariances, effects other than wear and events, by table."""
     modes, cov = track.modes, TABLES["track_cov"]
     return {

@@ -163,16 +163,6 @@ def _without_odd_rates(
     return tuple(one for one in ordered if one.log not in left_out), found
 
 
-def _shifts(own: Modes, others: Sequence[Modes]) -> FloatArray:
-    """Return ln f of the modes that all logs have, minus that of the others, ``(m, n_others)``."""
-    first, *rest = (
-        dict(zip(zip(one.names, one.sources, strict=True), one.ln_frequency, strict=True))
-        for one in (own, *others)
-    )
-    common = [mode for mode in first if mode[0] and all(mode in one for one in rest)]
-    return np.array([[first[mode] - one[mode] for one in rest] for mode in common])
-
-
 def _usual_rate(rates: FloatArray) -> BoolArray | None:
     """Return which logs have the most frequent rate, at a tie the first; None if all have one."""
     known = np.sort(rates[np.isfinite(rates)])
@@ -191,14 +181,18 @@ def _share(own: Modes, others: Sequence[Modes], ticks: FloatArray, ratio: float)
     predicts of the median mode: wear moves modes steadily, and some more. None where the ratio does
     not exceed the error of that.
     """
-    shifts = _shifts(own, others)
-    if not shifts.size:
+    first, *rest = (
+        dict(zip(zip(one.names, one.sources, strict=True), one.ln_frequency, strict=True))
+        for one in (own, *others)
+    )
+    common = [mode for mode in first if mode[0] and all(mode in one for one in rest)]
+    if not common:
         return None
+    moved = np.median([[first[mode] - one[mode] for one in rest] for mode in common], axis=0)
     line = np.stack([np.ones(ticks.size), ticks / np.abs(ticks).max()], axis=1)
     inverse = np.linalg.pinv(line.T @ line)
-    moved = np.median(shifts, axis=0)
     trend = inverse @ line.T @ moved
-    rest = float(np.sum((moved - line @ trend) ** 2)) / max(1, ticks.size - 2)
+    scatter = float(np.sum((moved - line @ trend) ** 2)) / max(1, ticks.size - 2)
     std = max(float(np.median(own.frequency_std / own.frequency)), constants.RATE_SPREAD)
-    spread = float(np.sqrt(max(rest, std**2) * (1 + inverse[0, 0])))
+    spread = float(np.sqrt(max(scatter, std**2) * (1 + inverse[0, 0])))
     return float(trend[0]) / ratio if abs(ratio) > constants.RATE_GATE * spread else None

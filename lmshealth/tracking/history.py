@@ -14,15 +14,10 @@ from lmshealth._private.tables import fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.associate import Association, Estimates, associate
-from lmshealth.tracking.contradictions import (
-    BY_CLOCK,
-    NO_MOMENT,
-    are_many,
-    without_contradictions,
-)
+from lmshealth.tracking.contradictions import BY_CLOCK, NO_MOMENT, are_many, without_contradictions
 from lmshealth.tracking.covariates import regressors
 from lmshealth.tracking.maintenance import RESETS, Action
 
@@ -102,19 +97,12 @@ class History(Result):
             raise ValueError(f"baselines are logs {self.baselines} of {n}")
         if {one.mode for one in self.series} - set(self.modes):
             raise ValueError(f"series {self.series} of modes that are not among {self.modes}")
-        self._expect_order()
-        self._expect_errors()
-
-    def _expect_order(self) -> None:
-        """Require moments, and the odometer where there is one, that never decrease."""
-        for name, ticks in (
-            ("recorded_at", self.seconds),
-            ("travel", self.travel if self.has_odometer else self.travel[:0]),
-        ):
+        for name, ticks in (("recorded_at", self.seconds), ("travel", self.travel)):
             back = np.flatnonzero(np.diff(ticks) < 0)
             if back.size:
                 log = self.logs[back[0] + 1]
                 raise ValueError(f"{name} runs backwards at {log}: sort the logs")
+        self._expect_errors()
 
     def _expect_errors(self) -> None:
         """Require a covariance of every estimate, with positive variances."""
@@ -132,13 +120,11 @@ class History(Result):
 
     def title(self) -> str:
         """Return machine, number of logs, and their time and travel."""
-        ends = (
-            ""
-            if not self.logs
-            else (f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}")
-        )
-        if self.logs and self.has_odometer:
-            ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
+        ends = ""
+        if self.logs:
+            ends = f", {self.recorded_at[0].date()} to {self.recorded_at[-1].date()}"
+            if self.has_odometer:
+                ends += f", {self.travel[0] / 1000:.6g} to {self.travel[-1] / 1000:.6g} km"
         return f"History of {self.stage}: {len(self.logs)} logs{ends}"
 
     def to_columns(self) -> dict[str, Any]:
@@ -378,31 +364,34 @@ def _baselines(ordered: Sequence[LogEstimates], steps: Sequence[Step]) -> tuple[
 
 def _estimates(ordered: Sequence[LogEstimates], stage: Stage | None) -> list[Estimates]:
     """Return the estimates of tracked modes of each log, with shapes over all channels."""
-    tracked = None if stage is None else {mode.name for mode in stage.modes if mode.tracked}
+    tracked = [] if stage is None else [mode for mode in stage.modes if mode.tracked]
+    known = {mode.name for mode in tracked}
     channels = list(dict.fromkeys(c for r in ordered for c in r.modes.shape_channels))
     estimates = []
-    for reading in ordered:
-        modes, n = reading.modes, len(reading.modes.names)
-        names = tuple(
-            name or _nearest(float(modes.frequency[i]), stage) for i, name in enumerate(modes.names)
+    for modes in (reading.modes for reading in ordered):
+        pairs = zip(modes.names, modes.frequency.tolist(), strict=True)
+        names = [name or _nearest(frequency, tracked) for name, frequency in pairs]
+        shapes = np.full((len(names), len(channels)), np.nan)
+        shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
+        kept = [i for i, name in enumerate(names) if stage is None or name in known]
+        at = np.array(kept, dtype=int)
+        both = np.concatenate([at, at + len(names)])
+        estimates.append(
+            Estimates(
+                names=tuple(names[i] for i in kept),
+                sources=tuple(modes.sources[i] for i in kept),
+                ln_frequency=modes.ln_frequency[at],
+                ln_damping=modes.ln_damping[at],
+                cov=modes.cov[both[:, None], both],
+                shapes=shapes[at],
+            )
         )
-        shapes = modes.shapes
-        if list(modes.shape_channels) != channels:
-            shapes = np.full((n, len(channels)), np.nan)
-            shapes[:, [channels.index(channel) for channel in modes.shape_channels]] = modes.shapes
-        columns = (modes.ln_frequency, modes.ln_damping, modes.cov, shapes)
-        one = Estimates(names, modes.sources, *columns)
-        kept = [i for i, name in enumerate(names) if tracked is None or name in tracked]
-        estimates.append(one if len(kept) == n else one.pick(kept))
     return estimates
 
 
-def _nearest(frequency: float, stage: Stage | None) -> str:
-    """Return the nearest tracked mode whose search holds a frequency in Hz, else no name."""
-    if stage is None:
-        return ""
-    tracked = [mode for mode in stage.modes if mode.tracked]
-    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in tracked]
+def _nearest(frequency: float, modes: Sequence[ModeSpec]) -> str:
+    """Return the nearest mode whose search holds a frequency in Hz, else no name."""
+    off = [(abs(frequency / mode.frequency_hz - 1), mode) for mode in modes]
     near = [(away, mode.name) for away, mode in off if away <= mode.search]
     return min(near, key=lambda one: one[0], default=(0.0, ""))[1]
 
@@ -430,21 +419,14 @@ def _line_up(
     for k, i, (mode, source) in assigned:
         if mode is not None and (mode, source) in places:
             pairs[k].append((places[mode, source], i))
-    # Most logs have the same estimates in the same columns: these are put there at once.
-    alike: dict[tuple[Any, ...], list[int]] = {}
-    for k, one in enumerate(estimates):
-        alike.setdefault((len(one.names), *pairs[k]), []).append(k)
     n, r = len(estimates), len(series)
     ln_f, ln_zeta = np.full((n, r), np.nan), np.full((n, r), np.nan)
     cov = np.full((n, 2 * r, 2 * r), np.nan)
-    for (size, *own), logs in alike.items():
+    for k, (one, own) in enumerate(zip(estimates, pairs, strict=True)):
         to, of = np.array(own, dtype=int).reshape(-1, 2).T
-        at, some = np.array(logs)[:, None], [estimates[k] for k in logs]
-        ln_f[at, to] = np.array([one.ln_frequency for one in some])[:, of]
-        ln_zeta[at, to] = np.array([one.ln_damping for one in some])[:, of]
-        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + size])
-        part = np.array([one.cov for one in some])[:, of[:, None], of]
-        cov[at[:, :, None], to[:, None], to] = part
+        ln_f[k, to], ln_zeta[k, to] = one.ln_frequency[of], one.ln_damping[of]
+        to, of = np.concatenate([to, to + r]), np.concatenate([of, of + len(one.names)])
+        cov[k, to[:, None], to] = one.cov[of[:, None], of]
     return modes, series, {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov}
 
 

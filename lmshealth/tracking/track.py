@@ -2,7 +2,7 @@
 
 All modes share one state space, because their estimates may be correlated, and one bank of filters.
 Declared steps are in the model from the start; a detected step is added, and the logs from it on
-are filtered again from the checkpoint before it. No epoch uses later logs; `smoother.smooth` does.
+are filtered again from the checkpoint before it. No epoch uses later logs; `smooth` does.
 """
 
 from collections.abc import Sequence
@@ -14,24 +14,24 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, ndtr
 
-from lmshealth._private.arrays import BoolArray, FloatArray, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
 from lmshealth.io.log import Refusal
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.filters.change_detection import Event
-from lmshealth.tracking.filters.published_filter import Nuisances
+from lmshealth.tracking.covariates import regressors
+from lmshealth.tracking.filters.kalman_filters import Nuisances, smooth_states
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.filters.track_state import (
     Epoch,
+    Event,
     TrackState,
     degrees_of_freedom,
     initial_state,
-    lagged_products,
+    running_sums,
     step,
-    unrolled,
     widening,
 )
 from lmshealth.tracking.history import History, Step
@@ -169,7 +169,7 @@ class Track(Result):
         return consistency(self.nis, self.nis_dof, self.innovations)
 
 
-def mode_columns(values: Any) -> dict[str, FloatArray]:
+def mode_columns(values: Track) -> dict[str, FloatArray]:
     """Return the columns of modes of a track, filtered or smoothed, one row per epoch and mode."""
     frequency, damping = np.exp(values.ln_frequency), np.exp(values.ln_damping)
     columns = {
@@ -189,19 +189,14 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     `nis` and `dof` have the shape ``(n_epochs,)``, standardised innovations ``(n_epochs, n)``, NaN
     where there is none.
     """
-    judged = dof > 0
-    total, degrees = float(nis[judged].sum()), float(dof[judged].sum())
+    ends = (float(own[-1:].sum()) for own in running_sums(nis, dof, innovations))
+    total, degrees, products, std, correlation = ends
     tail = float(chdtrc(degrees, total)) if degrees else 0.5
-    sums, counts = lagged_products(innovations)
-    n = int(counts.sum())
-    scale = float(np.sqrt(np.sum(sums**2)))
-    size = float(np.mean(innovations[np.isfinite(innovations)] ** 2)) if n else 1.0
-    correlation = float(sums.sum()) / n / max(size, 1e-12) if n else 0.0
     return Consistency(
         nis=total / degrees if degrees else 1.0,
-        p_value=float(2 * min(tail, 1 - tail)),
+        p_value=2 * min(tail, 1 - tail),
         autocorrelation=correlation,
-        autocorrelation_p_value=float(2 * ndtr(-abs(sums.sum()) / scale)) if scale else 1.0,
+        autocorrelation_p_value=float(2 * ndtr(-abs(products) / std)) if std else 1.0,
     )
 
 
@@ -262,7 +257,7 @@ def track(history: History, stage: Stage | None = None) -> Track:
 def _published(state: TrackState) -> Track:
     """Return the track of the logs up to a state."""
     space, sources = state.space, state.space.sources
-    history, epochs, rows = space.history, state.epochs(), unrolled(state.rows)
+    history, epochs, rows = space.history, state.epochs(), state.rows
     mean = np.array([row.mean for row in rows])
     drift, drift_cov = _drifts(space, mean, np.array([row.drift_cov for row in rows]))
     factor = widening(state)
@@ -445,3 +440,125 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
         )
         refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
     return refused
+
+
+def smooth(history: History, followed: Track, stage: Stage | None = None) -> Track:
+    """Return a track with its modes and drifts at every epoch given all logs [Rauch1965].
+
+    By the recursion of Rauch, Tung and Striebel of the published filter: the steps and nuisances of
+    the track are in the model; the stage is that of `track`. `ValueError` for a track without
+    nuisances, which `track` did not make.
+    """
+    if followed.nuisances is None:
+        raise ValueError(f"the track of {followed.stage} has no nuisances: filter it by `track`")
+    space = StateSpace(history, stage, followed.steps)
+    mean, cov = smooth_states(space, followed.nuisances)
+    size = space.drift.shape[1]
+    drift = mean[:, :size] @ space.drift.T
+    drift_cov = space.drift @ cov[:, :size, :size] @ space.drift.T
+    for variance in (diagonal(cov), diagonal(drift_cov)):  # rounding
+        np.maximum(variance, 0.0, out=variance)
+    early = np.arange(len(history.logs)) < history.baselines[0]
+    drift[early], drift_cov[early] = np.nan, np.nan
+    std = np.sqrt(diagonal(cov)) * followed.widening[:, None]
+    unseen = space.damping.start + np.flatnonzero(np.isnan(followed.ln_damping).all(axis=0))
+    mean[:, unseen], std[:, unseen] = np.nan, np.nan
+    return replace(
+        followed,
+        ln_frequency=mean[:, space.level],
+        ln_frequency_std=std[:, space.level],
+        ln_damping=mean[:, space.damping],
+        ln_damping_std=std[:, space.damping],
+        drift=drift,
+        drift_cov=drift_cov * followed.widening[:, None, None] ** 2,
+    )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CovariateEffect:
+    """Effect of a covariate on a mode, and the n estimates that it was regressed on."""
+
+    mode: str
+    covariate: str
+    reference: float  # the covariate at which the effect is zero
+    effects: tuple[Effect, ...]  # per unit, and per unit squared where there is a curvature
+    epochs: np.ndarray  # logs of the estimates, ``(n,)``
+    values: FloatArray  # the covariate in these logs, ``(n,)``
+    # ln f minus its smoothed level, steps, biases and other covariates, ``(n,)``. The level follows
+    # the logs: residuals scatter less than the estimates' errors.
+    measured: FloatArray
+
+    def __post_init__(self) -> None:
+        freeze(self, ("values measured", *self.epochs.shape))
+
+    def explained(self, values: FloatArray) -> FloatArray:
+        """Return the change of ln f at values of the covariate, shape of ``values``."""
+        offset = values - self.reference
+        return np.asarray(sum(e.coefficient * offset**p for p, e in enumerate(self.effects, 1)))
+
+    def explained_std(self, values: FloatArray) -> FloatArray | None:
+        """Return its standard deviation; None with a curvature, whose covariance is not kept."""
+        if len(self.effects) > 1:
+            return None
+        return np.abs(values - self.reference) * self.effects[0].std
+
+    @property
+    def corrected(self) -> FloatArray:
+        """Residuals of the measured changes, shape ``(n,)``."""
+        return self.measured - self.explained(self.values)
+
+    @property
+    def seen(self) -> bool:
+        """Whether any of the effects is more than two standard deviations from zero."""
+        return any(abs(effect.coefficient) > 2 * effect.std for effect in self.effects)
+
+
+def find_covariate_effects(
+    history: History, track: Track, stage: Stage
+) -> tuple[CovariateEffect, ...]:
+    """Return the effect of every described covariate on every mode, without outliers of the track.
+
+    The order is that of the description; a covariate that is unknown or never left its reference
+    has no effect. In a long history the level is the filtered one.
+    """
+    space = StateSpace(history, stage, track.steps)
+    columns, places = space.regressed, [at for _, _, at in space.effects]
+    if not columns:
+        return ()
+    taken = accepted_estimates(history, track)
+    short = len(taken.logs) <= constants.MOST_SMOOTHED
+    level = (smooth(taken, track, stage) if short else track).ln_frequency
+    coefficients = np.array([one.coefficient for one in track.effects[: len(places)]])
+    logs, n_series = range(len(history.logs)), len(history.series)
+    moved = np.array([space.matrix(k)[:n_series, places] @ coefficients for k in logs])
+    rest = taken.ln_frequency - level[:, taken.mode_of()] - moved
+    found = []
+    for covariate in stage.description.covariate:
+        own = [j for j, r in enumerate(columns) if r.name.removesuffix("^2") == covariate.name]
+        for i, mode in enumerate(track.modes) if own else ():
+            effects = tuple(track.effects[len(track.modes) * j + i] for j in own)
+            at, values = history.columns(mode), history.covariates[covariate.name]
+            epochs, series = np.nonzero(np.isfinite(rest[:, at]) & np.isfinite(values)[:, None])
+            parts = zip(own, effects, strict=True)
+            explained = np.sum([e.coefficient * columns[j].values for j, e in parts], axis=0)
+            found.append(
+                CovariateEffect(
+                    mode=mode,
+                    covariate=covariate.name,
+                    reference=covariate.reference,
+                    effects=effects,
+                    epochs=epochs,
+                    values=values[epochs],
+                    measured=rest[:, at][epochs, series] + explained[epochs],
+                )
+            )
+    return tuple(found)
+
+
+def covariate_shifts(history: History, track: Track, stage: Stage) -> FloatArray:
+    """Return the change of ln f of every mode by covariates, shape ``(n_logs, n_modes)``."""
+    columns, n_modes = regressors(history.covariates, stage, history.recorded_at), len(track.modes)
+    effects = track.effects[: len(columns) * n_modes]
+    coefficients = np.array([one.coefficient for one in effects]).reshape(-1, n_modes)
+    values = np.array([one.values for one in columns]).reshape(-1, len(history.logs))
+    return np.asarray(values.T @ coefficients)

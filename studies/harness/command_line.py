@@ -13,7 +13,7 @@ from unittest.mock import patch
 from click.testing import CliRunner
 
 from lmshealth.life import constants
-from lmshealth.life.posterior import ensemble_sampling as sampling
+from lmshealth.life.posterior import sampling
 from lmshealth.report import figures as plots
 from studies.harness.checkout import ROOT
 

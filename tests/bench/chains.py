@@ -12,13 +12,13 @@ from numpy.random import MT19937, RandomState
 
 from lmshealth._private.serialize import stream
 from lmshealth.calibration.lives import START
-from lmshealth.life.posterior.ensemble_sampling import sample
-from lmshealth.life.posterior.importance_sampling import (
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
+from lmshealth.life.posterior.sampling import (
     WeightedDraws,
     draw_to_ess,
     importance_sample,
+    sample,
 )
-from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.read_tables import Drifts

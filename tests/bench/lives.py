@@ -10,8 +10,8 @@ from filterpy.kalman import KalmanFilter
 from numpy.typing import NDArray
 
 from lmshealth.calibration.lives import make_history
-from lmshealth.life.posterior.importance_sampling import draw_to_ess, importance_sample
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, ln_health
+from lmshealth.life.posterior.sampling import draw_to_ess, importance_sample
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 

@@ -13,7 +13,7 @@ from scipy import stats
 
 from lmshealth.errors import BadStage, NotEnoughData
 from lmshealth.life import constants
-from lmshealth.life.posterior import ensemble_sampling as sampling
+from lmshealth.life.posterior import sampling
 from lmshealth.life.posterior.fit import fit_life
 from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood
 from lmshealth.life.prognosis import (

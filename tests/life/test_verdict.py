@@ -23,7 +23,7 @@ from lmshealth.life.verdict import (
     verdict_of,
 )
 from lmshealth.stage.description import Stage, load_stage
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
 from tests.lives import (

@@ -16,7 +16,7 @@ from lmshealth.machine import constants
 from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
 from lmshealth.report import text
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from tests.assessments import Maker, make
 
 __all__ = ["make"]

@@ -23,7 +23,7 @@ from lmshealth.machine.status import (
     make_status,
 )
 from lmshealth.machine.summary import summarise
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from tests.assessments import Maker, blind, make, nothing
 
 __all__ = ["make"]

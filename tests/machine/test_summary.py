@@ -12,7 +12,7 @@ from msgspec import structs
 from lmshealth.machine.summary import Summary, first_limit, summarise, summarise_life
 from lmshealth.report.text import headline as headline_of
 from lmshealth.report.text import next_step, time_left, travel_left
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from tests.assessments import Assessment, Maker, blind, make, nothing
 
 __all__ = ["make"]

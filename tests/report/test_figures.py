@@ -24,9 +24,8 @@ from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import figures as plots
 from lmshealth.report.text import plain
 from lmshealth.stage.description import Decision
-from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
-from lmshealth.tracking.track import Effect, Track
+from lmshealth.tracking.track import CovariateEffect, Effect, Track
 from tests.assessments import (
     EPOCHS,
     FREQUENCY,

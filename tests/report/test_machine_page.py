@@ -32,8 +32,8 @@ from lmshealth.report.pages import date_page, make_page, write_index
 from lmshealth.report.text import GAP, plain
 from lmshealth.stage.description import Decision, ScatterPrior, load_stage
 from lmshealth.stage.priors import Lognormal, Normal
-from lmshealth.tracking.covariate_effects import find_covariate_effects
 from lmshealth.tracking.history import Series
+from lmshealth.tracking.track import find_covariate_effects
 from tests.assessments import (
     Maker,
     Page,

@@ -32,9 +32,8 @@ from lmshealth.report.tables import (
 )
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.description import Decision, Stage, load_stage
-from lmshealth.tracking.filters.change_detection import Event
+from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History, Series
-from lmshealth.tracking.smoother import Smoothed
 from lmshealth.tracking.track import Effect, Track
 from tests.lives import health_of
 from tests.signals import write_archive_stage
@@ -320,7 +319,8 @@ def test_events_and_smoothed_columns_leave_with_their_units(stage: Stage) -> Non
     assert not row["declared"]
     assert made.track is not None
     level = np.full((2, 2), np.log(100.0))
-    smoothed = Smoothed(level, 0.01 * level, level, level, 0 * level, np.full((2, 2), 1e-3))
+    cov = np.tile(1e-6 * np.eye(2), (2, 1, 1))
+    smoothed = replace(made.track, ln_frequency=level, ln_frequency_std=0.01 * level, drift_cov=cov)
     rows = track_rows(made.track, smoothed)
     assert rows[0]["frequency_hz_smoothed"] == pytest.approx(100.0)
     assert rows[0]["frequency_std_hz_smoothed"] == pytest.approx(np.log(100.0))

@@ -23,7 +23,7 @@ from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.summary import limit_of
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report import figures, log_figures
-from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
+from lmshealth.tracking.track import covariate_shifts, find_covariate_effects
 from studies.harness.command_line import ROOT, call
 
 FOLDER = ROOT / "lmshealth" / "report" / "templates" / "reading"

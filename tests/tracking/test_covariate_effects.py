@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.covariate_effects import covariate_shifts, find_covariate_effects
 from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History
-from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.track import accepted_estimates, track
+from lmshealth.tracking.track import (
+    accepted_estimates,
+    covariate_shifts,
+    find_covariate_effects,
+    smooth,
+    track,
+)
 from tests.lives import FREQUENCY, PRELOAD, TWO, awkward_history, make_history, make_stage, since
 
 SLOPE = np.array([-8e-4, 5e-4])
@@ -56,7 +60,7 @@ def test_what_is_left_is_what_the_state_space_leaves(bent: Stage) -> None:
             if not step.changes_modes:
                 name = f"{step.kind}:{step.name or step.source}"
                 state[:, space.jump(j).start + m] = effects[mode, name]
-    for j, i in enumerate(space._biased()):
+    for j, i in enumerate(space.biased):
         series = history.series[i]
         state[:, space.first_bias + 2 * j] = effects[series.mode, f"bias:{series.source}"]
     r = len(history.series)

@@ -10,8 +10,7 @@ import pytest
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filters import state_space
-from lmshealth.tracking.smoother import smooth
-from lmshealth.tracking.track import track
+from lmshealth.tracking.track import smooth, track
 from tests.lives import (
     PRELOAD,
     TWO,
@@ -22,7 +21,7 @@ from tests.lives import (
     since,
 )
 from tests.oracles import Wander, batch
-from tests.tracking.filters.test_filter_bank import KNOWN, SETTINGS, one, trusted
+from tests.tracking.filters.test_kalman_filters import KNOWN, SETTINGS, one, trusted
 from tests.tracking.test_track import quiet, shown, std_of, still
 
 __all__ = ["trusted"]  # a fixture

@@ -18,7 +18,7 @@ from lmshealth.stage.description import Stage, Usage
 from lmshealth.tracking import constants
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filters import state_space
-from lmshealth.tracking.filters.change_detection import Event, loop_evidence
+from lmshealth.tracking.filters.track_state import Event, loop_evidence
 from lmshealth.tracking.history import History, StepKind
 from lmshealth.tracking.track import Consistency, Track, accepted_estimates, consistency, track
 from studies.robustness.off_model.run import of_world
@@ -36,7 +36,7 @@ from tests.lives import (
     since,
 )
 from tests.oracles import JUMPS, Known, Wander, binomial_band, filterpy_loop
-from tests.tracking.filters.test_filter_bank import KNOWN, SETTINGS, few, one
+from tests.tracking.filters.test_kalman_filters import KNOWN, SETTINGS, few, one
 
 __all__ = ["few"]  # a fixture
 

@@ -182,12 +182,12 @@ def condense(history: History, most: int) -> History:
         history,
         logs=tuple(history.logs[end - 1] for end in ends),
         recorded_at=tuple(datetime.fromtimestamp(seconds[part].mean(), UTC) for part in parts),
-        travel=_means(history.travel, parts),
-        covariates={name: _means(own, parts) for name, own in history.covariates.items()},
+        travel=_means(history.travel, begins),
+        covariates={name: _means(own, begins) for name, own in history.covariates.items()},
         ln_frequency=np.array([mean[:r] for mean, _ in found]),
         ln_damping=np.array([mean[r:] for mean, _ in found]),
         cov=np.array([cov for _, cov in found]),
-        loop_error=_means(history.loop_error, parts),
+        loop_error=_means(history.loop_error, begins),
         baselines=tuple(int(group_of[k]) for k in history.baselines),
         steps=tuple(
             replace(step, first=int(group_of[step.first]), there=step.there[begins])
@@ -211,12 +211,11 @@ def _group_begins(history: History, size: int) -> np.ndarray:
     return np.flatnonzero(within % size == 0)
 
 
-def _means(values: FloatArray, parts: list[slice]) -> FloatArray:
+def _means(values: FloatArray, begins: np.ndarray) -> FloatArray:
     """Return the mean of each group without missing values, NaN if all are missing."""
     known = np.isfinite(values)
-    filled = np.where(known, values, 0.0)
-    counts = np.array([known[part].sum() for part in parts])
-    sums = np.array([filled[part].sum() for part in parts])
+    counts = np.add.reduceat(known.astype(int), begins)
+    sums = np.add.reduceat(np.where(known, values, 0.0), begins)
     return np.where(counts > 0, sums / np.maximum(counts, 1), np.nan)
 
 

@@ -10,13 +10,13 @@ import numpy as np
 from lmshealth._private.arrays import FloatArray, ReadOnly
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.posterior.importance_sampling import (
+from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood, kept_weights
+from lmshealth.life.posterior.sampling import (
     WeightedDraws,
     draw_to_ess,
     importance_sample,
     importance_sample_again,
 )
-from lmshealth.life.posterior.likelihood import LifeDensity, LifeLikelihood, kept_weights
 from lmshealth.life.posterior.scenarios import DegradationPath, Scenario
 from lmshealth.stage.degradation_laws import Free
 

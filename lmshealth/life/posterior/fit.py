@@ -15,7 +15,6 @@ from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData
-from lmshealth.life.posterior.ensemble_sampling import Sample, sample, thin
 from lmshealth.life.posterior.exploration import Explored, LifeStart, explore, log_probability
 from lmshealth.life.posterior.likelihood import (
     NO_MODE,
@@ -25,6 +24,7 @@ from lmshealth.life.posterior.likelihood import (
     ln_health,
     scatter_prior,
 )
+from lmshealth.life.posterior.sampling import Sample, sample, thin
 from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
@@ -35,8 +35,6 @@ if TYPE_CHECKING:
 _STEP = 1 << 20  # of the random stream
 _N_SETTINGS, _N_LONE, _N_PRIOR = 500, 50, 2000
 _N_KEPT = constants.N_DRAWS // constants.N_ENSEMBLES  # draws of each ensemble
-_NONE = np.zeros(0, dtype=int)
-_CHECKS = ("ess_bulk", "ess_tail", "r_hat")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -127,8 +125,6 @@ class LifePosterior:
     def __post_init__(self) -> None:
         shape, p = self.health.shape, len(self.parameters)
         freeze(self, ("health off rate", *shape[:2], p), ("lone", *shape[:2]))
-        if sum(one.n_mixture_draws for one in self.scenarios) != shape[1]:
-            raise ValueError("the draws of the scenarios do not add up to those of health")
 
     @property
     def stage(self) -> str:
@@ -225,7 +221,7 @@ class LifePosterior:
             if names:
                 groups[f"way_{k}"] = {name: chains[..., i] for i, name in enumerate(names)}
             checks[f"probability_{k}"] = np.array(one.probability)
-            for what in _CHECKS:
+            for what in ("ess_bulk", "ess_tail", "r_hat"):
                 values = zip(names, getattr(one.sample, what), strict=True)
                 checks |= {f"{what}_{k}_{name}": value for name, value in values}
         attrs = {"/": {"stage": self.stage, "seed": " ".join(map(str, self.seed))}}
@@ -308,10 +304,9 @@ def fit_life(
             if before is None:
                 raise
             return fit_life(history, stage, seed, chains=chains, min_logs=min_logs)
-        # Where chains follow, importance sampling is only compared with them.
-        scenarios = _sampled_scenarios(weighted, seeds[1], by_chains=False, compared=chains)
+        scenarios = _sampled_scenarios(weighted, seeds[1], by_chains=False)
         judge, now = np.full((2, len(stage.parameters)), np.nan), np.array([likelihood.data.now])
-        if chains:
+        if chains:  # importance sampling is only compared with them
             drawn, scenarios = scenarios, _sampled_scenarios(weighted, seeds[1], by_chains=True)
             judge = _change(drawn, scenarios, now)
         rng = np.random.default_rng(off_seed)
@@ -396,16 +391,9 @@ def _lone_modes(
 
 
 def _sampled_scenarios(
-    found: Sequence[Explored],
-    seed: np.random.SeedSequence,
-    *,
-    by_chains: bool,
-    compared: bool = False,
+    found: Sequence[Explored], seed: np.random.SeedSequence, *, by_chains: bool
 ) -> tuple[ScenarioPosterior, ...]:
-    """Sample the probable scenarios, and divide the draws of the mixture among them.
-
-    Draws that are only to be `compared` get no nuisances.
-    """
+    """Sample the probable scenarios, and divide the draws of the mixture among them."""
     probability = softmax([log_probability(one) for one in found])
     least = constants.MIN_PROBABILITY
     order = [k for k in np.argsort(-probability) if probability[k] >= least]
@@ -427,14 +415,13 @@ def _sampled_scenarios(
             draws = Sample(y.reshape(constants.N_ENSEMBLES, _N_KEPT, n_dim), ess, ess, unknown)
         kept_draws = thin(draws.draws, _N_KEPT)
         mixed = np.concatenate(thin(kept_draws, int(share)))
-        is_mixed = share and not compared
         one = ScenarioPosterior(
             density=density,
             probability=float(own),
             evidence_std=float(np.sqrt(1 / weighted.ess)) if n_dim else 0.0,
             sample=replace(draws, draws=kept_draws),
             n_mixture_draws=int(share),
-            nuisances=density.draw_nuisances(mixed, rng) if is_mixed else (_NONE, _NONE),
+            nuisances=density.draw_nuisances(mixed, rng),
         )
         sampled.append(one)
     return tuple(sampled)

@@ -19,7 +19,7 @@ from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
 from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import LifeData
-from lmshealth.life.posterior.importance_sampling import log_sum_exp
+from lmshealth.life.posterior.sampling import log_sum_exp
 from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage import constants as of_stage
 from lmshealth.stage.description import ScatterPrior, Stage

@@ -5,15 +5,14 @@ the estimates of a log, and returns the next state and a label per estimate. No 
 logs, and an estimate gets a mode only if that mode has nearly all of the posterior probability.
 """
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from itertools import pairwise
 from typing import Literal, Self
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
 from lmshealth.tracking import constants
 from lmshealth.tracking.association.hypotheses import (
@@ -32,9 +31,16 @@ from lmshealth.tracking.association.mode_filters import (
     predict,
     update,
 )
-from lmshealth.tracking.association.noise_scale import learn_scales, scaled
 
 Reason = Literal["ambiguous", "jump", "unconfirmed"]
+Scales = dict[str, FloatArray]
+"""Factors on the stated errors of ln f and ln ζ by source, ``(2,)``; 1 where there is none."""
+Place = tuple[float, float, FloatArray]
+"""ln f of a named estimate, its variance, and the covariates of its log."""
+
+_SCALES, _CHANCES = np.array(constants.SOURCE_NOISE_SCALES).T
+_GRID = np.geomspace(_SCALES[0], _SCALES[-1], 41)  # 1 in its middle
+_LOG_PRIOR = np.interp(np.log(_GRID), np.log(_SCALES), np.log(_CHANCES))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,28 +56,8 @@ class Estimates:
 
     def __post_init__(self) -> None:
         n = len(self.names)
-        if len(self.sources) != n:
-            raise ValueError(f"sources has {len(self.sources)} entries, needed {n}")
-        if self.shapes.ndim != 2:
-            raise ValueError(f"shapes has {self.shapes.ndim} dimensions, needed 2")
-        for name, shape in (("ln_frequency", (n,)), ("ln_damping", (n,)), ("cov", (2 * n, 2 * n))):
-            if (found := getattr(self, name).shape) != shape:
-                raise ValueError(f"{name} has shape {found}, needed {shape}")
-        if len(self.shapes) != n:
-            raise ValueError(f"shapes has {len(self.shapes)} rows, needed {n}")
-
-    def pick(self, chosen: Sequence[int]) -> Self:
-        """Return some of the estimates."""
-        at, n = np.array(chosen, dtype=int), len(self.names)
-        both = np.concatenate([at, at + n])
-        return type(self)(
-            tuple(self.names[i] for i in chosen),
-            tuple(self.sources[i] for i in chosen),
-            self.ln_frequency[at],
-            self.ln_damping[at],
-            self.cov[both[:, None], both],
-            self.shapes[at],
-        )
+        shapes = "shapes", n, self.shapes.shape[-1]
+        freeze(self, ("ln_frequency ln_damping", n), ("cov", 2 * n, 2 * n), shapes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,9 +105,12 @@ class LogMeasurements:
     sources: tuple[str, ...]
     measurements: Measurements
 
-
-Place = tuple[float, float, FloatArray]
-"""ln f of a named estimate, its variance, and the covariates of its log."""
+    @property
+    def places(self) -> dict[tuple[str, str], Place]:
+        """Place of every named mode and source."""
+        new = self.measurements
+        rows = zip(self.names, self.sources, new.ln_f.tolist(), new.var_f.tolist(), strict=True)
+        return {(name, source): (*own, self.offsets) for name, source, *own in rows if name}
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -204,14 +193,18 @@ def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Labe
     found: list[Label] = [Label(None)] * len(log.names)
     confirmed: set[int] = set()
     detected: set[int] = set()
-    for source in range(len(set(log.sources))):
+    for source in dict.fromkeys(log.sources):
+        rows = np.flatnonzero([one == source for one in log.sources])
         # Modes that one source starts are known to the next.
-        rows, meant = _groups(state.names, log.names, log.sources)[source]
+        index = {name: i for i, name in enumerate(state.names)} | {"": -1}
+        meant = np.array([index.get(log.names[i], len(state.names)) for i in rows], dtype=int)
         own = log.measurements if rows.size == len(log.names) else log.measurements[rows]
-        scan = Scan(log.epoch, rows, meant, own, _row(log))
+        scan = Scan(log.epoch, rows, meant, own, np.concatenate([(1.0, 0.0), log.offsets]))
         unique = None if log.opened else _unique_assignment(state, scan)
         if unique is not None:
-            state, modes = _update(state, unique, own, scan.row), unique.tolist()
+            known, modes = state.hypotheses, unique.tolist()
+            filters = update(known.filters, (np.zeros_like(unique), unique), own, scan.row)
+            state = replace(state, hypotheses=replace(known, filters=filters))
             labels = [Label(state.names[mode]) for mode in modes]
         else:
             state, modes, labels = _resolve(state, scan, log, confirmed)
@@ -219,36 +212,8 @@ def associate_log(state: State, log: LogMeasurements) -> tuple[State, tuple[Labe
         for row, label in zip(rows, labels, strict=True):
             found[row] = label
     candidates = prune(state.candidates, log.epoch, confirmed, detected)
-    state = replace(state, candidates=candidates, places=places | _places(log))
+    state = replace(state, candidates=candidates, places=places | log.places)
     return state, tuple(found)
-
-
-@lru_cache(maxsize=256)
-def _groups(
-    modes: tuple[str, ...], names: tuple[str, ...], sources: tuple[str, ...]
-) -> list[tuple[IntArray, IntArray]]:
-    """Return the rows of each source, and the indices of the modes that their names mean."""
-    index = {name: i for i, name in enumerate(modes)}
-    meant = np.array([index.get(n, len(modes)) if n else -1 for n in names], dtype=int)
-    each = [np.flatnonzero(np.array(sources) == s) for s in dict.fromkeys(sources)]
-    return [(rows, meant[rows]) for rows in each]
-
-
-def _row(log: LogMeasurements) -> FloatArray:
-    """Return the observation row ``[1, 0, covariates]`` of a log."""
-    return np.concatenate([(1.0, 0.0), log.offsets])
-
-
-def _places(log: LogMeasurements) -> dict[tuple[str, str], Place]:
-    """Return the place of every named mode and source of a log."""
-    new = log.measurements
-    return {
-        (name, source): (ln_f, var, log.offsets)
-        for name, source, ln_f, var in zip(
-            log.names, log.sources, new.ln_f.tolist(), new.var_f.tolist(), strict=True
-        )
-        if name
-    }
 
 
 def _is_common_jump(
@@ -260,7 +225,7 @@ def _is_common_jump(
     names may be wrong.
     """
     moved = set()
-    for (name, source), (ln_f, var, _) in _places(log).items():
+    for (name, source), (ln_f, var, _) in log.places.items():
         if (name, source) not in places:
             continue
         change = float(np.abs(log.offsets - places[name, source][2]) @ prior_std)
@@ -284,12 +249,6 @@ def _predict(state: State, log: LogMeasurements) -> State:
         filters = predict(candidates.filters, step, log.life, opened=log.opened)
         candidates = replace(candidates, filters=filters)
     return replace(state, hypotheses=hypotheses, candidates=candidates, clock=log.clock)
-
-
-def _update(state: State, modes: IntArray, new: Measurements, row: FloatArray) -> State:
-    """Update the filters of a single hypothesis with estimates of known modes."""
-    filters = update(state.hypotheses.filters, (np.zeros_like(modes), modes), new, row)
-    return replace(state, hypotheses=replace(state.hypotheses, filters=filters))
 
 
 def _unique_assignment(state: State, scan: Scan) -> IntArray | None:
@@ -461,3 +420,103 @@ def measurements_of(epochs: Sequence[Estimates]) -> list[Measurements]:
         shapes /= np.where(norm > 0, norm, np.nan)
     columns = (ln_f, var_f, ln_zeta, var_zeta, shapes)
     return [Measurements(*(column[a:b] for column in columns)) for a, b in pairwise(start)]
+
+
+def learn_scales(
+    measurements: Sequence[Measurements],
+    sources: Sequence[tuple[str, ...]],
+    offsets: FloatArray,
+    prior_std: FloatArray,
+) -> list[Scales]:
+    """Return the scales of every log, as the scatter of successive estimates up to it shows them.
+
+    Another program may state errors that are wrong by an order of magnitude; gates need the scatter
+    before it is known which mode an estimate is of. Two estimates of successive logs that are each
+    other's nearest are nearly always of one mode. Scales are the most probable ones of a grid, and
+    change only by more than `constants.LEAST_RESCALING`: until then the same object is returned.
+    `sources` are those of the estimates of each log, other parameters those of `associate`.
+    """
+    ends = np.cumsum([0, *(len(own) for own in sources)])
+    source_of = np.array([source for own in sources for source in own], dtype=object)
+    log_of = np.repeat(np.arange(len(sources)), np.diff(ends))
+    columns = ("ln_f", "var_f", "ln_zeta", "var_zeta")
+    values = np.array([np.concatenate([getattr(m, c) for m in measurements]) for c in columns])
+    likely: dict[int, Scales] = {}
+    for source in dict.fromkeys(source_of):
+        rows = np.flatnonzero(source_of == source)
+        for k, scale in _likely_scales(values[:, rows], log_of[rows], offsets * prior_std):
+            likely.setdefault(k, {})[source] = scale
+    held: Scales = {}
+    scales = []
+    for k in range(len(sources)):
+        for source, scale in likely.get(k, {}).items():
+            change = np.abs(np.log(scale / held.get(source, np.ones(2)))).max()
+            if change > np.log(constants.LEAST_RESCALING):
+                held = {**held, source: scale}
+        scales.append(held)
+    return scales
+
+
+def _likely_scales(
+    values: FloatArray, log_of: IntArray, moving: FloatArray
+) -> Iterator[tuple[int, FloatArray]]:
+    """Yield the logs of a source after which other scales are the most probable ones, with these.
+
+    `values` are ln f, its variance, ln ζ and its variance of all estimates, ``(4, n)``, `log_of`
+    their logs and `moving` ln f by the covariates of each log, ``(n_logs, n_covariates)``.
+    """
+    logs, first, counts = np.unique(log_of, return_index=True, return_counts=True)
+    # Rows of the estimates of each log; those that are missing have no distance.
+    place = np.arange(counts.max())
+    there, rows = place < counts[:, None], np.minimum(first[:, None] + place, log_of.size - 1)
+    new, old, pair = _nearest_pairs(values[0], rows, there)
+    moved = np.sum(np.diff(moving[logs], axis=0) ** 2, axis=1)
+    gain = np.zeros((logs.size, 2, _GRID.size))
+    gain[0] = _LOG_PRIOR
+    np.add.at(gain, pair + 1, _evidence(values[:, new], values[:, old], moved[pair]))
+    best = np.cumsum(gain, axis=0)[1:].argmax(axis=2)
+    changes = np.diff(best, axis=0, prepend=_GRID.size // 2) != 0
+    for at in np.flatnonzero(changes.any(axis=1)):
+        yield int(logs[at + 1]), _GRID[best[at]]
+
+
+def scaled(new: Measurements, sources: tuple[str, ...], scales: Scales) -> Measurements:
+    """Return the estimates of one log with the variances by the scales of their sources."""
+    if not scales:
+        return new
+    factor = np.array([scales.get(source, np.ones(2)) for source in sources]).reshape(-1, 2)
+    var_f, var_zeta = np.array([new.var_f, new.var_zeta]) * factor.T**2
+    return replace(new, var_f=var_f, var_zeta=var_zeta)
+
+
+def _nearest_pairs(
+    ln_f: FloatArray, rows: IntArray, there: BoolArray
+) -> tuple[IntArray, IntArray, IntArray]:
+    """Return the estimates of two logs in a row that are each other's nearest, and which logs.
+
+    Returned are both estimates of each pair, and the index of the first of the two logs.
+    """
+    gap = np.abs(ln_f[rows[1:]][:, :, None] - ln_f[rows[:-1]][:, None, :])
+    gap[~(there[1:][:, :, None] & there[:-1][:, None, :])] = np.inf
+    own, back = gap.argmin(axis=2), gap.argmin(axis=1)
+    mutual = np.take_along_axis(back, own, axis=1) == np.arange(own.shape[1])
+    pair, i = np.nonzero(mutual & there[1:])
+    return rows[pair + 1, i], rows[pair, own[pair, i]], pair
+
+
+def _evidence(new: FloatArray, old: FloatArray, moved: FloatArray) -> FloatArray:
+    """Return the log evidence of n pairs for each scale of ln f and of ln ζ, ``(n, 2, n_scales)``.
+
+    `new` and `old` are as the values of `_likely_scales`, ``(4, n)``; `moved` is the variance of
+    ln f by the covariates between them, ``(n,)``. A share of the pairs is of different modes: their
+    differences have any size. Each estimate is in two differences, so that these count half.
+    """
+    off = (new[[0, 2]] - old[[0, 2]]).T
+    stated = (new[[1, 3]] + old[[1, 3]]).T
+    known = np.isfinite(stated)
+    var = np.where(known, stated, 1.0)[:, :, None] * _GRID**2
+    var[:, 0] += moved[:, None]
+    share = constants.STRAY_PROBABILITY
+    density = np.exp(-0.5 * off[:, :, None] ** 2 / var) / np.sqrt(2 * np.pi * var)
+    gain = np.log((1 - share) * density + share)
+    return np.asarray(0.5 * np.where(known[:, :, None], gain, 0.0))

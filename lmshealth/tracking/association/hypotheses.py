@@ -375,48 +375,36 @@ def follow(
     which each may be the new level as its name, else -1. Returned are the candidates, new ones at
     the end, and for each estimate the candidate that it confirms, or None.
     """
-    candidates, mine = _assign(candidates, scan)
-    known = [j for j in mine if j is not None]
+    from scipy.optimize import linear_sum_assignment  # late, as above
+
+    mine: list[int | None] = [None] * scan.rows.size
+    filters, log_odds = candidates.filters, candidates.log_odds.copy()
+    # The alternative of a detection is clutter, not a missed detection.
+    gains = clutter_gains(filters, scan)[0] + np.log(1 - constants.DETECTION_PROBABILITY)
+    best = np.where(scan.names[:, None] == candidates.modes, np.maximum(gains, 0.0), 0.0)
+    rows, known = linear_sum_assignment(-best)
+    detected = best[rows, known] > 0
+    rows, known = rows[detected], known[detected]
+    for i, j in zip(rows.tolist(), known.tolist(), strict=True):
+        mine[i] = j
+    if known.size:
+        log_odds[known] += best[rows, known]
+        at = (np.zeros_like(known), known)
+        filters = update(filters, at, scan.measurements[rows], scan.row)
     n_logs, last = candidates.n_logs.copy(), candidates.last.copy()
     n_logs[known] += last[known] != scan.epoch
     last[known] = scan.epoch
     lone = np.array([i for i, j in enumerate(mine) if j is None], dtype=int)
-    filters = candidates.filters
     if lone.size:
         filters = filters.start(scan.measurements[lone], scan.row, prior_std, life)
     grown = Candidates(
         filters,
         np.append(candidates.modes, scan.names[lone]),
-        np.append(candidates.log_odds, np.full(lone.size, np.log(constants.INITIATION_ODDS))),
+        np.append(log_odds, np.full(lone.size, np.log(constants.INITIATION_ODDS))),
         np.append(n_logs, np.ones(lone.size, dtype=int)),
         np.append(last, np.full(lone.size, scan.epoch)),
     )
     return grown, [j if j is not None and grown.confirmed(j) else None for j in mine]
-
-
-def _assign(candidates: Candidates, scan: Scan) -> tuple[Candidates, list[int | None]]:
-    """Assign estimates to candidates, one to one, and update these."""
-    from scipy.optimize import linear_sum_assignment  # late, as above
-
-    mine: list[int | None] = [None] * scan.rows.size
-    if not len(candidates):
-        return candidates, mine
-    # The alternative of a detection is clutter, not a missed detection.
-    gains = clutter_gains(candidates.filters, scan)[0]
-    gains += np.log(1 - constants.DETECTION_PROBABILITY)
-    gains[scan.names[:, None] != candidates.modes] = -np.inf
-    best = np.maximum(gains, 0.0)
-    pairs = [(i, j) for i, j in zip(*linear_sum_assignment(-best), strict=True) if best[i, j]]
-    if not pairs:
-        return candidates, mine
-    for i, j in pairs:
-        mine[i] = int(j)
-    rows, own = (np.array(side) for side in zip(*pairs, strict=True))
-    log_odds = candidates.log_odds.copy()
-    log_odds[own] += gains[rows, own]
-    at = (np.zeros_like(own), own)
-    filters = update(candidates.filters, at, scan.measurements[rows], scan.row)
-    return replace(candidates, filters=filters, log_odds=log_odds), mine
 
 
 def prune(

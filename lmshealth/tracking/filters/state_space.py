@@ -60,18 +60,6 @@ class Hyperparameters(Rows):
         return np.asarray((self.wander * np.exp(np.log(self.scales).mean(axis=1))) ** 2)
 
     @cached_property
-    def log_walks(self) -> FloatArray:
-        """Logs of the variance of the walk of ln f, then of the scales, ``(n, 1 + n_sources)``."""
-        with np.errstate(divide="ignore"):
-            return np.log(np.column_stack([self.level_walk**2, self.scales]))
-
-    @cached_property
-    def variances(self) -> FloatArray:
-        """Variances of settling, of wander, and of the part of it that stays, shape ``(n, 3)``."""
-        wander = self.wander_variance
-        return np.column_stack([self.settling**2, wander, wander * self.wander_keep])
-
-    @cached_property
     def process_noise(self) -> FloatArray:
         """Variances of the parts of process noise, in the order of `_process_noise`, ``(n, 7)``."""
         drive, wander = self.rate_walk**2, (1 - self.wander_keep**2) * self.wander_variance
@@ -128,7 +116,6 @@ class Observation:
 
     rows: np.ndarray  # of ``[ln f, ln ζ]`` of all series, ``(n_rows,)``
     values: FloatArray  # ``(n_rows,)``
-    matrix: FloatArray  # measurement matrix without steps, ``(n_rows, first_step)``
     cov: FloatArray  # covariance of the errors as stated, ``(n_rows, n_rows)``
     source: np.ndarray  # index of the source of each, ``(n_rows,)``
     extra: FloatArray | None  # variances of unknown covariates, ``(n_rows,)``; None without any
@@ -154,7 +141,11 @@ class StateSpace:
             slice(part * m, (part + 1) * m) for part in range(5)
         )
         self.first_bias = (5 + len(regressed)) * m
-        self.biased = self._biased()
+        # All series of a mode but the one detected first have a bias.
+        there = np.isfinite(history.ln_frequency)
+        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there)).tolist()
+        series = [history.columns(mode) for mode in history.modes]
+        self.biased = [i for own in series for i in own if i != min(own, key=first.__getitem__)]
         self.first_step = self.first_bias + 2 * len(self.biased)
         self.size = self.first_step + 2 * m * len(steps)
         # The mean distance between logs so far is the unit: no horizon has to be known.
@@ -186,7 +177,6 @@ class StateSpace:
             std[i] = np.sqrt(first[0]) if first.size else 0.0
         self.wander_cov = np.outer(std, std) * _correlation(constants.WANDER_COMMON, std.size)
         self.together = _correlation(constants.RATE_COMMON, std.size)
-        self.single = np.eye(std.size)
         self.noise, self.noise_shares = self._process_noise()
 
     def with_step(self, step: Step) -> Self:
@@ -214,20 +204,12 @@ class StateSpace:
 
     def matrix(self, k: int) -> FloatArray:
         """Return the measurement matrix of ``[ln f, ln ζ]`` of log k, ``(2 n_series, size)``."""
-        fixed: FloatArray = self.fixed[k]
-        if not self.steps:
-            return fixed
-        matrix = np.zeros((fixed.shape[0], self.size))
-        matrix[:, : self.first_step] = fixed
+        matrix = np.zeros((len(self.mode_of), self.size))
+        matrix[:, : self.first_step] = self.fixed[k]
         for j, (step, reading) in enumerate(self._jumps):
             if step.there[k]:
                 matrix[:, self.jump(j)] = reading
         return matrix
-
-    def observed_matrix(self, k: int) -> FloatArray:
-        """Return the measurement matrix of the estimates that log k has, ``(n_rows, size)``."""
-        own = self.observations[k]
-        return self.matrix(k)[own.rows] if self.steps else own.matrix
 
     def jump_noise(self, k: int) -> FloatArray | None:
         """Return the covariance of the jumps of the steps at log k, ``(size, size)``; None if none.
@@ -256,17 +238,6 @@ class StateSpace:
         first = self.first_step + 2 * self.n_modes * j
         return slice(first, first + 2 * self.n_modes)
 
-    def _biased(self) -> tuple[int, ...]:
-        """Return the series that have a bias: all of a mode but the one detected first."""
-        there = np.isfinite(self.history.ln_frequency)
-        first = np.where(there.any(axis=0), there.argmax(axis=0), len(there))
-        biased: list[int] = []
-        for mode in self.history.modes:
-            own = self.history.columns(mode)
-            reference = min(own, key=lambda i: (first[i], i), default=None)
-            biased += [i for i in self.history.columns(mode) if i != reference]
-        return tuple(biased)
-
     def _without_steps(self) -> FloatArray:
         """Return all measurement matrices without steps, ``(n_logs, 2 n_series, first_step)``."""
         history, r = self.history, len(self.history.series)
@@ -282,23 +253,19 @@ class StateSpace:
         return matrix
 
     def _observations(self) -> list[Observation]:
-        """Return the estimates of each log; logs with the same rows are taken at once."""
+        """Return the estimates of each log."""
         history, r = self.history, len(self.history.series)
         values = np.hstack([history.ln_frequency, history.ln_damping])
         source = np.array([self.sources.index(one.source) for one in history.series] * 2)
         # Variance of ln f due to unknown covariates.
         unknown = sum((one.unknown for one in self.regressed), np.zeros(len(values)))
-        found: dict[int, Observation] = {}
-        patterns, place = np.unique(np.isfinite(values), axis=0, return_inverse=True)
-        for i, there in enumerate(patterns):
-            rows, logs = np.flatnonzero(there), np.flatnonzero(place.ravel() == i)
-            own = values[logs[:, None], rows]
-            matrices = self.fixed[logs[:, None], rows]
-            covs = history.cov[logs[:, None, None], rows[:, None], rows]
-            for j, k in enumerate(logs.tolist()):
-                extra = np.where(rows < r, unknown[k], 0.0) if unknown[k] else None
-                found[k] = Observation(rows, own[j], matrices[j], covs[j], source[rows], extra)
-        return [found[k] for k in range(len(values))]
+        found = []
+        for own, cov, more in zip(values, history.cov, unknown, strict=True):
+            rows = np.flatnonzero(np.isfinite(own))
+            extra = np.where(rows < r, more, 0.0) if more else None
+            errors = cov[rows[:, None], rows]
+            found.append(Observation(rows, own[rows], errors, source[rows], extra))
+        return found
 
     def _process_noise(self) -> tuple[FloatArray, FloatArray]:
         """Return covariances of the parts of process noise, and their shares in every log.
@@ -307,7 +274,7 @@ class StateSpace:
         levels and rates, and in rates, wander, and the random walk of damping, of unit variance,
         ``(7, (5 n_modes)²)``. The shares, ``(n_logs, 7)``, are of variances per life.
         """
-        size, level, rate, single = 5 * self.n_modes, self.level, self.rate, self.single
+        size, level, rate, single = 5 * self.n_modes, self.level, self.rate, np.eye(self.n_modes)
         parts = np.zeros((7, size, size))
         parts[0, level, level], parts[6, self.damping, self.damping] = single, single
         parts[5, self.wander, self.wander] = self.wander_cov

@@ -21,7 +21,7 @@ from lmshealth.tracking.constants import (
     SETTLING_LOGS,
     WANDER_COMMON,
 )
-from lmshealth.tracking.filters import filter_bank
+from lmshealth.tracking.filters import kalman_filters
 from lmshealth.tracking.filters.state_space import Hyperparameters, StateSpace, hyperparameter_grid
 from lmshealth.tracking.history import History, Series
 
@@ -208,17 +208,17 @@ def without_common_errors(history: History) -> History:
 
 def banks(
     history: History, machine: Stage | None, setting: Hyperparameters
-) -> Iterator[tuple[filter_bank.FilterBank, float]]:
+) -> Iterator[tuple[kalman_filters.FilterBank, float]]:
     """Filter log by log with one setting; yield the bank and the squared innovation.
 
     The lives have no outliers and the other programs know none: the filter looks for none either.
     """
     space = StateSpace(history, machine)
     space.grid = replace(setting, log_prior=np.zeros(1))
-    bank = filter_bank.initial(space)
+    bank = kalman_filters.initial(space)
     for k in range(len(history.logs)):
-        before = filter_bank.predict(space, bank, k)
-        bank, innovation = filter_bank.update(space, before, k, outliers=False)
+        before = kalman_filters.predict(space, bank, k)
+        bank, innovation = kalman_filters.update(space, before, k, outliers=False)
         yield bank, float(innovation.nis)
 
 
@@ -260,7 +260,7 @@ def filtered(life: Life, machine: Stage) -> Filtered:
 def mixture(life: Life, machine: Stage, k: int, i: int) -> dict[str, float]:
     """Return the probability below the truth in the average over all settings, at one log."""
     space = StateSpace(life.history, machine)
-    bank = filter_bank.advance(space, filter_bank.initial(space), 0, k)
+    bank = kalman_filters.advance(space, kalman_filters.initial(space), 0, k)
     level, base, damping = (part.start + i for part in (space.level, space.base, space.damping))
     places = {"ln f": [level], "ln ζ": [damping], "drift": [level, base]}
     below = {}

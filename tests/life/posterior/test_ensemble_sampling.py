@@ -13,9 +13,8 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.posterior import ensemble_sampling as sampling
-from lmshealth.life.posterior.ensemble_sampling import Sample, _start, sample
-from lmshealth.life.posterior.importance_sampling import WeightedDraws
+from lmshealth.life.posterior import sampling
+from lmshealth.life.posterior.sampling import Sample, WeightedDraws, _start, sample
 
 MEAN = np.array([0.3, -1.2])
 WALKERS = 16
@@ -48,6 +47,11 @@ def drawn() -> Sample:
     return sample(gaussian, BEGIN, stream(7, 1))
 
 
+def flat(found: Sample) -> FloatArray:
+    """Return the draws of the ensembles in turn."""
+    return np.swapaxes(found.draws, 0, 1).reshape(-1, found.draws.shape[-1])
+
+
 def agree(values: FloatArray, known: float, ess: float) -> None:
     """Hold a mean of draws to its own Monte-Carlo error."""
     assert abs(values.mean() - known) < 5 * values.std() / np.sqrt(ess)
@@ -56,10 +60,10 @@ def agree(values: FloatArray, known: float, ess: float) -> None:
 @pytest.mark.slow
 def test_moments_of_a_gaussian(drawn: Sample) -> None:
     """Mean and covariance are right within the Monte-Carlo error of the stated sample size."""
-    off = drawn.flat - MEAN
+    off = flat(drawn) - MEAN
     ess = drawn.ess_bulk.min()
     for i in range(2):
-        agree(drawn.flat[:, i], MEAN[i], ess)
+        agree(flat(drawn)[:, i], MEAN[i], ess)
         for j in range(2):
             agree(off[:, i] * off[:, j], COV[i, j], ess)
 
@@ -69,7 +73,7 @@ def test_a_sample_carries_its_evidence(drawn: Sample) -> None:
     """Sample sizes lie between 1,000 and the number of draws; R-hat is below 1.01."""
     assert drawn.draws.shape[::2] == (constants.N_ENSEMBLES, 2)
     for ess in (drawn.ess_bulk, drawn.ess_tail):
-        assert (ess < drawn.flat.shape[0]).all()
+        assert (ess < flat(drawn).shape[0]).all()
         assert (ess > 1000).all()
     assert (drawn.r_hat < 1.01).all()
 
@@ -77,7 +81,7 @@ def test_a_sample_carries_its_evidence(drawn: Sample) -> None:
 def test_a_wrong_mean_is_noticed(drawn: Sample) -> None:
     """Negative control: a mean off by a fifth of a standard deviation fails the same check."""
     with pytest.raises(AssertionError):
-        agree(drawn.flat[:, 0], MEAN[0] + 0.2 * np.sqrt(COV[0, 0]), drawn.ess_bulk.min())
+        agree(flat(drawn)[:, 0], MEAN[0] + 0.2 * np.sqrt(COV[0, 0]), drawn.ess_bulk.min())
 
 
 @pytest.mark.slow
@@ -118,7 +122,7 @@ def test_ensembles_of_one_process_differ(drawn: Sample) -> None:
 def test_sample_sizes_are_honest() -> None:
     """Means of independent samples scatter by as much as for their effective sample size."""
     found = [sample(gaussian, BEGIN, stream(7, 20 + k)) for k in range(24)]
-    means = np.array([one.flat.mean(axis=0) for one in found])
+    means = np.array([flat(one).mean(axis=0) for one in found])
     ess = np.mean([one.ess_bulk for one in found], axis=0)
     ratio = np.var(means, axis=0, ddof=1) / (np.diag(COV) / ess)
     low, high = np.asarray(stats.chi2.ppf([5e-4, 1 - 5e-4], 23)) / 23
@@ -140,7 +144,7 @@ def test_moments_of_a_banana() -> None:
         return -0.5 * x[:, 0] ** 2 - 0.5 * (x[:, 1] - x[:, 0] ** 2) ** 2
 
     found = sample(banana, BEGIN, stream(11))
-    x, y = found.flat.T
+    x, y = flat(found).T
     ess = found.ess_bulk.min()
     agree(x, 0.0, ess)
     agree(y, 1.0, ess)
@@ -156,7 +160,7 @@ def test_more_dimensions_keep_their_width() -> None:
         return -0.5 * np.sum(x**2, axis=1)
 
     found = sample(ball, wide(6, scale=2.0), stream(15))
-    agree(np.mean(found.flat**2, axis=1), 1.0, found.ess_bulk.min())
+    agree(np.mean(flat(found) ** 2, axis=1), 1.0, found.ess_bulk.min())
 
 
 @pytest.mark.slow
@@ -168,7 +172,7 @@ def test_one_dimension_with_an_edge() -> None:
 
     found = sample(half, even(np.abs(wide(1).points)), stream(12))
     assert (found.draws > 0).all()
-    agree(found.flat[:, 0], np.sqrt(2 / np.pi), found.ess_bulk.min())
+    agree(flat(found)[:, 0], np.sqrt(2 / np.pi), found.ess_bulk.min())
 
 
 @pytest.mark.slow
@@ -183,7 +187,7 @@ def test_modes_far_apart_have_their_share() -> None:
     side = np.random.default_rng(13).choice([-3.0, 3.0], size=(800, 1))
     start = even(side + 0.4 * np.random.default_rng(14).standard_normal((800, 2)))
     found = sample(two, start, stream(13))
-    right = (found.flat[:, 0] > 0).astype(float)
+    right = (flat(found)[:, 0] > 0).astype(float)
     agree(right, 0.7, found.ess_bulk.min())
     with pytest.raises(AssertionError):
         agree(right, 0.5, found.ess_bulk.min())

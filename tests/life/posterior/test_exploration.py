@@ -9,8 +9,8 @@ import pytest
 from msgspec import structs
 
 from lmshealth.calibration.lives import make_history
-from lmshealth.life.posterior.importance_sampling import importance_sample
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, ln_health
+from lmshealth.life.posterior.sampling import importance_sample
 from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import Step

@@ -16,10 +16,9 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
 from lmshealth.life.posterior import exploration, fit
-from lmshealth.life.posterior.ensemble_sampling import Sample
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
-from lmshealth.life.posterior.importance_sampling import draw_to_ess, importance_sample
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood
+from lmshealth.life.posterior.sampling import Sample, draw_to_ess, importance_sample
 from lmshealth.life.prognosis import prognose
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History, Step
@@ -514,7 +513,7 @@ def test_no_life_without_convergence(
     history: History, stage: Stage, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A sampler that stops too soon is refused with its chains."""
-    monkeypatch.setattr("lmshealth.life.posterior.ensemble_sampling._FIRST_STEPS", 40)
+    monkeypatch.setattr("lmshealth.life.posterior.sampling._FIRST_STEPS", 40)
     monkeypatch.setattr("lmshealth.life.constants.MAX_CHAIN_STEPS", 40)
     with pytest.raises(NotConverged, match="after 40 steps") as caught:
         fit_life(history, stage, 1)

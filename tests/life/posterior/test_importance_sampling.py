@@ -12,7 +12,7 @@ from scipy import stats
 from lmshealth._private.arrays import FloatArray
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
-from lmshealth.life.posterior.importance_sampling import (
+from lmshealth.life.posterior.sampling import (
     Proposal,
     WeightedDraws,
     draw_to_ess,

@@ -432,11 +432,10 @@ def test_estimates_without_a_value_or_std_are_refused(changes: dict[str, Any]) -
         run([good, replace(good, **changes)])
 
 
-@pytest.mark.parametrize("name", ["sources", "ln_damping", "cov", "shapes"])
+@pytest.mark.parametrize("name", ["ln_damping", "cov", "shapes"])
 def test_fields_that_do_not_fit_are_refused(name: str) -> None:
     """The error names the field."""
     wrong: dict[str, Any] = {
-        "sources": ("acc",),
         "ln_damping": np.zeros(3),
         "cov": np.eye(2),
         "shapes": np.eye(3),

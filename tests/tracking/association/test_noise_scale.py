@@ -10,10 +10,15 @@ from numpy.typing import NDArray
 
 from lmshealth.tracking import constants
 from lmshealth.tracking.association import associate as module
-from lmshealth.tracking.association import noise_scale
-from lmshealth.tracking.association.associate import Association, Estimates, associate
+from lmshealth.tracking.association.associate import (
+    Association,
+    Estimates,
+    Scales,
+    associate,
+    learn_scales,
+    scaled,
+)
 from lmshealth.tracking.association.mode_filters import Measurements
-from lmshealth.tracking.association.noise_scale import Scales, learn_scales, scaled
 
 MODES = np.log([1.5, 1.515, 5.0])
 SCATTER = 1e-3
@@ -59,15 +64,6 @@ def test_scales_use_no_later_logs() -> None:
     for some, all_logs in zip(learned(15.0, n=9), learned(15.0)[:9], strict=True):
         assert {**some}.keys() == {**all_logs}.keys()
         assert all(np.array_equal(some[key], all_logs[key]) for key in some)
-
-
-def test_scales_do_not_depend_on_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Logs that are compared in several blocks have the scales of one block, bit for bit."""
-    whole = learned(15.0)
-    monkeypatch.setattr(noise_scale, "_BLOCK", 5)
-    for one, other in zip(whole, learned(15.0), strict=True):
-        assert one.keys() == other.keys()
-        assert all(np.array_equal(one[key], other[key]) for key in one)
 
 
 def test_covariates_explain_differences() -> None:

@@ -15,7 +15,9 @@ from lmshealth._private.arrays import FloatArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.filters import state_space
-from lmshealth.tracking.filters.change_detection import (
+from lmshealth.tracking.filters.kalman_filters import restart
+from lmshealth.tracking.filters.state_space import StateSpace
+from lmshealth.tracking.filters.track_state import (
     ChangeHypothesis,
     add_to_sums,
     loop_evidence,
@@ -24,12 +26,10 @@ from lmshealth.tracking.filters.change_detection import (
     unexplained_loop_changes,
     worst_window,
 )
-from lmshealth.tracking.filters.filter_bank import restart
-from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.history import History, Step
 from lmshealth.tracking.track import Track, track
 from tests.lives import DAMPING, FREQUENCY, make_stage, rough_history, seen_by, since
-from tests.tracking.filters.test_filter_bank import SETTINGS, one, run
+from tests.tracking.filters.test_kalman_filters import SETTINGS, one, run
 
 N_LOGS, PLACE = 40, 22
 

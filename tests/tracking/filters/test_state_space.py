@@ -154,7 +154,7 @@ def test_the_series_seen_first_of_a_mode_has_no_bias(history: History, stage: St
     # The first log has both estimates of one mode, and of the other that by Δe alone.
     assert np.isfinite(history.ln_frequency[0]).tolist() == [True, False, True, True]
     space = StateSpace(history, stage)
-    assert space.biased == (2, 1)
+    assert space.biased == [2, 1]
     matrix = space.matrix(0)[:, space.first_bias : space.first_step]
     expected = np.zeros((8, 4))
     expected[2, 0] = expected[6, 1] = expected[1, 2] = expected[5, 3] = 1

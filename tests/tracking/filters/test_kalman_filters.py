@@ -11,7 +11,7 @@ from scipy.special import softmax
 from lmshealth._private.arrays import BoolArray
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
-from lmshealth.tracking.filters.filter_bank import (
+from lmshealth.tracking.filters.kalman_filters import (
     FilterBank,
     initial,
     predict,
