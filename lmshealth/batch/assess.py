@@ -27,7 +27,6 @@ from lmshealth.machine.assessment import (
     with_calibration,
     with_fleet_prior,
 )
-from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import Maintenance
@@ -35,7 +34,7 @@ from lmshealth.tracking.maintenance import Maintenance
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
 
-_Job = tuple["Machine", PackedLogs, dict[str, bytes]]
+_Job = tuple["Machine", PackedLogs, bytes | None]  # with a packed `LifeState`
 _Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]  # with its key
 
 Part = TypeVar("Part")
@@ -81,7 +80,9 @@ def assess_all(
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
-        return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
+        key = _life_key(one.stage, one.seed)
+        known = None if force else store.part(one.name, key, after=one.key)
+        return one, packed_logs(one, store), known
 
     assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
         function=_assess_packed,
@@ -102,7 +103,7 @@ def assess_all(
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
     """Fetch the names and the packed estimates of the logs of a machine."""
-    contents = dict(store.packed_identified(key for _, key in machine.logs))
+    contents = dict(store.identified(key for _, key in machine.logs))
     return tuple((log, contents[key]) for log, key in machine.logs if key in contents)
 
 
@@ -116,8 +117,7 @@ def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
 def pack_assessment(assessment: Assessment) -> PackedAssessment:
     """Encode an assessment for the store."""
     evidence = pack(FleetContribution(assessment.evidence, assessment.ended))
-    summary = pack(summarise(assessment, assessment.service()))
-    return PackedAssessment(pack(assessment), evidence, summary)
+    return PackedAssessment(pack(assessment), evidence)
 
 
 def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
@@ -125,11 +125,10 @@ def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
     machine, logs, known = job
 
     def work() -> PackedAssessment:
-        readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
-        before = unpack_or_none(known.get(key), LifeState)
+        readings, before = unpack_logs(logs), unpack_or_none(known, LifeState)
         how = {"epochs": machine.epochs, "seed": machine.seed}
         found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
-        parts = {} if after is None else {key: pack(after)}
+        parts = {} if after is None else {_life_key(machine.stage, machine.seed): pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
     return [reason_if_failed(work, machine.name, (CancelledError,))]

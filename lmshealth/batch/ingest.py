@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.store import Cached, Identified, Resources, Store
+from lmshealth.batch.store import Cached, Identified, Resources, Store, unpack_or_none
 from lmshealth.batch.workers import Pool, Threads, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
@@ -322,7 +322,9 @@ def _cached(
     """
     digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
     own = {task.key(digest): task for task in tasks for digest in digests}
-    for key, found in store.identified(own):
+    for key, content in store.identified(own):
+        if (found := unpack_or_none(content, Identified)) is None:
+            continue
         matching = _matching(stages, Metadata(stage=found.stage, description=found.asked))
         used = "" if matching is None else matching.digest
         is_late = isinstance(found.outcome, LogEstimates) and is_future(

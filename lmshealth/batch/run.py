@@ -413,7 +413,7 @@ def _report(
             if isinstance(output, str):
                 failed[name] = output
                 continue
-            store.publish(name, (keys[name], own_keys[name]), refused_key)
+            store.publish(name, (keys[name], own_keys[name]), output.summary, refused_key)
             tables[name] = output.tables
             excluded.update(output.excluded)
             made[name] = output.status

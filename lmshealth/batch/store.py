@@ -85,7 +85,7 @@ def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PackedAssessment:
-    """An assessment as bytes: as a whole, its evidence for a fleet prior, and its summary.
+    """An assessment as bytes: as a whole, and its evidence for a fleet prior.
 
     ``parts`` are those of its results that the next assessment may use, by key; None if all that
     are stored stay.
@@ -93,7 +93,6 @@ class PackedAssessment:
 
     content: bytes
     evidence: bytes
-    summary: bytes
     parts: dict[str, bytes] | None = None
 
 
@@ -112,11 +111,11 @@ class Published:
 
 @dataclass(frozen=True, slots=True)
 class _Report:
-    """Packed summary of a published assessment, its key, and its number for the machine."""
+    """Summary of a published assessment, its key, and its number for the machine."""
 
     key: str
     number: int
-    summary: bytes
+    summary: Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +165,8 @@ def default_url(folder: Path) -> URL:
     return URL.create("sqlite", database=str(path))
 
 
-_ASSESSMENT = "assessed", "evidence", "summary"
-"""Kinds of the values of an assessment: as a whole, its evidence for a fleet, its summary."""
+_ASSESSMENT = "assessed", "evidence"
+"""Kinds of the values of an assessment: as a whole, and its evidence for a fleet."""
 
 
 class Store:
@@ -297,15 +296,9 @@ class Store:
         """Store digests of the content of files."""
         self._put("hashed", {key: digest.encode() for key, digest in digests.items()})
 
-    def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
-        """Fetch the outcomes of those logs that are stored, under their names of that time."""
-        for key, content in self.packed_identified(keys):
-            if (found := unpack_or_none(content, Identified)) is not None:
-                yield key, found
-
-    def packed_identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Fetch the same as bytes, for `unpack_or_none` in a worker."""
-        yield from self._of_keys("identified", keys)
+    def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+        """Fetch the packed outcomes (`Identified`) of those logs that are stored, by their keys."""
+        return self._of_keys("identified", keys)
 
     def put_identified(self, outcomes: Mapping[str, bytes]) -> None:
         """Store packed outcomes of logs by their keys."""
@@ -327,9 +320,8 @@ class Store:
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine, and its parts in place of those stored before."""
-        contents = made.content, made.evidence, made.summary
         with self.transaction():
-            for kind, content in zip(_ASSESSMENT, contents, strict=True):
+            for kind, content in zip(_ASSESSMENT, (made.content, made.evidence), strict=True):
                 self._put(kind, {key: content}, machine)
             if made.parts is not None:
                 self._keep("parts", machine, made.parts)
@@ -339,18 +331,15 @@ class Store:
         """Store one more part of the last assessment of a machine."""
         self._put("parts", {key: content}, machine)
 
-    def part(self, machine: str, key: str) -> bytes | None:
-        """Fetch a part of the last assessment of a machine; None where it is not stored."""
-        return self._get("parts", key, machine)
+    def part(self, machine: str, key: str, *, after: str = "") -> bytes | None:
+        """Fetch a part of the last assessment of a machine; None where it is not stored.
 
-    def parts(self, machine: str, key: str = "") -> dict[str, bytes]:
-        """Fetch the parts of the last assessment of a machine, for the next one, by their keys.
-
-        There are none for one that was lost: from its own parts it would have other draws.
+        There is none for the assessment under the key ``after`` if that was the last and is lost:
+        from its own parts it would have other draws.
         """
-        if any(key in one.kept for one in self._decoded("present", Published, machine)):
-            return {}
-        return dict(self._all("parts", machine))
+        present = self._decoded("present", Published, machine) if after else []
+        is_lost = any(after in one.kept for one in present)
+        return None if is_lost else self._get("parts", key, machine)
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that were refused as a whole, and return its key."""
@@ -358,30 +347,26 @@ class Store:
         self._put("refused", {key: pack(refused)})
         return key
 
-    def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
+    def publish(self, machine: str, keys: Sequence[str], summary: Summary, refused: str) -> None:
         """Make an assessment the present one of a machine, and delete its other assessments.
 
         The keys are that of the assessment, and those of others of the machine that stay;
         ``refused`` is that of the list of logs that were refused as a whole.
         """
         key = keys[0]
-        summary = self._get("summary", key, machine)
         reports = self._decoded("reports", _Report, machine)
         number = 1 + max((one.number for one in reports), default=0)
         with self.transaction():
             present = Published(machine, key, refused, tuple(keys))
             self._put("present", {"": pack(present)}, machine)
-            if summary is not None:
-                self._put("reports", {key: pack(_Report(key, number, summary))}, machine)
+            self._put("reports", {key: pack(_Report(key, number, summary))}, machine)
             for kind in _ASSESSMENT:
                 self._keep(kind, machine, keys)
 
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
-        reports = (one for one in self._decoded("reports", _Report, machine) if one.key != key)
-        newest_first = sorted(reports, key=lambda one: one.number, reverse=True)
-        summaries = (unpack_or_none(one.summary, Summary) for one in newest_first)
-        return next((summary for summary in summaries if summary is not None), None)
+        reports = [one for one in self._decoded("reports", _Report, machine) if one.key != key]
+        return max(reports, key=lambda one: one.number).summary if reports else None
 
     def published(self) -> tuple[Published, ...]:
         """List the published assessments of all machines by name; `StoreError` if none is."""

@@ -9,6 +9,7 @@ from datetime import date
 from itertools import combinations, permutations, zip_longest
 from typing import TYPE_CHECKING
 
+from lmshealth._private.arrays import FloatArray
 from lmshealth._private.tables import TABLES, Row, spell
 from lmshealth.cli.terminal import (
     print_line,
@@ -20,7 +21,7 @@ from lmshealth.cli.terminal import (
 )
 from lmshealth.life.health import Health
 from lmshealth.machine.constants import RUL_LEVELS
-from lmshealth.machine.service import ProbabilityBounds, Service
+from lmshealth.machine.service import Service
 from lmshealth.machine.summary import Life, ParameterHealth, Summary
 from lmshealth.report import constants
 from lmshealth.report.tables import events_rows, to_rows, track_rows
@@ -448,7 +449,7 @@ def _travel_left(life: Life | None) -> str:
 
 
 def print_life(
-    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
+    life: Life, service: Service, before: tuple[date, FloatArray] | None = None
 ) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
@@ -483,7 +484,7 @@ def print_life(
 
 
 def _limit_cells(
-    life: Life, index: int, before: tuple[date, ProbabilityBounds] | None
+    life: Life, index: int, before: tuple[date, FloatArray] | None
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], RUL_LEVELS
@@ -501,8 +502,7 @@ def _limit_cells(
     yield (f"  beyond horizon: {probability(one.beyond_horizon)}",)
     if before is not None:
         asked, bounds = before
-        chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
-        yield (f"  before {asked}: {chance}",)
+        yield (f"  before {asked}: {probability_range(bounds[:, index].tolist())}",)
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:

@@ -18,11 +18,10 @@ from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undec
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import (
-    ProbabilityBounds,
     Service,
     day_after,
-    probability_before,
     remaining_days,
+    risk_before,
 )
 from lmshealth.stage.description import ParameterSpec, Stage
 
@@ -314,8 +313,7 @@ def _postponed(
     for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
         assert prognosis is not None
         if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
-            reached = probability_before(prognosis, day)
-            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
+            yield day, weeks or None, risk_before(prognosis, day)
 
 
 def summarise_life(
@@ -328,12 +326,12 @@ def summarise_life(
     limits = []
     for k, name in enumerate(prognosis.parameters):
         baseline = baselines.get(name, 1.0)
-        wait = _quantiles(days[:, k])
+        wait = quantiles(days[:, k])
         limits.append(
             LimitLife(
                 parameter=name,
                 limit=float(prognosis.limits[k]),
-                travel=_quantiles(travel[:, k]),
+                travel=quantiles(travel[:, k]),
                 days=wait,
                 dates=tuple(day_after(prognosis, one) for one in wait),
                 already_past=float(past[k]),
@@ -353,9 +351,10 @@ def summarise_life(
     )
 
 
-def _quantiles(values: FloatArray) -> tuple[float, ...]:
+def quantiles(
+    values: FloatArray, levels: tuple[float, ...] = constants.RUL_LEVELS
+) -> tuple[float, ...]:
     """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
-    levels = constants.RUL_LEVELS
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
 
 
@@ -395,7 +394,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
 
 
 def prognosis_rows(
-    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
+    life: Life, service: Service, before: tuple[date, FloatArray] | None = None
 ) -> list[Row]:
     """Return a remaining life, one row per limit and one for any, which has the service.
 
@@ -405,11 +404,8 @@ def prognosis_rows(
     of_any = (
         *(service.kind, service.by, service.risk, service.inspect_by),
         *(finite_or_none(service.inspect_every / _KM), service.earliest_end),
-        *(
-            (finite_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives)
-            if fleet
-            else [None] * 3
-        ),
+        finite_or_none(fleet.travel / _KM) if fleet else None,
+        *((fleet.coverage, fleet.n_lives) if fleet else (None, None)),
     )
     rows = []
     for j, one in enumerate(life.limits):
@@ -425,7 +421,7 @@ def prognosis_rows(
         )
         if before is not None:
             day, reached = before
-            at_least, at_most = reached.at_least[j], reached.at_most[j]
+            at_least, at_most = reached[:, j]
             row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows

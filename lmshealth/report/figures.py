@@ -22,8 +22,10 @@ from lmshealth.errors import BadQuestion
 from lmshealth.io.log import SI_UNITS, Log
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.constants import LEVELS
 from lmshealth.machine.service import Service
 from lmshealth.machine.status import chi_square_band
+from lmshealth.machine.summary import quantiles
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report import constants
@@ -35,7 +37,6 @@ from lmshealth.report.text import (
     fixed,
     km,
     moment,
-    quantiles,
     signed,
     spell,
     whole_km,
@@ -213,8 +214,6 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
     For two parameters: highest-density regions of 50 and 90 %, baseline, medians and marginal 90 %
     intervals (bars along the axes). For one parameter: its density.
     """
-    if len(parameters) not in (1, 2):
-        raise ValueError(f"cannot plot {len(parameters)} parameters; needed are 1 or 2")
     columns = [health.parameters.index(name) for name in parameters]
     draws = 100 * health.samples[-1][:, columns]
     draws = draws[np.isfinite(draws).all(axis=1)]
@@ -251,13 +250,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     return odometer(ax)
 
 
-def plot_life(
-    ax: Axes,
-    prognosis: Prognosis,
-    parameter: str,
-    *,
-    baseline: float = 1.0,
-) -> Axes:
+def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float = 1.0) -> Axes:
     """Plot a parameter since the baseline and up to the horizon, by its laws.
 
     The bar on the limit is the 90 % interval of its first passage. `baseline` is the value of the
@@ -271,12 +264,11 @@ def plot_life(
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label=tr("now"))
     end = now + prognosis.horizon / _KM
-    low, middle, high = np.array(quantiles(prognosis.remaining[:, column])) / _KM
+    low, middle, high = np.array(quantiles(prognosis.remaining[:, column], LEVELS)) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
         _passage(ax, now, np.array([low, middle, high]), 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
-    shown = right >= 0.55 * end
-    if shown:
+    if shown := right >= 0.55 * end:
         right = end
         ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label=tr("horizon"))
     left = min(float(travel.min()), now)
@@ -320,32 +312,20 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     ax.plot(ahead, chance_left(left[:, -1], ahead), color=BLUE, lw=2.2, label=label)
     some = np.linspace(0, end, 25)
     chance = chance_left(left[:, -1], some)
-    pairs = zip(_KM * some, chance, strict=True)
-    hints(
-        ax,
-        some,
-        chance,
-        [
-            tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%")
-            for x, y in pairs
-        ],
-    )
+    texts = [
+        tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%")
+        for x, y in zip(_KM * some, chance, strict=True)
+    ]
+    hints(ax, some, chance, texts)
     if service is not None and service.kept_risk is not None:
-        risk = decimal(f"{100 * service.kept_risk:.3g}")
-        accepted, cheapest = (
-            tr("accepted risk {risk} %", risk=risk),
-            tr("risk at least cost {risk} %", risk=risk),
-        )
-        label = accepted if service.max_risk else cheapest
+        label = tr("risk at least cost {risk} %") if service.cost_ratio else tr("accepted risk {risk} %")
+        label = label.format(risk=decimal(f"{100 * service.kept_risk:.3g}"))
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     grouped(ax)
-    ax.set_xlabel(
-        tr("travel from now in km (ends at the horizon)")
-        if end == horizon
-        else tr("travel from now in km")
-    )
+    whole = tr("travel from now in km (ends at the horizon)")
+    ax.set_xlabel(whole if end == horizon else tr("travel from now in km"))
     ax.set_ylabel(tr("probability in %"))
     return legend(ax)
 
@@ -376,12 +356,10 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     right = where[2] if np.isfinite(where[2]) else 1e9  # beyond the figure
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
-        ax.plot(
-            where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label=tr("limit reached")
-        )
-    for x, far, name in zip(
-        where, ahead, (tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")), strict=True
-    ):
+        style: Any = {"color": RED, "mec": PAPER, "ms": 6, "zorder": 5}
+        ax.plot(where[1], level, "D", label=tr("limit reached"), **style)
+    names = tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")
+    for x, far, name in zip(where, ahead, names, strict=True):
         if np.isfinite(x):
             ahead_, at = km(_KM * far), whole_km(_KM * x)
             text = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
@@ -606,9 +584,7 @@ def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     k = track.modes.index(mode)
     x = along(track)
     _filtered(ax, x, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
-    names = {
-        kind: tr(words) for kind, words in _WORDS.items()
-    }  # each kind has one entry in the legend
+    names = {kind: tr(words) for kind, words in _WORDS.items()}  # each in the legend once
     own = (step for step in track.steps if step.mode in ("", mode))
     for kind, first in dict.fromkeys((step.kind, step.first) for step in own):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}

@@ -22,7 +22,7 @@ from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summa
 from lmshealth.report import figures, tables
 from lmshealth.report.language import decimal, tr
 from lmshealth.report.rendering import render
-from lmshealth.report.text import reason, spell
+from lmshealth.report.text import spell
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
 
@@ -263,7 +263,7 @@ def plot_spectra(
                 middle, *(fit * range_), **style, label=tr("95 % range of the data, by the fit")
             )
         label = figures.plain_label(name) + ("\n" + tr("(2nd derivative)") if derived else "")
-        label += f"\n({reason(refused[name])})" if name in refused else ""
+        label += f"\n({tr(refused[name])})" if name in refused else ""
         _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, own)
     for k, values in enumerate(singular):
@@ -467,7 +467,7 @@ def _annotate(
             for ax in panels:
                 ax.axvline(refused, **style, label=tr("refused, or not found"))
             labels.append(
-                (refused, f"{spell(refusal.mode)}\n{reason(refusal.reason)}", figures.RED)
+                (refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", figures.RED)
             )
     panels[-1].set_xlabel(tr("frequency in Hz"))
     panels[-1].set_xlim(*band)
@@ -524,7 +524,7 @@ def _notes(modes: Modes) -> list[str]:
             tr(
                 "{what} refused, {reason}: {detail}",
                 what=what,
-                reason=reason(refusal.reason),
+                reason=tr(refusal.reason),
                 detail=refusal.detail,
             )
         )

@@ -97,7 +97,8 @@ def put_in(store: Store, key: str, outcome: Outcome) -> None:
 
 def got_from(store: Store, key: str, log: str) -> Outcome | None:
     """Fetch what became of a log, under its present name."""
-    return next((found.renamed(log).outcome for _, found in store.identified([key])), None)
+    found = (unpack_or_none(content, Identified) for _, content in store.identified([key]))
+    return next((one.renamed(log).outcome for one in found if one is not None), None)
 
 
 @pytest.fixture
@@ -412,8 +413,8 @@ def test_a_lost_assessment_is_made_from_nothing(file_url: str, tmp_path: Path) -
     with closing(Store(file_url)) as store:
         keep(store, "A", "k1", worn(tmp_path))
         store.put_part("A", "p", b"part")
-        assert store.parts("A", "k2") == {"p": b"part"}
-        assert store.parts("A", "k1") == {}
+        assert store.part("A", "p", after="k2") == b"part"
+        assert store.part("A", "p", after="k1") is None
 
 
 def test_one_run_at_a_time_is_alone(url: str) -> None:
@@ -463,7 +464,8 @@ def test_a_store_in_a_read_only_folder_is_read(
 def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
     """Store an assessment as a run does, and publish it."""
     store.put_assessment(machine, key, pack_assessment(assessment))
-    store.publish(machine, [key], store.put_refused(()))
+    summary = summarise(assessment, assessment.service())
+    store.publish(machine, [key], summary, store.put_refused(()))
 
 
 def recall(store: Store, machine: str, key: str) -> Assessment | None:
@@ -500,12 +502,13 @@ def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> No
 
 def test_only_the_published_assessment_and_its_source_are_kept(url: str, tmp_path: Path) -> None:
     """Publishing deletes the other assessments of the same machine, not of others."""
-    one = pack_assessment(worn(tmp_path))
+    made = worn(tmp_path)
+    one, summary = pack_assessment(made), summarise(made, made.service())
     with closing(Store(url)) as store:
         for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
             store.put_assessment(machine, key, one)
         assert store.has_assessment("A", "k1")
-        store.publish("A", ["k3", "k2"], "")
+        store.publish("A", ["k3", "k2"], summary, "")
         assert [store.has_assessment("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
         assert store.assessment("A", "k1") is None
         assert store.has_assessment("B", "k1")
@@ -534,11 +537,12 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
     """A later run replaces what an earlier one refused, where it published the same machines."""
     one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
+    summary = summarise(worn(tmp_path), worn(tmp_path).service())
     with closing(Store(url)) as store:
 
         def publish(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
             for machine in machines:
-                store.publish(machine, ["k1"], store.put_refused(refused))
+                store.publish(machine, ["k1"], summary, store.put_refused(refused))
             return store.refused(one.refused for one in store.published())
 
         assert publish("ABC", ()) == ()
@@ -605,7 +609,6 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
         assert recall(store, "B", "k1") is None
         assert store.part("A", "p") is not None
         assert store.part("B", "p") is None
-        assert store.parts("B") == {}
         assert store.previous_summary("A", "k2") is not None
         assert store.previous_summary("B", "k2") is None
 
@@ -632,14 +635,15 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
 @pytest.mark.slow
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
     """Of many threads that write and publish the same, none fails and nothing is doubled."""
-    made = pack_assessment(worn(tmp_path))
+    one = worn(tmp_path)
+    made, summary = pack_assessment(one), summarise(one, one.service())
 
     def write(_: int) -> None:
         with closing(Store(url)) as store:
             for number in range(5):
                 put_in(store, f"k{number}", reading())
             store.put_assessment("A", "k1", made)
-            store.publish("A", ["k1"], store.put_refused(()))
+            store.publish("A", ["k1"], summary, store.put_refused(()))
 
     with ThreadPoolExecutor(6) as threads:
         list(threads.map(write, range(12)))
