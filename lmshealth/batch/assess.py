@@ -86,7 +86,6 @@ def assess_all(
 
     assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
         function=_assess_packed,
-        on_crash=lambda _, why: [why],
         key=lambda one: fingerprint(one.name, one.key),
         fetch=fetch,
         job=job,
@@ -168,7 +167,6 @@ def apply_fleet_priors(
 
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
         function=_update,
-        on_crash=lambda _, why: [why],
         key=lambda one: one[1],
         fetch=fetch,
         job=job,

@@ -283,7 +283,6 @@ def _all_digests(
 
     hashing: Cached[Path, tuple[Path, ...], str | BadLog] = Cached(
         function=_digests,
-        on_crash=lambda paths, why: [],  # a thread has none
         key=lambda path: files[path][0],
         fetch=fetch,
         job=tuple,

@@ -32,7 +32,7 @@ from lmshealth.batch.assess import (
     reason_if_failed,
     unpack_logs,
 )
-from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
+from lmshealth.batch.ingest import NOT_LISTED, Settings, ingest
 from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -245,33 +245,46 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         judging = _judging(store, settings)
-        done, made, tables, excluded = _report(usable, refused, resources, out, judging)
+        rows, lacking, made = _report(usable, refused, resources, out, judging)
+        present = {name: output.status for name, output in made.items()}
+        tables = {name: output.tables for name, output in made.items()}
         with store.alone():  # a run that ends before its tables are written has announced nothing
-            statuses, changes, notes = announce(store, made, judging.moment, settings.alerts, scope)
+            found = announce(store, present, judging.moment, settings.alerts, scope)
+            statuses, changes, notes = found
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
             with in_language(settings.language):
-                write_index(out, done.rows, refused, today=judging.moment.date())
+                write_index(out, rows, refused, today=judging.moment.date())
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
-    counted, lost = _counted(done, ingested, refused, excluded)
+    excluded = {log for output in made.values() for log in output.excluded}
+    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
+    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
+    lost = (others - copies | excluded) & ingested.logs
+    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
             f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
-    return replace(
-        counted,
-        failed=failed | done.failed,
+    return RunResult(
+        index=out / "index.html",
+        rows=rows,
+        failed=failed | lacking,
+        n_logs=len(ingested.logs - copies),
+        n_refused=len(lost),
+        n_remembered=ingested.n_cached,
+        n_unlisted=len(unlisted),
+        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
         statuses=statuses,
         changes=tuple(changes),
         unsent=unsent,
-        notes=(*counted.notes, *notes),
+        notes=(*misspelt, *notes),
     )
 
 
@@ -339,26 +352,6 @@ def _prepare(out: Path) -> None:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
 
 
-def _counted(
-    result: RunResult, ingested: Ingested, refused: Sequence[Refusal], excluded: set[str]
-) -> tuple[RunResult, set[str]]:
-    """Add counts and notes to a result; return the logs that were refused as a whole too."""
-    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
-    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
-    lost = (others - copies | excluded) & ingested.logs
-    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
-    counted = replace(
-        result,
-        n_logs=len(ingested.logs - copies),
-        n_refused=len(lost),
-        n_remembered=ingested.n_cached,
-        n_unlisted=len(unlisted),
-        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
-        notes=(*result.notes, *misspelt),
-    )
-    return counted, lost
-
-
 def _others(folder: Path, logs: frozenset[str]) -> str:
     """Return the suffixes of the files of a folder without logs."""
     if logs:
@@ -390,18 +383,17 @@ def _report(
     resources: Resources,
     out: Path,
     judging: Judging,
-) -> tuple[RunResult, dict[str, Status], dict[str, dict[str, bytes]], set[str]]:
-    """Write pages; return the result without counts, statuses, packed tables, and excluded logs.
+) -> tuple[tuple[Summary, ...], dict[str, str], dict[str, MachineOutput]]:
+    """Write pages; return summaries, why machines have none, and all outputs without their pages.
 
     Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
     refused_key, lost = store.put_refused(tuple(refused)), _lost_of(refused)
-    rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
+    rows, made = dict[str, Summary](), dict[str, MachineOutput]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    tables = dict[str, dict[str, bytes]]()
     left = list(machines)
     for attempt in range(constants.ASSESSMENT_ATTEMPTS):
         if attempt:
@@ -414,21 +406,14 @@ def _report(
                 failed[name] = output
                 continue
             store.publish(name, (keys[name], own_keys[name]), output.summary, refused_key)
-            tables[name] = output.tables
-            excluded.update(output.excluded)
-            made[name] = output.status
+            made[name] = replace(output, page="")
             rows[name] = judging.write(output, out / files[name])
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    result = RunResult(
-        index=out / "index.html",
-        rows=tuple(by_urgency(rows.values())),
-        failed=not_updated | unread | failed,
-    )
-    return result, made, tables, excluded
+    return tuple(by_urgency(rows.values())), not_updated | unread | failed, made
 
 
 def _outputs(
@@ -464,7 +449,6 @@ def _outputs(
 
     drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
         function=output_or_reason,
-        on_crash=lambda _, why: [why],
         key=lambda machine: own[machine.name],
         fetch=fetch,
         job=job,

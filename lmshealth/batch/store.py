@@ -564,15 +564,16 @@ class Cached(Generic[Piece, Job, Value]):
     ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` yields
     those pieces whose value is in the store, with it. Of the others a run claims some, at most
     ``most`` at a time, and makes a ``job`` of those that it gets, of which a worker computes the
-    function: a list of their values. ``on_crash`` makes that of a job that ends its worker.
+    function: a list of their values. ``on_crash`` makes that of a job that ends its worker; by
+    default it is the reason.
     """
 
     function: Task[Job, Sequence[Value]]
-    on_crash: OnCrash[Job, Sequence[Value]]
     key: Callable[[Piece], str]
     fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]]
     job: Callable[[Sequence[Piece]], Job]
     most: int = 1
+    on_crash: OnCrash[Job, Any] = lambda _, why: [why]
 
     def values(
         self, pieces: Sequence[Piece], resources: Resources

@@ -46,19 +46,8 @@ def readable(text: str) -> str:
     return text.encode(_charset(), _ERRORS).decode(_charset())
 
 
-def is_unicode() -> bool:
-    """Return whether standard output encodes all characters."""
-    return codecs.lookup(_charset()).name.startswith("utf")
-
-
 def _charset() -> str:
     return getattr(sys.stdout, "charset", None) or sys.stdout.encoding or "utf-8"
-
-
-def _lost() -> OSError | None:
-    """Return why standard output takes no more, if it does not."""
-    found: OSError | None = getattr(sys.stdout, "lost", None)
-    return found
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:
@@ -139,7 +128,7 @@ def standard_streams() -> Iterator[None]:
         yield
     except SystemExit as end:
         sys.stdout.flush()
-        error = _lost()
+        error: OSError | None = getattr(sys.stdout, "lost", None)
         if error is None:
             raise
         if error.errno != errno.EPIPE:  # of `| head`, which has read what it needs
@@ -188,7 +177,7 @@ def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
     # msgspec writes null for NaN and infinity.
     encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
     text = msgspec.json.format(encoded, indent=indent).decode()
-    if not is_unicode():
+    if not codecs.lookup(_charset()).name.startswith("utf"):
         text = re.sub(r"[^\0-\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
     click.echo(text)
 
@@ -237,14 +226,11 @@ def _wrapped(text: str, width: int, indent: str = "", *, fold: bool = True) -> I
 
 def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons, and apart from them warnings about what is used."""
+    # Whole logs are refused for the same reasons as parts, without a channel.
+    parts = [row["reason"] in WARNINGS and bool(row["channel"]) for row in rows]
     for title, in_part in (("Refused", False), ("Used in part", True)):
-        if own := [row for row in rows if _is_warning(row) == in_part]:
+        if own := [row for row, is_part in zip(rows, parts, strict=True) if is_part == in_part]:
             print_view(title, "refused", short_names(own))
-
-
-def _is_warning(row: Row) -> bool:
-    # Whole logs are refused for the same reasons, without a channel.
-    return row["reason"] in WARNINGS and bool(row["channel"])
 
 
 @dataclass(frozen=True, slots=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
-from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -481,14 +480,10 @@ def compare(
     changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
     changes += _transitions(before, now)
-    severity = partial(_severity, now=now)
-    return now, [Change(now.stage, *one, now.recorded_at, severity(one[0])) for one in changes]
-
-
-def _severity(what: str, now: Status) -> Severity:
-    """Return the severity of a change; of a verdict by what it is now."""
-    calm = what == "verdict" and not _is_loss(_at_last_log(now))
-    return CHANGES["verdict, no loss" if calm else what][0]
+    severities = {what: severity for what, (severity, _) in CHANGES.items()}
+    if not _is_loss(_at_last_log(now)):
+        severities["verdict"] = severities["verdict, no loss"]
+    return now, [Change(now.stage, *one, now.recorded_at, severities[one[0]]) for one in changes]
 
 
 def _detail(code: str, now: Status) -> str:

@@ -276,6 +276,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     words = degraded_words(judgement.verdict)
     lost = [spec.name for spec in assessment.stage.parameters if spec.word in words]
+    modes, deviates = assessment.track.modes if assessment.track else (), (*assessment.left_out,)
+    if set(modes) == {*deviates}:
+        deviates = ("all",)
     return Summary(
         file=file,
         identity=judgement.stage,
@@ -295,15 +298,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
         step=next_step(assessment, service),
-        deviates=_deviating(assessment) if judgement.probability >= 0 else (),
+        deviates=deviates if judgement.probability >= 0 else (),
         postponed=tuple(_postponed(prognosis, service)),
     )
-
-
-def _deviating(assessment: Assessment) -> tuple[str, ...]:
-    """Return the modes in which the last logs are left out as `Summary` has them."""
-    modes = assessment.track.modes if assessment.track else ()
-    return ("all",) if set(modes) == assessment.left_out.keys() else (*assessment.left_out,)
 
 
 def _postponed(

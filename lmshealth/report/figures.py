@@ -28,19 +28,9 @@ from lmshealth.machine.status import chi_square_band
 from lmshealth.machine.summary import quantiles
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.report import constants
+from lmshealth.report import constants, text
 from lmshealth.report.language import decimal, language, mark, tr
-from lmshealth.report.text import (
-    GAP,
-    covariate,
-    ends,
-    fixed,
-    km,
-    moment,
-    signed,
-    spell,
-    whole_km,
-)
+from lmshealth.report.text import GAP, spell
 from lmshealth.tracking.covariate_effects import CovariateEffect
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import Track
@@ -116,14 +106,11 @@ def _compact(text: str) -> str:
     text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
     text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
     # Successive equal markers share their style.
-    text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
+    runs = r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+'
+    text = re.sub(runs, lambda m: f"<g {m[1]}>\n{m[0].replace(f' {m[1]}', '')}</g>\n", text)
     used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
     return re.sub(r"<g>\n(<(?:use|path) [^>]*/>)\n</g>", r"\1", text)
-
-
-def _once(found: re.Match[str]) -> str:
-    return f"<g {found[1]}>\n{found[0].replace(f' {found[1]}', '')}</g>\n"
 
 
 def print_figure(
@@ -234,11 +221,11 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     name = tr("health by all logs") if informed else tr("mostly prior, not measured")
     _bands(ax, health.travel / _KM, bands, name, informed=informed)
     if informed:  # else no values are published
-        texts = [
-            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {fixed(q[2], 1)}{GAP}%, "
-            f"90{GAP}%: {ends(fixed(q[0], 1), fixed(q[4], 1))}{GAP}%"
-            for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
-        ]
+        texts = []
+        for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True):
+            least, _, median, _, most = (text.fixed(one, 1) for one in q)
+            own = f"{spell(parameter)} {median}{GAP}%, 90{GAP}%: {text.ends(least, most)}{GAP}%"
+            texts.append(f"{text.moment(when)}, {text.whole_km(travel)}\n{own}")
         hints(ax, health.travel / _KM, bands[2], texts)
     _levels(ax, limit)
     # Show bands up to 250 %, baseline and limit.
@@ -277,9 +264,8 @@ def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float
     ax.set_ylabel(tr("% of baseline"))
     odometer(ax)
     if not shown:
-        ax.set_xlabel(
-            tr("odometer in km (horizon at {distance}, not shown)", distance=whole_km(_KM * end))
-        )
+        label = tr("odometer in km (horizon at {distance}, not shown)")
+        ax.set_xlabel(label.format(distance=text.whole_km(_KM * end)))
     return ax
 
 
@@ -313,13 +299,17 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     some = np.linspace(0, end, 25)
     chance = chance_left(left[:, -1], some)
     texts = [
-        tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%")
+        tr("after {distance}: {share}", distance=text.whole_km(x), share=f"{y:.0f}{GAP}%")
         for x, y in zip(_KM * some, chance, strict=True)
     ]
     hints(ax, some, chance, texts)
     if service is not None and service.kept_risk is not None:
-        label = tr("risk at least cost {risk} %") if service.cost_ratio else tr("accepted risk {risk} %")
-        label = label.format(risk=decimal(f"{100 * service.kept_risk:.3g}"))
+        cheapest, risk = (
+            tr("risk at least cost {risk} %"),
+            decimal(f"{100 * service.kept_risk:.3g}"),
+        )
+        label = cheapest if service.cost_ratio else tr("accepted risk {risk} %")
+        label = label.format(risk=risk)
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
@@ -361,9 +351,9 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     names = tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")
     for x, far, name in zip(where, ahead, names, strict=True):
         if np.isfinite(x):
-            ahead_, at = km(_KM * far), whole_km(_KM * x)
-            text = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
-            hints(ax, np.array([x]), np.array([level]), [text])
+            ahead_, at = text.km(_KM * far), text.whole_km(_KM * x)
+            hint = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
+            hints(ax, np.array([x]), np.array([level]), [hint])
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
@@ -621,9 +611,9 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
         f"{title(track, k)}\n"
         + tr(
             "NIS {value}; expected {low} to {high}",
-            value=fixed(value, 1),
-            low=fixed(a, 1),
-            high=fixed(b, 1),
+            value=text.fixed(value, 1),
+            low=text.fixed(a, 1),
+            high=text.fixed(b, 1),
         )
         for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
     ]
@@ -693,13 +683,13 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     ax.plot(grid, line, color=BLUE, lw=1.6, label=tr("effect"))
     ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label=tr("as measured"))
     ax.plot(x, after, "o", color=INK, ms=2.8, label=tr("corrected"))
-    name, unit = covariate(influence.covariate)
+    name, unit = text.covariate(influence.covariate)
     texts = [
         f"{title(history, k)}\n{name} {decimal(f'{value:.4g}')}{GAP}{unit}\n"
         + tr(
             "as measured {before}, corrected {after}",
-            before=f"{signed(a, 2)}{GAP}%",
-            after=f"{signed(b, 2)}{GAP}%",
+            before=f"{text.signed(a, 2)}{GAP}%",
+            after=f"{text.signed(b, 2)}{GAP}%",
         )
         for k, value, a, b in zip(epochs, x, before, after, strict=True)
     ]
@@ -721,7 +711,7 @@ def _logs(
     style: Any = {"fmt": "o", "ms": 3, "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
     ax.errorbar(x, bounds[1], np.diff(bounds, axis=0), label=tr("each log, ±2σ"), **style)
     texts = [
-        f"{title(history, k)}\n{fixed(value, 2)} ± {fixed(value * std[k], 2)}{GAP}{name}"
+        f"{title(history, k)}\n{text.fixed(value, 2)} ± {text.fixed(value * std[k], 2)}{GAP}{name}"
         for k, value in zip(seen.tolist(), bounds[1], strict=True)
     ]
     hints(ax, x, bounds[1], texts)
@@ -730,7 +720,7 @@ def _logs(
 
 def title(lives: History | Track, k: int) -> str:
     """Return name, time and odometer of a log, for hints."""
-    return f"{lives.logs[k]}\n{moment(lives.recorded_at[k])}, {whole_km(lives.travel[k])}"
+    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}, {text.whole_km(lives.travel[k])}"
 
 
 def _filtered(ax: Axes, x: FloatArray, level: FloatArray, std: FloatArray, unit: float) -> None:
@@ -784,7 +774,7 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     texts = []
     for k, ln_f in enumerate(history.ln_frequency):
         lines = [
-            f"{spell(history.series[i].mode)} {fixed(np.exp(ln_f[i]), 2)}{GAP}Hz"
+            f"{spell(history.series[i].mode)} {text.fixed(np.exp(ln_f[i]), 2)}{GAP}Hz"
             for i in np.flatnonzero(np.isfinite(ln_f))
         ]
         texts.append("\n".join([title(history, k), *lines]))
@@ -809,7 +799,7 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
             + tr(
                 "{name} at {frequency}, {amplitude} in {channel}",
                 name=name,
-                frequency=f"{fixed(line.frequency, 2)}{GAP}Hz",
+                frequency=f"{text.fixed(line.frequency, 2)}{GAP}Hz",
                 amplitude=f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}",
                 channel=line.channel,
             )

@@ -466,9 +466,7 @@ def _annotate(
             style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
                 ax.axvline(refused, **style, label=tr("refused, or not found"))
-            labels.append(
-                (refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", figures.RED)
-            )
+            labels.append((refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", figures.RED))
     panels[-1].set_xlabel(tr("frequency in Hz"))
     panels[-1].set_xlim(*band)
     if band[1] > WIDE * band[0] > 0:

@@ -20,9 +20,9 @@ from lmshealth.report.language import (
     mark_either,
     sentence,
     tr,
+    tr_day,
     tr_either,
 )
-from lmshealth.report.language import tr_day as day
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
@@ -34,6 +34,8 @@ GAP = "\u202f"  # narrow no-break space between a number and its unit, and betwe
 _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB", "percent": "%"}
 
 Number = float | np.floating[Any]
+
+day = tr_day  # of a date, or of a moment
 
 # Names in the shipped descriptions, and of covariates.
 _NAMES = (

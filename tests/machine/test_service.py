@@ -256,9 +256,7 @@ def test_a_day_that_is_past_has_what_is_reached_already() -> None:
     """The probability before the last log is that of having passed the limit."""
     prognosis = make_prognosis(np.r_[-1e5, -1.0, 1e6, 2e6], np.full(4, 1e4))
     for day in (START.date(), date(2020, 1, 1)):
-        assert (
-            probability_before(prognosis, day)[0, -1] == prognosis.already_past()[-1] == 0.5
-        )
+        assert probability_before(prognosis, day)[0, -1] == prognosis.already_past()[-1] == 0.5
 
 
 def test_without_a_prognosis_the_service_is_unknown() -> None:

@@ -59,8 +59,8 @@ def assess_and_report(
     with processes(workers) as pool:
         resources = Resources(store, pool, progress)
         assert not assess_all(machines, resources)
-        result, *_ = running._report(machines, (), resources, out, running._judging(store))
-    assert not result.failed
+        _, failed, _ = running._report(machines, (), resources, out, running._judging(store))
+    assert not failed
 
 
 def run_with(
