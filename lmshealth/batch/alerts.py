@@ -61,11 +61,7 @@ def last_number(store: Store) -> int:
 
 
 def announce(
-    store: Store,
-    made: Mapping[str, Status],
-    moment: datetime,
-    alerts: Alerts,
-    scope: Scope,
+    store: Store, made: Mapping[str, Status], moment: datetime, alerts: Alerts, scope: Scope
 ) -> tuple[tuple[Status, ...], list[Change], list[str]]:
     """Compare all machines of a folder of logs with what was announced, and queue their changes.
 

@@ -166,10 +166,7 @@ def apply_fleet_priors(
         )
 
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
-        function=_update,
-        key=lambda one: one[1],
-        fetch=fetch,
-        job=job,
+        function=_update, key=lambda one: one[1], fetch=fetch, job=job
     )
     for k, ([(one, made)], is_new) in enumerate(updating.values(updates, resources), start=1):
         machine, key, *_ = one

@@ -448,10 +448,7 @@ def _outputs(
         return record(machine, packed_logs(machine, store))
 
     drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
-        function=output_or_reason,
-        key=lambda machine: own[machine.name],
-        fetch=fetch,
-        job=job,
+        function=output_or_reason, key=lambda machine: own[machine.name], fetch=fetch, job=job
     )
     for [(machine, drawn)], is_new in drawing.values(machines, resources):
         name = machine.name

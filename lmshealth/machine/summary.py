@@ -17,12 +17,7 @@ from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import (
-    Service,
-    day_after,
-    remaining_days,
-    risk_before,
-)
+from lmshealth.machine.service import Service, day_after, remaining_days, risk_before
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[

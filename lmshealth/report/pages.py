@@ -47,12 +47,7 @@ _MARK = "<!--day-->"  # no other comment is in a page: everything else is escape
 _SIZES = {"waterfall": (4.5, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
-def make_page(
-    assessment: Assessment,
-    summary: Summary,
-    *,
-    before: Summary | None = None,
-) -> str:
+def make_page(assessment: Assessment, summary: Summary, *, before: Summary | None = None) -> str:
     """Make the page of one machine (HTML), with marks that `date_page` replaces.
 
     Parameters

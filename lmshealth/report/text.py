@@ -14,15 +14,7 @@ import numpy as np
 
 from lmshealth._private import tables
 from lmshealth.report import constants
-from lmshealth.report.language import (
-    decimal,
-    mark,
-    mark_either,
-    sentence,
-    tr,
-    tr_day,
-    tr_either,
-)
+from lmshealth.report.language import decimal, mark, mark_either, sentence, tr, tr_day, tr_either
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
