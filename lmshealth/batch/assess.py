@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, unexpected
@@ -35,7 +35,9 @@ PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
 
 _Job = tuple["Machine", PackedLogs, bytes | None]  # with a packed `LifeState`
-_Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]  # with its key
+# With the key of the result; without a prior the prognosis is calibrated by ended lives.
+_Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]
+_UpdateJob = tuple[_Update, bytes | None, bytes | None]  # packed assessment and `LifeState`
 
 Part = TypeVar("Part")
 
@@ -154,16 +156,9 @@ def apply_fleet_priors(
         return ((one, None) for one in of_part if store.has_assessment(one[0].name, one[1]))
 
     def job(part: Sequence[_Update]) -> _UpdateJob:
-        [(machine, key, prior, ended)] = part
-        return _UpdateJob(
-            machine=machine.name,
-            key=key,
-            content=store.assessment(machine.name, machine.key),
-            life=store.part(machine.name, _life_key(machine.stage, machine.seed)),
-            epochs=machine.epochs,
-            prior=prior,
-            ended=ended,
-        )
+        [one] = part
+        name, life_key = one[0].name, _life_key(one[0].stage, one[0].seed)
+        return one, store.assessment(name, one[0].key), store.part(name, life_key)
 
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
         function=_update, key=lambda one: one[1], fetch=fetch, job=job
@@ -205,33 +200,22 @@ def _machines_to_update(
             yield from ((fleet[m], None, tuple(ended)) for m in evidence if m not in priors)
 
 
-class _UpdateJob(NamedTuple):
-    """What is needed to recompute the prognosis of a machine, and the key of the result."""
-
-    machine: str
-    key: str
-    content: bytes | None  # packed assessment by the description
-    life: bytes | None  # packed `LifeState`
-    epochs: int
-    prior: FleetPrior | None  # None where the prognosis is calibrated instead
-    ended: tuple[EndedLife, ...]
-
-
 def _update(job: _UpdateJob) -> list[PackedAssessment | str | None]:
     """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
+    (machine, _, prior, ended), content, life = job
 
     def work() -> PackedAssessment | None:
-        found: Assessment | None = unpack_or_none(job.content, Assessment)
+        found: Assessment | None = unpack_or_none(content, Assessment)
         if found is None or found.track is None:
             return None
-        if job.prior is None:
+        if prior is None:
             is_open = found.prognosis is None
-            return None if is_open else pack_assessment(with_calibration(found, job.ended))
-        before = unpack_or_none(job.life, LifeState)
-        made = with_fleet_prior(found, job.prior, epochs=job.epochs, before=before)
+            return None if is_open else pack_assessment(with_calibration(found, ended))
+        before = unpack_or_none(life, LifeState)
+        made = with_fleet_prior(found, prior, epochs=machine.epochs, before=before)
         return pack_assessment(made)
 
-    return [reason_if_failed(work, job.machine)]
+    return [reason_if_failed(work, machine.name)]
 
 
 def reason_if_failed(

@@ -120,25 +120,18 @@ class _ProcessPool(Pool):
                 first.result()
                 return
             except BrokenExecutor:
-                self.kill()
+                self.close(kill=True)
             except BaseException:
-                self.kill()
+                self.close(kill=True)
                 raise
         found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
         raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 
-    def kill(self) -> None:
-        """End all processes at once, whatever they are doing."""
-        self._end(kill_workers=True)
-
-    def close(self) -> None:
-        """Wait for the tasks that are running, and end the processes."""
-        self._end()
-
-    def _end(self, **how: bool) -> None:
+    def close(self, *, kill: bool = False) -> None:
+        """End all processes, after the tasks that are running, or at once."""
         if self._n_started:
             self._n_started = 0
-            self.executor.shutdown(**how)
+            self.executor.shutdown(kill_workers=kill)
             self._open_end.close()
 
     def map_unordered(
@@ -162,7 +155,7 @@ class _ProcessPool(Pool):
                 return
             # One of these items ended its process, and with it the pool. Each is run again alone,
             # so that only that one is lost.
-            self.kill()
+            self.close(kill=True)
             self.start(len(first))
             with _process_pool(1) as single:
                 for item in interrupted:
@@ -179,7 +172,7 @@ class _ProcessPool(Pool):
                 result: Result = self.executor.submit(function, item).result()
                 return result
             except BrokenExecutor:
-                self.kill()
+                self.close(kill=True)
         ended = f"the process that worked on it alone ended {constants.ATTEMPTS_ALONE} times"
         return on_crash(item, ended)
 
@@ -216,7 +209,7 @@ def _process_pool(size: int) -> Iterator[_ProcessPool]:
         try:
             yield pool
         except BaseException:
-            pool.kill()
+            pool.close(kill=True)
             raise
         pool.close()
 

@@ -273,23 +273,19 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         title = "Standard deviation of the parameters"
         print_view(title, "stage_parameters", parameters, "identifiability")
         print_text(TABLES["stage_parameters"].legend.format_map(stage))
-        _print_sensitivities(content)
+        modes: dict[str, dict[str, str]] = {}
+        for row in content["sensitivities"]:
+            ends = [text.number(row[key], 2) for key in ("at_baseline", "at_limits")]
+            own = modes.setdefault(row["mode"], {"mode": row["mode"]})
+            own[row["parameter"]] = " → ".join(ends)
+        title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
+        print_table(title, list(modes.values()))
+        for row in content["correlations"]:
+            pair = f"{row['parameter_a']} and {row['parameter_b']}"
+            print_line(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
+        print_line("")
     for row in content["findings"]:
         print_text(row["text"], "+ " if row["good"] else "! ")
-
-
-def _print_sensitivities(content: dict[str, list[Row]]) -> None:
-    modes: dict[str, dict[str, str]] = {}
-    for row in content["sensitivities"]:
-        ends = [text.number(row[key], 2) for key in ("at_baseline", "at_limits")]
-        own = modes.setdefault(row["mode"], {"mode": row["mode"]})
-        own[row["parameter"]] = " → ".join(ends)
-    title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
-    print_table(title, list(modes.values()))
-    for row in content["correlations"]:
-        pair = f"{row['parameter_a']} and {row['parameter_b']}"
-        print_line(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
-    print_line("")
 
 
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
@@ -326,11 +322,6 @@ def print_track(track: Track) -> None:
     print_view(title, "track", track_rows(track)[-len(track.modes) :])
     if track.events:
         print_view("Events", "events", events_rows(track))
-    print_text(_consistency(track))
-
-
-def _consistency(track: Track) -> str:
-    """Return whether the innovations of the filter agree with its model."""
     found = track.consistency()
     values = (
         f"normalised innovations squared {found.nis:.2f} (expected 1, p = {found.p_value:.2g}), "
@@ -338,7 +329,8 @@ def _consistency(track: Track) -> str:
     )
     if found.holds:
         less = {"below": " (they vary less than expected)", "above": " (they vary more)"}
-        return f"The filter is consistent with its logs{less.get(found.side, '')}: {values}."
+        print_text(f"The filter is consistent with its logs{less.get(found.side, '')}: {values}.")
+        return
     remedy = "The logs vary less than expected: its standard deviations are too large."
     if track.widening[-1] > 1:
         remedy = (
@@ -346,7 +338,7 @@ def _consistency(track: Track) -> str:
             "missing: a covariate, a change of servo tuning, or wrong standard deviations in the "
             "table."
         )
-    return f"The filter is NOT consistent with its logs: {values}. {remedy}"
+    print_text(f"The filter is NOT consistent with its logs: {values}. {remedy}")
 
 
 def print_health(health: Health) -> None:

@@ -607,16 +607,10 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label=tr("95 % band"))
     inside = (nis >= low) & (nis <= high)
     ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label=tr("inside"))
-    texts = [
-        f"{title(track, k)}\n"
-        + tr(
-            "NIS {value}; expected {low} to {high}",
-            value=text.fixed(value, 1),
-            low=text.fixed(a, 1),
-            high=text.fixed(b, 1),
-        )
-        for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
-    ]
+    texts, words = [], tr("NIS {value}; expected {low} to {high}")
+    for k, *values in zip(seen.tolist(), nis, low, high, strict=True):
+        value, least, most = (text.fixed(one, 1) for one in values)
+        texts.append(f"{title(track, k)}\n{words.format(value=value, low=least, high=most)}")
     hints(ax, x, nis, texts)
     if not inside.all():
         ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label=tr("outside"))
@@ -684,15 +678,12 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label=tr("as measured"))
     ax.plot(x, after, "o", color=INK, ms=2.8, label=tr("corrected"))
     name, unit = text.covariate(influence.covariate)
-    texts = [
-        f"{title(history, k)}\n{name} {decimal(f'{value:.4g}')}{GAP}{unit}\n"
-        + tr(
-            "as measured {before}, corrected {after}",
-            before=f"{text.signed(a, 2)}{GAP}%",
-            after=f"{text.signed(b, 2)}{GAP}%",
-        )
-        for k, value, a, b in zip(epochs, x, before, after, strict=True)
-    ]
+    texts, words = [], tr("as measured {before}, corrected {after}")
+    for k, value, *both in zip(epochs, x, before, after, strict=True):
+        measured, corrected = (f"{text.signed(one, 2)}{GAP}%" for one in both)
+        own = words.format(before=measured, after=corrected)
+        there = f"{name} {decimal(f'{value:.4g}')}{GAP}{unit}"
+        texts.append(f"{title(history, k)}\n{there}\n{own}")
     hints(ax, x, before, texts)
     ax.set_xlabel(plain_label(tr("{name} in {unit}", name=name, unit=unit) if unit else name))
     ax.set_ylabel(tr("change of frequency in %"))
@@ -794,17 +785,12 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
         name = tr("other line") if kind == "unknown" else tr("{kind} line", kind=spell(kind))
         label = plain_label(name)
         ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=label)
-        texts = [
-            f"{title(history, k)}\n"
-            + tr(
-                "{name} at {frequency}, {amplitude} in {channel}",
-                name=name,
-                frequency=f"{text.fixed(line.frequency, 2)}{GAP}Hz",
-                amplitude=f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}",
-                channel=line.channel,
-            )
-            for line, k in own
-        ]
+        texts, words = [], tr("{name} at {frequency}, {amplitude} in {channel}")
+        for line, k in own:
+            at = f"{text.fixed(line.frequency, 2)}{GAP}Hz"
+            size = f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}"
+            found = words.format(name=name, frequency=at, amplitude=size, channel=line.channel)
+            texts.append(f"{title(history, k)}\n{found}")
         hints(ax, x, y, texts)
 
 

@@ -414,11 +414,8 @@ def _mark_lines(
         own = [line for line in seen if (line.kind, line.channel) == (kind, channel)]
         x = np.array([line.frequency for line in own])
         y = 1.5 * np.interp(x, frequency, level)
-        name = (
-            tr("line of unknown origin")
-            if kind == "unknown"
-            else tr("line: {kind}", kind=spell(kind))
-        )
+        unknown = tr("line of unknown origin")
+        name = unknown if kind == "unknown" else tr("line: {kind}", kind=spell(kind))
         label = figures.plain_label(name)
         ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
 
@@ -457,9 +454,8 @@ def _annotate(
     for declared in sought.values():
         style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
         if band[0] <= declared <= band[1]:
-            panels[-1].plot(
-                declared, 0, "^", transform=place, label=tr("declared frequency"), **style
-            )
+            label = tr("declared frequency")
+            panels[-1].plot(declared, 0, "^", transform=place, label=label, **style)
     for refusal in modes.refused:
         refused = refusal.frequency or sought.get(refusal.mode)
         if refused is not None and band[0] <= refused <= band[1]:
@@ -517,14 +513,8 @@ def _notes(modes: Modes) -> list[str]:
     """Return the refusals in lines that fit."""
     lines = []
     for refusal in modes.refused:
-        what = spell(refusal.mode) or refusal.channel or tr("modes")
-        text = figures.plain_label(
-            tr(
-                "{what} refused, {reason}: {detail}",
-                what=what,
-                reason=tr(refusal.reason),
-                detail=refusal.detail,
-            )
-        )
+        what, why = spell(refusal.mode) or refusal.channel or tr("modes"), tr(refusal.reason)
+        own = {"what": what, "reason": why, "detail": refusal.detail}
+        text = figures.plain_label(tr("{what} refused, {reason}: {detail}", **own))
         lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
     return lines
