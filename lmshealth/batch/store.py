@@ -23,17 +23,8 @@ from sqlalchemy.engine import URL, Connection
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from lmshealth._private.serialize import fingerprint, pack, unpack
-from lmshealth.batch import constants
-from lmshealth.batch.database import (
-    INSERT,
-    VALUES,
-    StoreError,
-    connect,
-    is_older,
-    next_step,
-    reason,
-    shown_address,
-)
+from lmshealth.batch import constants, database
+from lmshealth.batch.database import VALUES, StoreError
 from lmshealth.batch.workers import OnCrash, Pool, Progress, Task
 from lmshealth.io.log import Refusal
 from lmshealth.machine.status import Change, Status
@@ -176,8 +167,8 @@ class Store:
     """
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:
-        self._engine, self._address, self._made_anew = connect(url, create=create)
-        self._shown, self._writes = shown_address(self._address), create
+        self._engine, self._address, self._made_anew = database.connect(url, create=create)
+        self._shown, self._writes = database.shown_address(self._address), create
         self._claims: Connection | None = None
         self._open: Connection | None = None  # transaction
         self.damaged: Counter[str] = Counter()  # values that were damaged, by their kind
@@ -185,7 +176,7 @@ class Store:
             tables = sql.inspect(self._engine).get_table_names()
         if VALUES.name not in tables:
             found = "no results"
-            if is_older(tables):
+            if database.is_older(tables):
                 found = "only results of another version of lmshealth"
             self.close()
             raise self.unfilled(f"{found} (no table {VALUES.name})")
@@ -463,7 +454,7 @@ class Store:
             for key, content in values.items()
             for sealed in [_seal(content, kind, owner, key) + content]
         ]
-        insert = INSERT[self._engine.dialect.name](VALUES).values(rows[0])
+        insert = database.INSERT[self._engine.dialect.name](VALUES).values(rows[0])
         keys = [column.name for column in VALUES.primary_key]
         rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
         with self.transaction() as connection:
@@ -502,8 +493,8 @@ class Store:
         try:
             yield
         except SQLAlchemyError as error:
-            why = reason(error, self._address)
-            step = next_step(error, self._address)
+            why = database.reason(error, self._address)
+            step = database.next_step(error, self._address)
             step = step or "its results are kept, run again to continue"
             # The cause would quote the row.
             raise StoreError(f"the store {self._shown} failed: {why}; {step}") from None
