@@ -71,11 +71,8 @@ def announce(
     """
     unsent, everything = store.unsent(), store.announced()
     folder, notes = shown(os.path.abspath(scope.logs)), list[str]()
-    own = {
-        stage: one
-        for stage, one in everything.items()
-        if stage in made or PurePath(one.folder).is_relative_to(folder)
-    }
+    inside = {k for k, one in everything.items() if PurePath(one.folder).is_relative_to(folder)}
+    own = {stage: one for stage, one in everything.items() if stage in inside | made.keys()}
     known = {stage: one.status for stage, one in own.items()}
     try:
         written = msgspec.json.decode(read_table(scope.out / FILE), type=Fleet)
@@ -175,13 +172,8 @@ def run_command(command: Sequence[str], content: bytes) -> str:
         given.write(content)
         given.seek(0)
         try:
-            process = subprocess.Popen(
-                command,
-                stdin=given,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            to: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+            process = subprocess.Popen(command, stdin=given, start_new_session=True, **to)
         except OSError as error:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
     reader = Thread(target=_keep_end, args=(process.stdout, last), daemon=True)

@@ -152,16 +152,9 @@ def ingest(
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
 
-    def add(found: _Outcome) -> None:
-        lost.extend(found.refused)
-        owners[found.key[0]] = found.machine or owners.get(found.key[0])
-        if not found.refused:
-            own = groups.setdefault(str(found.machine), {}).setdefault(found.description, [])
-            own.append(found.key)
-
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
-    options: dict[str, Any] = {"stages": tuple(stages), "how": how}
-    identify = partial(_identify_logs, limit=settings.seconds_per_log, **options)
+    limit = settings.seconds_per_log
+    identify = partial(_identify_logs, stages=tuple(stages), how=how, limit=limit)
 
     def fetch(part: Sequence[_Task]) -> Iterator[tuple[_Task, _Outcome]]:
         for task, outcome in _cached(part, stages, store, settings.latest):
@@ -172,7 +165,11 @@ def ingest(
     for part, is_new in _identified(tasks, identify, resources, fetch):
         store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
         for one in part:
-            add(one)
+            lost += one.refused
+            owners[one.key[0]] = one.machine or owners.get(one.key[0])
+            if not one.refused:
+                own = groups.setdefault(str(one.machine), {})
+                own.setdefault(one.description, []).append(one.key)
         n_cached += 0 if is_new else len(part)
         done += len(part)
         progress("identifying", done, len(tasks))

@@ -251,8 +251,6 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         if content["modes"] and stage is None and band is None:
             terminal.print_text(_NO_BAND)
 
-    if given["save"] and found:
-        _save(given["save"], found[0])
     _finish(ctx, content, refused, found, lost, show)
 
 
@@ -505,11 +503,11 @@ def _finish(
     ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
-    found: Sequence[object],
+    found: Sequence[Any],
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
 ) -> None:
-    """Print results as csv (the first table of the content), json, or tables, and exit.
+    """Print results as csv (the first table of the content), json, or tables; save them, and exit.
 
     Tables list refused parts of logs, but not lost logs.
     """
@@ -520,6 +518,8 @@ def _finish(
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     elif found:
         show(tables.refused_rows(refused))
+    if ctx.params.get("save") and found:
+        _save(ctx.params["save"], found[0])
     _exit(ctx, found, lost)
 
 

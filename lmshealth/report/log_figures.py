@@ -442,10 +442,9 @@ def _annotate(
     for k, f in enumerate(modes.frequency.tolist()):
         reach = 1.96 * float(np.sqrt(modes.cov[k, k]))
         for ax in panels:
-            ax.axvspan(
-                f * np.exp(-reach), f * np.exp(reach),
-                color=figures.BLUE, alpha=0.35, lw=0, label=tr("mode, 95 % interval"),
-            )  # fmt: skip
+            span: Any = {"color": figures.BLUE, "alpha": 0.35, "lw": 0}
+            label = tr("mode, 95 % interval")
+            ax.axvspan(f * np.exp(-reach), f * np.exp(reach), label=label, **span)
             ax.axvline(f, color=figures.BLUE, lw=0.6)
         name = spell(modes.names[k] or tr("unnamed"))
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))

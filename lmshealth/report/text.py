@@ -31,9 +31,8 @@ day = tr_day  # of a date, or of a moment
 
 # Names in the shipped descriptions, and of covariates.
 _NAMES = (
-    *(mark("guide preload"), mark("mount stiffness"), mark("any limit")),
-    *(mark("roll"), mark("pitch"), mark("yaw")),
-    *(mark("temperature"), mark("payload"), mark("position")),
+    *(mark("guide preload"), mark("mount stiffness"), mark("any limit"), mark("roll")),
+    *(mark("pitch"), mark("yaw"), mark("temperature"), mark("payload"), mark("position")),
 )
 # Conditions of a state by NAMUR NE 107, kinds of events and of spectral lines, and labels of the
 # pictures of how-to-read.html.
