@@ -19,8 +19,9 @@ from typing import IO, Any, NamedTuple
 import msgspec
 
 from lmshealth._private.files import read_table, write_bytes
+from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
-from lmshealth.batch.store import Announced, Store, Unsent
+from lmshealth.batch.store import Announced, Store, Unsent, machine_key
 from lmshealth.io.refusal import shown, visible
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.machine.status import Change, Fleet, Status, compare
@@ -108,8 +109,10 @@ def announce(
         changes += found
         place = folder if stage in made or not last else last.folder
         announced.append(Announced(judged, place, tuple(sorted(channels)), number))
-    store.put_announced(announced)
-    store.put_unsent(queued)
+    for last in announced:
+        store.put("announced", {"": pack(last)}, last.status.stage)
+    for waits in queued:
+        store.put("unsent", {waits.key: pack(waits)}, waits.change.stage)
     return tuple(one.status for one in announced), changes, notes
 
 
@@ -137,7 +140,8 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
                 again = "are sent again by the next run with this option"
                 failed[name] = f"{why}; {len(rows)} changes {again}"
             else:
-                store.remove_unsent(unsent)
+                for one in unsent:
+                    store.remove("unsent", machine_key(one.change.stage), one.key)
     return failed
 
 

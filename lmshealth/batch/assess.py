@@ -104,7 +104,7 @@ def assess_all(
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
     """Fetch the names and the packed estimates of the logs of a machine."""
-    contents = dict(store.identified(key for _, key in machine.logs))
+    contents = dict(store.of_keys("identified", (key for _, key in machine.logs)))
     return tuple((log, contents[key]) for log, key in machine.logs if key in contents)
 
 
@@ -158,7 +158,7 @@ def apply_fleet_priors(
     def job(part: Sequence[_Update]) -> _UpdateJob:
         [one] = part
         name, life_key = one[0].name, _life_key(one[0].stage, one[0].seed)
-        return one, store.assessment(name, one[0].key), store.part(name, life_key)
+        return one, store.get("assessed", one[0].key, name), store.part(name, life_key)
 
     updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
         function=_update, key=lambda one: one[1], fetch=fetch, job=job
@@ -189,7 +189,7 @@ def _machines_to_update(
     for fleet in fleets.values():
         evidence, ended = {}, list[EndedLife]()
         for name, machine in sorted(fleet.items()):
-            content = store.evidence(name, machine.key)
+            content = store.get("evidence", machine.key, name)
             if (own := unpack_or_none(content, FleetContribution)) is not None:
                 ended += own.ended
                 if own.evidence is not None:

@@ -163,7 +163,8 @@ def ingest(
     n_cached = done = 0
     progress("identifying", 0, len(tasks))
     for part, is_new in _identified(tasks, identify, resources, fetch):
-        store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
+        packed = {one.key[1]: one.packed for one in part if one.packed is not None}
+        store.put("identified", packed)
         for one in part:
             lost += one.refused
             owners[one.key[0]] = one.machine or owners.get(one.key[0])
@@ -275,8 +276,8 @@ def _all_digests(
     store, digests = resources.store, dict[Path, str | BadLog]()
 
     def fetch(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
-        known = store.digests(files[path][0] for path in paths)
-        return ((path, known[key]) for path in paths if (key := files[path][0]) in known)
+        known = dict(store.of_keys("hashed", (files[path][0] for path in paths)))
+        return ((path, known[key].decode()) for path in paths if (key := files[path][0]) in known)
 
     hashing: Cached[Path, tuple[Path, ...], str | BadLog] = Cached(
         function=_digests,
@@ -292,7 +293,7 @@ def _all_digests(
         digests |= part
         if is_new:
             new = {files[path]: digest for path, digest in part if isinstance(digest, str)}
-            store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
+            store.put("hashed", {key: one.encode() for (key, is_old), one in new.items() if is_old})
         resources.progress("reading", len(digests), len(files))
     return digests
 
@@ -318,7 +319,7 @@ def _cached(
     """
     digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
     own = {task.key(digest): task for task in tasks for digest in digests}
-    for key, content in store.identified(own):
+    for key, content in store.of_keys("identified", own):
         if (found := unpack_or_none(content, Identified)) is None:
             continue
         matching = _matching(stages, Metadata(stage=found.stage, description=found.asked))

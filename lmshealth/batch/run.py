@@ -453,7 +453,7 @@ def _outputs(
     for [(machine, drawn)], is_new in drawing.values(machines, resources):
         name = machine.name
         if is_new and isinstance(drawn, MachineOutput):
-            store.put_part(name, own[name], pack(drawn))
+            store.put("parts", {own[name]: pack(drawn)}, name)
         if drawn is not None:
             yield name, drawn
 
@@ -468,7 +468,7 @@ def _record(
     logs: PackedLogs | None = None,
 ) -> MachineRecord:
     """Fetch the results of a machine from the store; ``lost`` are of all machines."""
-    assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
+    assessment, before = store.get("assessed", key, machine), store.previous_summary(machine, key)
     own = lost.get(machine, ())
     return MachineRecord(machine, file, assessment, logs, before, own, language)
 

@@ -277,50 +277,20 @@ class Store:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             yield
 
-    # Logs
-
-    def digests(self, keys: Iterable[str]) -> dict[str, str]:
-        """Fetch the digests of the content of those files that are known by their keys."""
-        return {key: content.decode() for key, content in self._of_keys("hashed", keys)}
-
-    def put_digests(self, digests: Mapping[str, str]) -> None:
-        """Store digests of the content of files."""
-        self._put("hashed", {key: digest.encode() for key, digest in digests.items()})
-
-    def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Fetch the packed outcomes (`Identified`) of those logs that are stored, by their keys."""
-        return self._of_keys("identified", keys)
-
-    def put_identified(self, outcomes: Mapping[str, bytes]) -> None:
-        """Store packed outcomes of logs by their keys."""
-        self._put("identified", outcomes)
-
     # Machines
 
     def has_assessment(self, machine: str, key: str) -> bool:
         """Return whether a machine has an undamaged assessment under a key."""
-        return all(self._get(kind, key, machine) is not None for kind in _ASSESSMENT)
-
-    def assessment(self, machine: str, key: str) -> bytes | None:
-        """Fetch a packed assessment; None where it is not stored."""
-        return self._get("assessed", key, machine)
-
-    def evidence(self, machine: str, key: str) -> bytes | None:
-        """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
-        return self._get("evidence", key, machine)
+        return all(self.get(kind, key, machine) is not None for kind in _ASSESSMENT)
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine, and its parts in place of those stored before."""
         with self.transaction():
             for kind, content in zip(_ASSESSMENT, (made.content, made.evidence), strict=True):
-                self._put(kind, {key: content}, machine)
+                self.put(kind, {key: content}, machine)
             if made.parts is not None:
                 self._keep("parts", machine, made.parts)
-                self._put("parts", made.parts, machine)
-
-    def put_part(self, machine: str, key: str, content: bytes) -> None:
-        """Store one more part of the last assessment of a machine."""
-        self._put("parts", {key: content}, machine)
+                self.put("parts", made.parts, machine)
 
     def part(self, machine: str, key: str, *, after: str = "") -> bytes | None:
         """Fetch a part of the last assessment of a machine; None where it is not stored.
@@ -330,12 +300,12 @@ class Store:
         """
         present = self._decoded("present", Published, machine) if after else []
         is_lost = any(after in one.kept for one in present)
-        return None if is_lost else self._get("parts", key, machine)
+        return None if is_lost else self.get("parts", key, machine)
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that were refused as a whole, and return its key."""
         key = fingerprint(refused)
-        self._put("refused", {key: pack(refused)})
+        self.put("refused", {key: pack(refused)})
         return key
 
     def publish(self, machine: str, keys: Sequence[str], summary: Summary, refused: str) -> None:
@@ -349,8 +319,8 @@ class Store:
         number = 1 + max((one.number for one in reports), default=0)
         with self.transaction():
             present = Published(machine, key, refused, tuple(keys))
-            self._put("present", {"": pack(present)}, machine)
-            self._put("reports", {key: pack(_Report(key, number, summary))}, machine)
+            self.put("present", {"": pack(present)}, machine)
+            self.put("reports", {key: pack(_Report(key, number, summary))}, machine)
             for kind in _ASSESSMENT:
                 self._keep(kind, machine, keys)
 
@@ -371,7 +341,7 @@ class Store:
         asked = dict.fromkeys(keys)
         found = {
             key: unpack_or_none(content, tuple[Refusal, ...]) or ()
-            for key, content in self._of_keys("refused", asked)
+            for key, content in self.of_keys("refused", asked)
         }
         return tuple(dict.fromkeys(one for key in asked for one in found.get(key, ())))
 
@@ -381,29 +351,14 @@ class Store:
         """Fetch what was announced of each machine last."""
         return {one.status.stage: one for one in self._decoded("announced", Announced)}
 
-    def put_announced(self, announced: Iterable[Announced]) -> None:
-        """Store what was announced of machines."""
-        for one in announced:
-            self._put("announced", {"": pack(one)}, one.status.stage)
-
     def unsent(self) -> list[Unsent]:
         """Fetch the changes that are to be delivered, the oldest first."""
         found = self._decoded("unsent", Unsent)
         return sorted(found, key=lambda one: (one.number, one.change.stage))
 
-    def put_unsent(self, unsent: Iterable[Unsent]) -> None:
-        """Store changes that are to be delivered."""
-        for one in unsent:
-            self._put("unsent", {one.key: pack(one)}, one.change.stage)
-
-    def remove_unsent(self, sent: Iterable[Unsent]) -> None:
-        """Remove changes that were delivered."""
-        for one in sent:
-            self._remove("unsent", machine_key(one.change.stage), one.key)
-
     # Values
 
-    def _get(self, kind: str, key: str, machine: str) -> bytes | None:
+    def get(self, kind: str, key: str, machine: str) -> bytes | None:
         """Fetch a value of a machine; None where there is none, or it is damaged."""
         return dict(self._all(kind, machine, VALUES.c.key == key)).get(key)
 
@@ -414,7 +369,7 @@ class Store:
         own = () if machine is None else (VALUES.c.owner == machine_key(machine),)
         return self._intact(kind, *own, *where)
 
-    def _of_keys(self, kind: str, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    def of_keys(self, kind: str, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Fetch the values of no machine that are there under keys, some rows in each query."""
         asked = list(dict.fromkeys(keys))
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
@@ -441,11 +396,11 @@ class Store:
             self.damaged[kind] += 1
             _logger.info("damaged row of %s in the store %s", kind, self._shown)
             if self._writes:
-                self._remove(kind, owner, key)
+                self.remove(kind, owner, key)
         return found
 
-    def _put(self, kind: str, values: Mapping[str, bytes], machine: str | None = None) -> None:
-        """Write sealed values of a machine, or of none, in one statement; later ones replace."""
+    def put(self, kind: str, values: Mapping[str, bytes], machine: str | None = None) -> None:
+        """Write values of a machine, or of none, sealed in one statement; later ones replace."""
         if not values:
             return
         owner = "" if machine is None else machine_key(machine)
@@ -467,7 +422,8 @@ class Store:
         with self.transaction() as connection:
             connection.execute(sql.delete(VALUES).where(*where, VALUES.c.key.not_in([*keys])))
 
-    def _remove(self, kind: str, owner: str, key: str) -> None:
+    def remove(self, kind: str, owner: str, key: str) -> None:
+        """Delete a value of an owner (`machine_key`)."""
         with self.transaction() as connection:
             connection.execute(sql.delete(VALUES).filter_by(kind=kind, owner=owner, key=key))
 

@@ -100,7 +100,7 @@ def tables(out: Path) -> dict[str, bytes]:
 def assessments(out: Path) -> list[Assessment]:
     """Fetch what a run kept of its machines."""
     with closing(Store(default_url(out), create=False)) as store:
-        packed = [store.assessment(one.machine, one.key) for one in store.published()]
+        packed = [store.get("assessed", one.key, one.machine) for one in store.published()]
     return [unpack_or_none(content, Assessment) for content in packed if content is not None]
 
 
