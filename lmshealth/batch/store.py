@@ -360,14 +360,8 @@ class Store:
 
     def get(self, kind: str, key: str, machine: str) -> bytes | None:
         """Fetch a value of a machine; None where there is none, or it is damaged."""
-        return dict(self._all(kind, machine, VALUES.c.key == key)).get(key)
-
-    def _all(
-        self, kind: str, machine: str | None, *where: sql.ColumnElement[bool]
-    ) -> list[tuple[str, bytes]]:
-        """Fetch the values of a machine, or of all (None), with their keys."""
-        own = () if machine is None else (VALUES.c.owner == machine_key(machine),)
-        return self._intact(kind, *own, *where)
+        found = self._intact(kind, VALUES.c.owner == machine_key(machine), VALUES.c.key == key)
+        return dict(found).get(key)
 
     def of_keys(self, kind: str, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Fetch the values of no machine that are there under keys, some rows in each query."""
@@ -378,7 +372,8 @@ class Store:
 
     def _decoded(self, kind: str, of: type[Record], machine: str | None = None) -> list[Record]:
         """Fetch those values of a machine, or of all, that this version can decode."""
-        found = (unpack_or_none(content, of) for _, content in self._all(kind, machine))
+        own = () if machine is None else (VALUES.c.owner == machine_key(machine),)
+        found = (unpack_or_none(content, of) for _, content in self._intact(kind, *own))
         return [one for one in found if one is not None]
 
     def _intact(self, kind: str, *where: sql.ColumnElement[bool]) -> list[tuple[str, bytes]]:

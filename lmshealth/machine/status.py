@@ -24,7 +24,7 @@ from lmshealth.life.verdict import (
 )
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.summary import Summary, days_between, prognosis_rows
+from lmshealth.machine.summary import Summary, prognosis_rows
 from lmshealth.tracking.contradictions import are_many
 
 _SEVERITIES = "serious", "caution", "note"
@@ -362,7 +362,7 @@ def _judged(status: Status, today: date) -> Status:
         status,
         conditions=found,
         device_health=state,
-        days_without_log=days_between(status.recorded_at, today),
+        days_without_log=max((today - status.recorded_at.date()).days, 0),
         silent="silent" in found,
         unknown_since=status.recorded_at.date() if unknown else None,
         verdict=UNKNOWN if unknown else verdict,

@@ -250,16 +250,6 @@ class Summary:
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
 
-    @property
-    def days_without_log(self) -> int:
-        """Days from the last log to the day of the summary."""
-        return days_between(self.recorded_at, self.today)
-
-
-def days_between(last: datetime, today: date | None) -> int:
-    """Return the days from the last log to a day, at least 0; 0 without one."""
-    return 0 if today is None else max((today - last.date()).days, 0)
-
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
