@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -306,19 +306,18 @@ def report(
     progress("reporting", 0, len(present))
     judging = _judging(store, settings)
     refused = store.refused(one.refused for one in present)
-    lost = _lost_of(refused)
+    record = _records(store, refused, settings.language)
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
-        own = ((one.machine, one.key, files[one.machine]) for one in present)
-        records = (_record(*one, store, settings.language, lost) for one in own)
+        records = (record(one.machine, one.key, files[one.machine]) for one in present)
         made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
         made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
-        for record, [output] in made:
+        for drawn, [output] in made:
             if isinstance(output, str):
-                failed[record.machine] = output
+                failed[drawn.machine] = output
             elif output is not None:
-                rows[record.machine] = judging.write(output, out / record.file)
+                rows[drawn.machine] = judging.write(output, out / drawn.file)
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         raise store.unfilled("no assessment that this version of lmshealth can read")
@@ -390,7 +389,8 @@ def _report(
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
-    refused_key, lost = store.put_refused(tuple(refused)), _lost_of(refused)
+    refused_key = store.put_refused(tuple(refused))
+    record = _records(store, refused, judging.language)
     rows, made = dict[str, Summary](), dict[str, MachineOutput]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
@@ -401,7 +401,8 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources, judging.language, lost):
+        records = {name: partial(record, name, keys[name], files[name]) for name in names}
+        for name, output in _outputs(left, records, resources):
             if isinstance(output, str):
                 failed[name] = output
                 continue
@@ -418,24 +419,16 @@ def _report(
 
 def _outputs(
     machines: Sequence[Machine],
-    keys: Mapping[str, str],
-    files: Mapping[str, str],
+    records: Mapping[str, Callable[..., MachineRecord]],
     resources: Resources,
-    language: Language,
-    lost: Mapping[str, tuple[Refusal, ...]],
 ) -> Iterator[tuple[str, MachineOutput | str]]:
     """Yield the outputs of machines; those of unchanged results are taken from the store.
 
     A machine whose assessment is missing, or cannot be decoded, is left out.
     """
     store = resources.store
-
-    def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
-        name = machine.name
-        return _record(name, keys[name], files[name], store, language, lost, logs)
-
     # Its logs, which are large, follow from their names and keys.
-    own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
+    own = {one.name: fingerprint(VERSION, records[one.name](), one.logs) for one in machines}
 
     def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, MachineOutput]]:
         for machine in part:
@@ -445,7 +438,7 @@ def _outputs(
 
     def job(part: Sequence[Machine]) -> MachineRecord:
         [machine] = part
-        return record(machine, packed_logs(machine, store))
+        return records[machine.name](packed_logs(machine, store))
 
     drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
         function=output_or_reason, key=lambda machine: own[machine.name], fetch=fetch, job=job
@@ -458,28 +451,21 @@ def _outputs(
             yield name, drawn
 
 
-def _record(
-    machine: str,
-    key: str,
-    file: str,
-    store: Store,
-    language: Language,
-    lost: Mapping[str, tuple[Refusal, ...]],
-    logs: PackedLogs | None = None,
-) -> MachineRecord:
-    """Fetch the results of a machine from the store; ``lost`` are of all machines."""
-    assessment, before = store.get("assessed", key, machine), store.previous_summary(machine, key)
-    own = lost.get(machine, ())
-    return MachineRecord(machine, file, assessment, logs, before, own, language)
-
-
-def _lost_of(refused: Iterable[Refusal]) -> dict[str, tuple[Refusal, ...]]:
-    """Return the logs of each machine that were refused as a whole."""
-    found: dict[str, list[Refusal]] = {}
+def _records(
+    store: Store, refused: Iterable[Refusal], language: Language
+) -> Callable[..., MachineRecord]:
+    """Return what fetches the results of a machine, of which some logs were refused as a whole."""
+    lost: dict[str, list[Refusal]] = {}
     for one in refused:
         if one.reason not in _COPIES:
-            found.setdefault(one.machine, []).append(one)
-    return {machine: tuple(own) for machine, own in found.items()}
+            lost.setdefault(one.machine, []).append(one)
+
+    def record(name: str, key: str, file: str, logs: PackedLogs | None = None) -> MachineRecord:
+        assessment, before = store.get("assessed", key, name), store.previous_summary(name, key)
+        own = tuple(lost.get(name, ()))
+        return MachineRecord(name, file, assessment, logs, before, own, language)
+
+    return record
 
 
 # Watch

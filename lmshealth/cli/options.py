@@ -203,8 +203,8 @@ ALLOW_FUTURE = click.option(
 )
 TODAY = click.option(
     "--today",
+    type=day,
     metavar="DAY",
-    callback=lambda ctx, option, given: None if given is None else day(given),
     help="Judge status and silence as on this day, for runs that repeat; default now.",
 )
 PART = click.option(
