@@ -6,7 +6,6 @@ This module collects results and figures; wording and markup are in ``templates/
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date, timedelta
 from functools import partial
 from itertools import combinations
@@ -366,16 +365,6 @@ _WORDS = (
 )
 
 
-@dataclass(frozen=True, slots=True)
-class Month:
-    """Number of services due in a month; ``before`` is the day after its last."""
-
-    label: str
-    year: str
-    before: date
-    count: int
-
-
 def file_names(identities: Iterable[str]) -> dict[str, str]:
     """Name the pages of machines: valid on every file system and unique regardless of case."""
     taken = {"index", "how-to-read"}
@@ -444,26 +433,25 @@ def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     median = len(RUL_LEVELS) // 2
     left = [one.life.any.travel[median] / 1000 for one in summaries if one.life]
     edges = [0.0, *constants.LIFE_EDGES, np.inf]
-    labels = [
-        tr("passed"),
-        *(tr("to {distance}", distance=text.number(edge)) for edge in edges[1:-1]),
-    ]
-    labels += [tr("more"), tr("beyond")]
+    inner = [tr("to {distance}", distance=text.number(edge)) for edge in edges[1:-1]]
+    labels = [tr("passed"), *inner, tr("more"), tr("beyond")]
     places = Counter(int(np.searchsorted(edges, km)) + (km == np.inf) for km in left)
     return [(label, places[k]) for k, label in enumerate(labels)] if left else []
 
 
-def _months(summaries: Sequence[Summary], today: date) -> list[Month]:
-    """Count the services due now and in each month of a year; empty without any."""
+def _months(summaries: Sequence[Summary], today: date) -> list[dict[str, Any]]:
+    """Count the services due now and in each month of a year, ``before`` a day; empty without."""
     due = [one.service.by for one in summaries if one.service.by is not None]
     today = min(today, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
     # Due now: everything due on or before this day.
     counts = Counter(day.replace(day=1) for day in due if day > today)
-    months = [Month(tr("now"), "", today + timedelta(days=1), sum(day <= today for day in due))]
+    now = sum(day <= today for day in due)
+    months = [{"label": tr("now"), "year": "", "before": today + timedelta(days=1), "count": now}]
     begin = today.replace(day=1)
     for k in range(constants.CALENDAR_MONTHS):
         year = f"{begin:%Y}" if k == 0 or begin.month == 1 else ""
         after = (begin + timedelta(days=31)).replace(day=1)
-        months.append(Month(tr_month(begin), year, after, counts[begin]))
+        month = {"label": tr_month(begin), "year": year, "before": after, "count": counts[begin]}
+        months.append(month)
         begin = after
-    return months if any(month.count for month in months) else []
+    return months if any(month["count"] for month in months) else []
