@@ -24,7 +24,7 @@ from lmshealth.life.verdict import (
 )
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.summary import Summary, prognosis_rows
+from lmshealth.machine.summary import Summary, prognosis_rows, step_of
 from lmshealth.tracking.contradictions import are_many
 
 _SEVERITIES = "serious", "caution", "note"
@@ -400,7 +400,8 @@ def on_day(summary: Summary, status: Status, today: date) -> Summary:
     postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
     # Logs as rare as the step allows would let the machine become silent.
     often = min(summary.step.log_every, status.silent_after_days or np.inf)
-    step = replace(summary.step.on("overdue" if is_past else late), log_every=often)
+    kind = step_of(*summary.step.case, "overdue" if is_past else late)
+    step = replace(summary.step, kind=kind, log_every=often)
     return replace(found, today=today, step=step, postponed=tuple(postponed))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Literal
 
@@ -74,10 +74,6 @@ class NextStep:
     horizon: float = np.nan  # travel in m beyond which nothing is claimed
     partial: bool = False  # whether a limit is left out, because the modes do not show it
     case: tuple[str, str, str] = ("open", "unknown", "young")  # verdict, service and age
-
-    def on(self, day: str) -> NextStep:
-        """Return the step on an ``overdue`` or ``late`` day, or on another (``""``)."""
-        return replace(self, kind=step_of(*self.case, day))
 
 
 def next_step(assessment: Assessment, service: Service) -> NextStep:
@@ -191,11 +187,6 @@ class LimitLife:
     def name(self) -> str:
         """Name of the limit in words."""
         return "any limit" if self.parameter == "any" else spell(self.parameter)
-
-    @property
-    def share(self) -> float:
-        """Limit as a fraction of the baseline."""
-        return self.limit / self.baseline
 
 
 @dataclass(frozen=True, slots=True)

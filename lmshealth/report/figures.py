@@ -304,11 +304,8 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     ]
     hints(ax, some, chance, texts)
     if service is not None and service.kept_risk is not None:
-        cheapest, risk = (
-            tr("risk at least cost {risk} %"),
-            decimal(f"{100 * service.kept_risk:.3g}"),
-        )
-        label = cheapest if service.cost_ratio else tr("accepted risk {risk} %")
+        risk, label = decimal(f"{100 * service.kept_risk:.3g}"), tr("accepted risk {risk} %")
+        label = tr("risk at least cost {risk} %") if service.cost_ratio else label
         label = label.format(risk=risk)
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
