@@ -11,11 +11,11 @@ from typing import TypeVar
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, unexpected
 from lmshealth.batch.store import (
-    Cached,
     Identified,
     PackedAssessment,
     Resources,
     Store,
+    cached,
     unpack_or_none,
 )
 from lmshealth.errors import LmshealthError
@@ -86,14 +86,12 @@ def assess_all(
         known = None if force else store.part(one.name, key, after=one.key)
         return one, packed_logs(one, store), known
 
-    assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
-        function=_assess_packed,
-        key=lambda one: fingerprint(one.name, one.key),
-        fetch=fetch,
-        job=job,
-    )
+    def key(one: Machine) -> str:
+        return fingerprint(one.name, one.key)
+
     resources.progress("assessing", 0, len(machines))
-    for k, ([(machine, made)], _) in enumerate(assessing.values(machines, resources), start=1):
+    found = cached(_assess_packed, machines, resources, key=key, fetch=fetch, job=job)
+    for k, ([(machine, made)], _) in enumerate(found, start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         elif made is not None:
@@ -160,10 +158,8 @@ def apply_fleet_priors(
         name, life_key = one[0].name, _life_key(one[0].stage, one[0].seed)
         return one, store.get("assessed", one[0].key, name), store.part(name, life_key)
 
-    updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
-        function=_update, key=lambda one: one[1], fetch=fetch, job=job
-    )
-    for k, ([(one, made)], is_new) in enumerate(updating.values(updates, resources), start=1):
+    found = cached(_update, updates, resources, key=lambda one: one[1], fetch=fetch, job=job)
+    for k, ([(one, made)], is_new) in enumerate(found, start=1):
         machine, key, *_ = one
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, key, made)

@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.store import Cached, Identified, Resources, Store, unpack_or_none
+from lmshealth.batch.store import Identified, Resources, Store, cached, unpack_or_none
 from lmshealth.batch.workers import Pool, Threads, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
@@ -279,17 +279,11 @@ def _all_digests(
         known = dict(store.of_keys("hashed", (files[path][0] for path in paths)))
         return ((path, known[key].decode()) for path in paths if (key := files[path][0]) in known)
 
-    hashing: Cached[Path, tuple[Path, ...], str | BadLog] = Cached(
-        function=_digests,
-        key=lambda path: files[path][0],
-        fetch=fetch,
-        job=tuple,
-        most=constants.FILES_PER_HASH_TASK,
-    )
     resources.progress("reading", 0, len(files))
     # Threads hash at the same time, and start at once.
     in_threads = replace(resources, pool=Threads(resources.pool.size))
-    for part, is_new in hashing.values([*files], in_threads):
+    how: Any = {"key": lambda path: files[path][0], "most": constants.FILES_PER_HASH_TASK}
+    for part, is_new in cached(_digests, [*files], in_threads, fetch=fetch, **how):
         digests |= part
         if is_new:
             new = {files[path]: digest for path, digest in part if isinstance(digest, str)}
@@ -352,15 +346,9 @@ def _identified(
     Yield some outcomes at a time, and whether they are new.
     """
     lost: list[tuple[_Task, ...]] = []
-    identifying: Cached[_Task, tuple[_Task, ...], _Outcome | None] = Cached(
-        function=identify,
-        on_crash=lambda part, why: [None] * len(part),
-        key=lambda task: task.key(""),
-        fetch=fetch,
-        job=tuple,
-        most=constants.LOGS_PER_TASK,
-    )
-    for part, is_new in identifying.values(tasks, resources):
+    how: Any = {"key": lambda task: task.key(""), "most": constants.LOGS_PER_TASK}
+    how |= {"on_crash": lambda part, why: [None] * len(part)}
+    for part, is_new in cached(identify, tasks, resources, fetch=fetch, **how):
         lost += [(task,) for task, outcome in part if outcome is None]
         yield [outcome for _, outcome in part if outcome is not None], is_new
     for _, outcomes in resources.pool.map_unordered(identify, lost, _crashed):

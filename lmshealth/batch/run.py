@@ -15,6 +15,7 @@ from datetime import time as day_time
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
+from typing import Any
 
 import msgspec
 
@@ -33,7 +34,7 @@ from lmshealth.batch.assess import (
     unpack_logs,
 )
 from lmshealth.batch.ingest import NOT_LISTED, Settings, ingest
-from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
+from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -440,10 +441,8 @@ def _outputs(
         [machine] = part
         return records[machine.name](packed_logs(machine, store))
 
-    drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
-        function=output_or_reason, key=lambda machine: own[machine.name], fetch=fetch, job=job
-    )
-    for [(machine, drawn)], is_new in drawing.values(machines, resources):
+    how: Any = {"key": lambda machine: own[machine.name], "fetch": fetch, "job": job}
+    for [(machine, drawn)], is_new in cached(output_or_reason, machines, resources, **how):
         name = machine.name
         if is_new and isinstance(drawn, MachineOutput):
             store.put("parts", {own[name]: pack(drawn)}, name)

@@ -3,7 +3,7 @@
 The key of a value is a fingerprint of everything that it depends on. A change of any of it gives
 another key, so that only stale values are computed again. A value that is damaged is removed and
 counts as absent, and so does one that this version cannot decode. Every write may be repeated, and
-may be made by two runs at once: runs may be killed, and may share a store. `Cached` functions are
+may be made by two runs at once: runs may be killed, and may share a store. `cached` functions are
 computed where the store lacks their values; the runs on a store divide that work.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql
@@ -483,8 +483,8 @@ def _seal(content: bytes, *place: Any) -> bytes:
 # Cached functions
 
 Piece = TypeVar("Piece")
-Job = TypeVar("Job")
 Value = TypeVar("Value")
+Pairs = list[tuple[Piece, Value]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -496,72 +496,64 @@ class Resources:
     progress: Progress = lambda step, done, total: None
 
 
-Pairs = list[tuple[Piece, Value]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cached(Generic[Piece, Job, Value]):
-    """A pure function of pieces of work, whose values a store keeps.
+def cached(
+    function: Task[Any, Sequence[Value]],
+    pieces: Sequence[Piece],
+    resources: Resources,
+    *,
+    key: Callable[[Piece], str],
+    fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]],
+    job: Callable[[Sequence[Piece]], Any] = tuple,
+    most: int = 1,
+    on_crash: OnCrash[Any, Any] = lambda _, why: [why],
+) -> Iterator[tuple[Pairs[Piece, Value], bool]]:
+    """Yield pieces of work with their values by a pure function, and whether these are new.
 
     ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` yields
     those pieces whose value is in the store, with it. Of the others a run claims some, at most
     ``most`` at a time, and makes a ``job`` of those that it gets, of which a worker computes the
     function: a list of their values. ``on_crash`` makes that of a job that ends its worker; by
-    default it is the reason.
+    default it is the reason. What other runs have claimed is looked at again in the end: they store
+    its value, or end without. The caller stores new values before it asks for the next.
     """
+    store = resources.store
 
-    function: Task[Job, Sequence[Value]]
-    key: Callable[[Piece], str]
-    fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]]
-    job: Callable[[Sequence[Piece]], Job]
-    most: int = 1
-    on_crash: OnCrash[Job, Any] = lambda _, why: [why]
-
-    def values(
-        self, pieces: Sequence[Piece], resources: Resources
-    ) -> Iterator[tuple[Pairs[Piece, Value], bool]]:
-        """Yield all pieces with their values, some at a time, and whether these are new.
-
-        What other runs have claimed is looked at again in the end: they store its value, or end
-        without. The caller stores new values before it asks for the next.
-        """
-        left, is_waiting = pieces, False
-        while left:
-            known = set[str]()
-            for piece, value in self.fetch(left):
-                known.add(self.key(piece))
-                yield [(piece, value)], False
-            if is_waiting and not known:
-                time.sleep(constants.OTHERS_POLL_S)
-            left = [piece for piece in left if self.key(piece) not in known]
-            others = yield from self._unclaimed(left, resources)
-            left, is_waiting = others, len(others) == len(left)
-
-    def _unclaimed(
-        self, pieces: Sequence[Piece], resources: Resources
+    def compute(
+        pieces: Sequence[Piece],
     ) -> Generator[tuple[Pairs[Piece, Value], bool], None, list[Piece]]:
         """Compute the values of unclaimed pieces; return the other pieces."""
-        store, others, claimed = resources.store, list[Piece](), dict[int, list[Piece]]()
+        others, claimed = list[Piece](), dict[int, list[Piece]]()
         # A few are spread over the workers.
-        size = min(self.most, max(1, len(pieces) // (4 * resources.pool.size)))
+        size = min(most, max(1, len(pieces) // (4 * resources.pool.size)))
 
-        def jobs() -> Iterator[Job]:
+        def jobs() -> Iterator[Any]:
             for first in range(0, len(pieces), size):
-                part = [(self.key(piece), piece) for piece in pieces[first : first + size]]
-                own = store.claim([key for key, _ in part])
+                part = [(key(piece), piece) for piece in pieces[first : first + size]]
+                own = store.claim([one for one, _ in part])
                 if store.is_divided:  # another run may have done it since this one began
-                    mine = [piece for key, piece in part if key in own]
-                    done = {self.key(piece) for piece, _ in self.fetch(mine)}
+                    done = {key(piece) for piece, _ in fetch([p for k, p in part if k in own])}
                     store.release([*done])
                     own -= done
-                others.extend(piece for key, piece in part if key not in own)
-                if mine := [piece for key, piece in part if key in own]:
-                    job = self.job(mine)
-                    claimed[id(job)] = mine
-                    yield job
+                others.extend(piece for one, piece in part if one not in own)
+                if mine := [piece for one, piece in part if one in own]:
+                    made = job(mine)
+                    claimed[id(made)] = mine
+                    yield made
 
-        for job, values in resources.pool.map_unordered(self.function, jobs(), self.on_crash):
-            mine = claimed.pop(id(job))
+        for made, values in resources.pool.map_unordered(function, jobs(), on_crash):
+            mine = claimed.pop(id(made))
             yield list(zip(mine, values, strict=True)), True
-            store.release([self.key(piece) for piece in mine])
+            store.release([key(piece) for piece in mine])
         return others
+
+    left, is_waiting = pieces, False
+    while left:
+        known = set[str]()
+        for piece, value in fetch(left):
+            known.add(key(piece))
+            yield [(piece, value)], False
+        if is_waiting and not known:
+            time.sleep(constants.OTHERS_POLL_S)
+        left = [piece for piece in left if key(piece) not in known]
+        others = yield from compute(left)
+        left, is_waiting = others, len(others) == len(left)
