@@ -180,7 +180,14 @@ def run_command(command: Sequence[str], content: bytes) -> str:
             process = subprocess.Popen(command, stdin=given, start_new_session=True, **to)
         except OSError as error:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
-    reader = Thread(target=_keep_end, args=(process.stdout, last), daemon=True)
+
+    def keep_end(stream: IO[bytes]) -> None:
+        """Read up to the end, and keep the last bytes."""
+        with stream:
+            while block := os.read(stream.fileno(), 1 << 16):
+                last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
+
+    reader = Thread(target=keep_end, args=(process.stdout,), daemon=True)
     reader.start()
     try:
         status = process.wait(constants.ALERT_TIMEOUT_S)
@@ -197,13 +204,6 @@ def run_command(command: Sequence[str], content: bytes) -> str:
     lines = bytes(last).decode(errors="replace").split("\n")
     line = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
     return f"ended with status {status}: {visible(line[:200])}" if status else ""
-
-
-def _keep_end(stream: IO[bytes], last: bytearray) -> None:
-    """Read a stream up to its end, and keep its last bytes."""
-    with stream:
-        while block := os.read(stream.fileno(), 1 << 16):
-            last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
 
 
 def notify() -> None:

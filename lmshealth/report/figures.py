@@ -637,9 +637,14 @@ def plot_waterfall(
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
     level[:, ::2] = waterfall.level.T
-    low, high = _shown_levels(waterfall)
+    free = waterfall.level.copy()  # without spectral lines
+    for row, lines in zip(free, waterfall.lines, strict=True):
+        for at in np.searchsorted(waterfall.edges, [line.frequency for line in lines]):
+            row[max(at - 3, 0) : at + 2] = np.nan
+    low, high = np.nanquantile(free, [0.02, 0.998])
     # As an image: rectangles would need a hundred times the bytes.
-    colours: Any = {"cmap": "cividis", "vmin": low, "vmax": high}
+    steps = {"vmin": 5 * float(np.floor(low / 5)), "vmax": 5 * float(np.ceil(high / 5))}
+    colours: Any = {"cmap": "cividis", **steps}
     picture = ax.pcolormesh(x, waterfall.edges, level, rasterized=True, **colours)
     bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
     bar.set_label(tr("level in dB"))
@@ -739,16 +744,6 @@ def _columns(x: FloatArray) -> FloatArray:
     # Logs at the same odometer get a narrow column.
     half = np.clip(gaps / 2, 0.1 * usual, _MOST_ROOM * usual)
     return np.stack([x - np.append(usual / 2, half), x + np.append(half, usual / 2)], axis=1)
-
-
-def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
-    """Return the range of colours in dB, without spectral lines, in steps of 5 dB."""
-    free = waterfall.level.copy()
-    for row, lines in zip(free, waterfall.lines, strict=True):
-        for at in np.searchsorted(waterfall.edges, [line.frequency for line in lines]):
-            row[max(at - 3, 0) : at + 2] = np.nan
-    low, high = np.nanquantile(free, [0.02, 0.998])
-    return 5 * float(np.floor(low / 5)), 5 * float(np.ceil(high / 5))
 
 
 def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History) -> None:

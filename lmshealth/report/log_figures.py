@@ -134,7 +134,10 @@ def plot_shapes(
             plot_shape(axes[0], shapes, i, places)
         axes[-1].set_axis_on()
         _plot_components(axes[-1], shapes, i, before)
-        _name_shape(axes[0], shapes, i, float(mac[i]))
+        own = {"MPC": float(shapes.complexity[i]), "MAC": float(mac[i])}
+        values = (f"{name} {decimal(f'{one:.2f}')}" for name, one in own.items() if one == one)
+        title = f"{spell(shapes.names[i])}\n{', '.join(values)}"
+        axes[0].set_title(figures.plain_label(title), size=9)
         axes[-1].tick_params(labelleft=column == 0)
     handles, labels = grid[len(heights) - 1, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4)
@@ -172,15 +175,6 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
     ax.set_xticks([-1, 0, 1])
     ax.set_yticks(y, [figures.plain_label(name) for name in shapes.channels])
     ax.invert_yaxis()
-
-
-def _name_shape(ax: Axes, shapes: ModeShapes, i: int, mac: float) -> None:
-    """Write the mode above its shape, with its phase collinearity and its MAC."""
-    values = {"MPC": float(shapes.complexity[i]), "MAC": mac}
-    text = ", ".join(
-        f"{name} {decimal(f'{value:.2f}')}" for name, value in values.items() if np.isfinite(value)
-    )
-    ax.set_title(figures.plain_label(f"{spell(shapes.names[i])}\n{text}"), size=9)
 
 
 def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpec]) -> Axes:
