@@ -458,9 +458,7 @@ def _limit_cells(
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], RUL_LEVELS
-    name = one.name
-    if one.parameter != "any":
-        name += f" below {text.percent(one.limit / one.baseline)}"
+    name = one.name if one.parameter == "any" else f"{one.name} below {text.percent(one.share)}"
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):

@@ -188,6 +188,11 @@ class LimitLife:
         """Name of the limit in words."""
         return "any limit" if self.parameter == "any" else spell(self.parameter)
 
+    @property
+    def share(self) -> float:
+        """Limit as a fraction of the baseline."""
+        return self.limit / self.baseline
+
 
 @dataclass(frozen=True, slots=True)
 class Life:

@@ -181,4 +181,4 @@ def test_limits_in_other_units_are_shown_as_fractions(make: Maker) -> None:
         summarise_life(life, own).limits[0]
         for life, own in ((prognosis, stage), (scaled, replace(stage, description=described)))
     )
-    assert other.limit / other.baseline == pytest.approx(one.limit / one.baseline)
+    assert other.share == pytest.approx(one.share)
