@@ -156,10 +156,7 @@ def ingest(
     limit = settings.seconds_per_log
     identify = partial(_identify_logs, stages=tuple(stages), how=how, limit=limit)
 
-    def fetch(part: Sequence[_Task]) -> Iterator[tuple[_Task, _Outcome]]:
-        for task, outcome in _cached(part, stages, store, settings.latest):
-            yield task, _Outcome.of(task, outcome, is_new=False)
-
+    fetch = partial(_cached, stages=stages, store=store, latest=settings.latest)
     n_cached = done = 0
     progress("identifying", 0, len(tasks))
     for part, is_new in _identified(tasks, identify, resources, fetch):
@@ -305,7 +302,7 @@ def _digests(paths: Iterable[Path]) -> list[str | BadLog]:
 
 def _cached(
     tasks: Sequence[_Task], stages: Sequence[Stage], store: Store, latest: datetime | None
-) -> Iterator[tuple[_Task, Identified]]:
+) -> Iterator[tuple[_Task, _Outcome]]:
     """Yield the stored outcomes that are still valid.
 
     These are the outcomes that used no description, or that used the one which matches the log now,
@@ -322,7 +319,8 @@ def _cached(
             found.outcome.metadata.recorded_at, latest
         )
         if found.description in ("", _none_of(stages), used) and not is_late:
-            yield own[key], found.renamed(own[key].name)
+            outcome = _Outcome.of(own[key], found.renamed(own[key].name), is_new=False)
+            yield own[key], outcome
 
 
 def _matching(stages: Sequence[Stage], metadata: Metadata) -> Stage | None:
