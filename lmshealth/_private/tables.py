@@ -80,6 +80,7 @@ class _Specification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     command: dict[str, Table]
     refusals: dict[str, RefusalCode]
     notices: dict[str, tuple[Literal["note", "caution", "serious"], str, str]]
+    steps: dict[str, str]
 
 
 _TEXT = (resources.files(__package__) / "tables.toml").read_bytes()
@@ -94,6 +95,8 @@ REFUSALS: Mapping[str, RefusalCode] = _READ.refusals
 """Every code in the column ``reason`` of ``refused.csv``."""
 NOTICES = _READ.notices
 """Severity, sentence and what to do of notices, by code and case (`machine.status`)."""
+STEPS = _READ.steps
+"""Sentences of next steps, by their kind."""
 FLAGS: Mapping[str, str] = _READ.run["modes"].values["flags"]
 """Meaning of the flags of a mode."""
 MOMENTS = sorted(

@@ -368,47 +368,6 @@ def service_on_day(summary: Summary) -> str:
 
 # Work that restores a parameter; of any other: work on it.
 _WORK = {"preload": mark("a preload adjustment"), "mount": mark("a tightening of the mount")}
-# Sentence of each step, of the work, the day of the service and how often to record a log.
-_STEPS = {
-    "inspect": mark(
-        "Inspect guide and mount now, and look for work, loads or tunings that the logs lack; then "
-        "record a log."
-    ),
-    "find-cause": mark(
-        "Find out what moved the mode: its sensor, cables, payload or attachments; then record a "
-        "log."
-    ),
-    "check-drift": mark(
-        "Record a log at once: a mode has moved by more than logs scatter. If it stays, look for "
-        "work, payload, sensor or tuning as the cause."
-    ),
-    "check-loss": mark(
-        "Record a log at once: the last one deviates from those before. If the machine was "
-        "repaired in between, enter that in maintenance.csv; if not, {work} is due {by}."
-    ),
-    "log-now": mark(
-        "Record a log now: it is overdue, and the state since the last one is unknown."
-    ),
-    "none": "",
-    "record": mark("Record further logs; the reasons are below."),
-    "service-now": mark(
-        "Do {work} now, before the machine travels on, and record logs for a new baseline."
-    ),
-    "overdue": mark("Do {work} now: its date, {by}, has passed. Record logs for a new baseline."),
-    "confirm": mark(
-        "Record {often}, and order nothing yet: with so few logs the service before {by} rests on "
-        "the prior of the laws."
-    ),
-    "schedule": mark(
-        "No work is needed yet. Plan {work} for {by} at the latest; until then {often}."
-    ),
-    "plan": mark("Order and plan {work} before {by}; until then {often}."),
-    "later": mark("No service is needed within {horizon}; record {often}."),
-}
-
-_LATER_IN_PART = mark(
-    "No service is needed within {horizon} for what the modes show; record {often}."
-)
 
 
 def next_step(step: NextStep) -> str:
@@ -424,7 +383,8 @@ def next_step(step: NextStep) -> str:
         often = tr("a log every {n} days", n=int(days))
     if days < 2 or 7 <= days < 8:
         often = tr("a log a day") if days < 2 else tr("a log a week")
-    words = _LATER_IN_PART if step.partial and step.kind == "later" else _STEPS[step.kind]
+    in_part = step.partial and step.kind == "later"
+    words = tables.STEPS["later, in part" if in_part else step.kind]
     return tr(words, work=work, by=by, often=often, horizon=horizon)
 
 
