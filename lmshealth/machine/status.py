@@ -154,25 +154,15 @@ DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINT
 
 Severity = Literal["serious", "caution", "note"]
 
-CHANGES: dict[str, tuple[Severity, str]] = {
-    "alarm": ("serious", "a mode has an undeclared alarm"),
-    "verdict": ("serious", "the verdict is a loss, `step` or `outside-map`"),
-    "limit-reached": ("serious", "a limit is reached with probability 0.5 or more"),
-    "large-drift": ("serious", "a drift that no scatter explains, before a verdict is possible"),
-    "unreliable": ("caution", "a serious warning beside a verdict, or `unexplained-drifts`"),
-    "service-due": ("caution", "the service date has passed or is within 30 days"),
-    "inspection-overdue": ("caution", "`inspect_by` has passed"),
-    "silent": ("caution", "no log for long"),
-    "no-log-since-maintenance": ("note", "no log after the last work"),
-    "unconfirmed-jump": ("note", "the last logs are far from those before them"),
-    "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
-    "recovered": (
-        "note",
-        "a verdict, silence, alarm, late log, jump or, by work, another state has ended",
-    ),
+CHANGES: dict[str, Severity] = {
+    **dict.fromkeys(("alarm", "verdict", "limit-reached", "large-drift"), "serious"),
+    **dict.fromkeys(("unreliable", "service-due", "inspection-overdue", "silent"), "caution"),
+    **dict.fromkeys(("no-log-since-maintenance", "unconfirmed-jump"), "note"),
+    **dict.fromkeys(("verdict, no loss", "recovered"), "note"),
 }
-"""Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
-kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
+"""Severity of the kinds of changes; report/README.md states when each begins. Each change of a
+machine is one of them, once. A kind that is a code of `conditions` begins with that; ``recovered``
+has what ended in ``before``."""
 
 # Conditions that begin once per baseline: their dates and probabilities move with each log. Others
 # begin anew after they have ended, which is a change too.
@@ -421,7 +411,7 @@ def compare(
     changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
     changes += _transitions(before, now)
-    severities = {what: severity for what, (severity, _) in CHANGES.items()}
+    severities = dict(CHANGES)
     if not _is_loss(_at_last_log(now)):
         severities["verdict"] = severities["verdict, no loss"]
     return now, [Change(now.stage, *one, now.recorded_at, severities[one[0]]) for one in changes]

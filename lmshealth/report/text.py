@@ -384,7 +384,7 @@ def next_step(step: NextStep) -> str:
     if days < 2 or 7 <= days < 8:
         often = tr("a log a day") if days < 2 else tr("a log a week")
     in_part = step.partial and step.kind == "later"
-    words = tables.STEPS["later, in part" if in_part else step.kind]
+    words = tables.STEPS["later-in-part" if in_part else step.kind]
     return tr(words, work=work, by=by, often=often, horizon=horizon)
 
 
