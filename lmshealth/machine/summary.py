@@ -24,10 +24,7 @@ Step = Literal[
     "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
     "service-now", "overdue", "confirm", "schedule", "plan", "later",
 ]  # fmt: skip
-"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, or a
-loss after which the machine was perhaps repaired, record a log that is late, nothing, record logs,
-service it now, service it after its date, confirm a service date by further logs, plan the service
-of a sound or of a worn machine, or nothing within the horizon."""
+"""What to do; the sentence of each is in `[steps]` of ``_private/tables.toml``."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
 # step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
