@@ -14,6 +14,8 @@ from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from lmshealth._private.files import write_bytes
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import LmshealthError
@@ -80,22 +82,16 @@ def _environment() -> Any:
 
 def _translated(message: str, /, **values: Any) -> Any:
     """Translate a message of a template, which may have marks of HTML; its values are escaped."""
-    from markupsafe import Markup
-
     return Markup(language.tr(message)).format(**values)  # noqa: S704
 
 
 def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
     """Translate a message of a template by number, as `_translated` does."""
-    from markupsafe import Markup
-
     return Markup(language.tr_either(one, many, n)).format(n=n, **values)  # noqa: S704
 
 
 def translated_svg(svg: Any) -> Any:
     """Translate the labels of a figure (Markup) that was drawn in English."""
-    from markupsafe import Markup
-
     if language.language() == "en":
         return svg
     label = language.label
