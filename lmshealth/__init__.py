@@ -56,58 +56,38 @@ if TYPE_CHECKING:
 
 __version__ = version("lmshealth")
 
-# Module of each public name, imported on first use: reading a log needs no database, and the
+# Public names by their module, imported on first use: reading a log needs no database, and the
 # command line sets the number of threads before numpy is imported.
-_HOMES = {
-    "LmshealthError": "errors",
-    "LogEstimates": "modal.log_estimates",
-    "Settings": "batch.ingest",
-    "analyse": "batch.analysis",
-    "assess": "machine.assessment",
-    "build_history": "tracking.history",
-    "check_calibration": "calibration.check",
-    "decide": "machine.service",
-    "fit_life": "life.posterior.fit",
-    "identify": "modal.identification",
-    "merge_setups": "modal.setups",
-    "identify_decays": "modal.deterministic.free_decays",
-    "infer": "life.health",
-    "infer_drifts": "life.health",
-    "judge": "life.verdict",
-    "load": "machine.saving",
-    "load_stage": "stage.description",
-    "plan": "stage.identifiability",
-    "prognose": "life.prognosis",
-    "read_frf": "modal.deterministic.frequency_response",
-    "read_log": "io.reading",
-    "run": "batch.run",
-    "save": "machine.saving",
-    "track": "tracking.track",
+_NAMES = {
+    "batch.analysis": "analyse",
+    "batch.ingest": "Settings",
+    "batch.run": "RunResult run",
+    "calibration.check": "CalibrationCheck check_calibration",
+    "errors": "LmshealthError",
+    "io.log": "Log Refusal",
+    "io.reading": "read_log",
+    "life.health": "Health infer infer_drifts",
+    "life.posterior.fit": "LifePosterior fit_life",
+    "life.prognosis": "Prognosis prognose",
+    "life.verdict": "Verdict judge",
+    "machine.assessment": "Assessment assess",
+    "machine.saving": "load save",
+    "machine.service": "Service decide",
+    "machine.status": "Status",
+    "machine.summary": "Summary",
+    "modal.deterministic.free_decays": "identify_decays",
+    "modal.deterministic.frequency_response": "FrfReading read_frf",
+    "modal.identification": "identify",
+    "modal.log_estimates": "LogEstimates",
+    "modal.modes": "Modes",
+    "modal.setups": "merge_setups",
+    "stage.description": "Stage load_stage",
+    "stage.identifiability": "Plan plan",
+    "tracking.history": "History build_history",
+    "tracking.track": "Track track",
 }
-
-# Types of the results of these functions.
-_RESULTS = {
-    "Assessment": "machine.assessment",
-    "CalibrationCheck": "calibration.check",
-    "FrfReading": "modal.deterministic.frequency_response",
-    "Health": "life.health",
-    "History": "tracking.history",
-    "LifePosterior": "life.posterior.fit",
-    "Log": "io.log",
-    "Modes": "modal.modes",
-    "Plan": "stage.identifiability",
-    "Prognosis": "life.prognosis",
-    "Refusal": "io.log",
-    "RunResult": "batch.run",
-    "Service": "machine.service",
-    "Stage": "stage.description",
-    "Status": "machine.status",
-    "Summary": "machine.summary",
-    "Track": "tracking.track",
-    "Verdict": "life.verdict",
-}
-
-__all__ = [*_HOMES, *_RESULTS]
+_HOMES = {name: module for module, names in _NAMES.items() for name in names.split()}
+__all__ = [*_HOMES]
 
 
 def _draw(result: _Result, what: str, ax: Any) -> Any:
@@ -121,10 +101,9 @@ if not TYPE_CHECKING:  # a type checker would accept any attribute otherwise
 
     def __getattr__(name: str) -> object:
         """Import a public name on first use."""
-        homes = _HOMES | _RESULTS
-        if name not in homes:
+        if name not in _HOMES:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-        found = getattr(import_module(f"{__name__}.{homes[name]}"), name)
+        found = getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
         globals()[name] = found
         return found
 

@@ -16,7 +16,8 @@ import lmshealth
 # `save` and `load` came with the types of results, which need no example of their own;
 # `check_calibration` is a question that each description raises.
 MOST_NAMES = 24
-FUNCTIONS = sorted(set(lmshealth.__all__) - set(lmshealth._RESULTS))
+CLASSES = "LmshealthError", "LogEstimates", "Settings"
+FUNCTIONS = sorted(name for name in lmshealth.__all__ if name.islower() or name in CLASSES)
 # Of these nothing is needed to import the package or to show help, and all take their time.
 HEAVY = (
     *(

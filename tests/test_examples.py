@@ -20,6 +20,7 @@ import pytest
 import lmshealth
 from lmshealth import examples
 from lmshealth.stage.description import load_stage
+from tests.test_api import FUNCTIONS
 
 # What the module of the example says of its machine: preload and mount left, and km to the limit.
 LEFT, KM_LEFT = (0.72, 0.87), 2457 - 1632
@@ -41,7 +42,7 @@ def outcome(test: doctest.DocTest) -> str:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", sorted(set(lmshealth.__all__) - set(lmshealth._RESULTS)))
+@pytest.mark.parametrize("name", FUNCTIONS)
 def test_example(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A user who pastes the example of a name, and nothing before it, sees what it says."""
     test = example_of(name)

@@ -14,8 +14,10 @@ from lmshealth.batch.run import run
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.errors import BadStage
+from lmshealth.machine.summary import summarise
 from lmshealth.report.pages import file_names
 from lmshealth.stage.description import load_stage
+from tests.assessments import worn
 from tests.security.guards import acting, bad_names
 from tests.security.hostile import BAD_STAGES, MACHINES, SECRET
 from tests.signals import write_archive, write_archive_stage
@@ -111,8 +113,8 @@ def test_a_link_is_no_store(tmp_path: Path) -> None:
 def test_sql_in_names_is_text(tmp_path: Path, store_url: str) -> None:
     """Names that hold statements are kept and found as they are, in either kind of store."""
     store = Store(store_url)
-    refused = store.put_refused(())
+    refused, made = store.put_refused(()), worn(tmp_path)
     for name in MACHINES:
-        store.publish(name, ["0" * 64], refused)
+        store.publish(name, ["0" * 64], summarise(made, made.service()), refused)
     assert sorted(one.machine for one in store.published()) == sorted(MACHINES)
     store.close()

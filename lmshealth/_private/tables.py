@@ -8,7 +8,7 @@ from collections.abc import Iterable, Mapping
 from datetime import datetime
 from functools import cached_property
 from importlib import resources
-from typing import Any
+from typing import Any, Literal
 
 import msgspec
 
@@ -79,6 +79,8 @@ class _Specification(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     run: dict[str, Table]
     command: dict[str, Table]
     refusals: dict[str, RefusalCode]
+    notices: dict[str, tuple[Literal["note", "caution", "serious"], str, str]]
+    steps: dict[str, str]
 
 
 _TEXT = (resources.files(__package__) / "tables.toml").read_bytes()
@@ -91,6 +93,10 @@ TABLES: Mapping[str, Table] = {**_READ.run, **_READ.command}
 """All tables, those of the answers of commands by their key there."""
 REFUSALS: Mapping[str, RefusalCode] = _READ.refusals
 """Every code in the column ``reason`` of ``refused.csv``."""
+NOTICES = _READ.notices
+"""Severity, sentence and what to do of notices, by code and case (`machine.status`)."""
+STEPS = _READ.steps
+"""Sentences of next steps, by their kind."""
 FLAGS: Mapping[str, str] = _READ.run["modes"].values["flags"]
 """Meaning of the flags of a mode."""
 MOMENTS = sorted(

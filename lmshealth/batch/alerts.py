@@ -19,8 +19,9 @@ from typing import IO, Any, NamedTuple
 import msgspec
 
 from lmshealth._private.files import read_table, write_bytes
+from lmshealth._private.serialize import pack
 from lmshealth.batch import constants
-from lmshealth.batch.store import Announced, Store, Unsent
+from lmshealth.batch.store import Announced, Store, Unsent, machine_key
 from lmshealth.io.refusal import shown, visible
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.machine.status import Change, Fleet, Status, compare
@@ -61,11 +62,7 @@ def last_number(store: Store) -> int:
 
 
 def announce(
-    store: Store,
-    made: Mapping[str, Status],
-    moment: datetime,
-    alerts: Alerts,
-    scope: Scope,
+    store: Store, made: Mapping[str, Status], moment: datetime, alerts: Alerts, scope: Scope
 ) -> tuple[tuple[Status, ...], list[Change], list[str]]:
     """Compare all machines of a folder of logs with what was announced, and queue their changes.
 
@@ -75,11 +72,8 @@ def announce(
     """
     unsent, everything = store.unsent(), store.announced()
     folder, notes = shown(os.path.abspath(scope.logs)), list[str]()
-    own = {
-        stage: one
-        for stage, one in everything.items()
-        if stage in made or PurePath(one.folder).is_relative_to(folder)
-    }
+    inside = {k for k, one in everything.items() if PurePath(one.folder).is_relative_to(folder)}
+    own = {stage: one for stage, one in everything.items() if stage in inside | made.keys()}
     known = {stage: one.status for stage, one in own.items()}
     try:
         written = msgspec.json.decode(read_table(scope.out / FILE), type=Fleet)
@@ -115,8 +109,10 @@ def announce(
         changes += found
         place = folder if stage in made or not last else last.folder
         announced.append(Announced(judged, place, tuple(sorted(channels)), number))
-    store.put_announced(announced)
-    store.put_unsent(queued)
+    for last in announced:
+        store.put("announced", {"": pack(last)}, last.status.stage)
+    for waits in queued:
+        store.put("unsent", {waits.key: pack(waits)}, waits.change.stage)
     return tuple(one.status for one in announced), changes, notes
 
 
@@ -144,7 +140,8 @@ def deliver(store: Store, machines: Sequence[Status], alerts: Alerts, out: Path)
                 again = "are sent again by the next run with this option"
                 failed[name] = f"{why}; {len(rows)} changes {again}"
             else:
-                store.remove_unsent(unsent)
+                for one in unsent:
+                    store.remove("unsent", machine_key(one.change.stage), one.key)
     return failed
 
 
@@ -179,16 +176,18 @@ def run_command(command: Sequence[str], content: bytes) -> str:
         given.write(content)
         given.seek(0)
         try:
-            process = subprocess.Popen(
-                command,
-                stdin=given,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.STDOUT,
-                start_new_session=True,
-            )
+            to: dict[str, Any] = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+            process = subprocess.Popen(command, stdin=given, start_new_session=True, **to)
         except OSError as error:
             return f"{visible(command[0])} cannot be started: {error.strerror}"
-    reader = Thread(target=_keep_end, args=(process.stdout, last), daemon=True)
+
+    def keep_end(stream: IO[bytes]) -> None:
+        """Read up to the end, and keep the last bytes."""
+        with stream:
+            while block := os.read(stream.fileno(), 1 << 16):
+                last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
+
+    reader = Thread(target=keep_end, args=(process.stdout,), daemon=True)
     reader.start()
     try:
         status = process.wait(constants.ALERT_TIMEOUT_S)
@@ -205,13 +204,6 @@ def run_command(command: Sequence[str], content: bytes) -> str:
     lines = bytes(last).decode(errors="replace").split("\n")
     line = next((line.strip() for line in reversed(lines) if line.strip()), "no output")
     return f"ended with status {status}: {visible(line[:200])}" if status else ""
-
-
-def _keep_end(stream: IO[bytes], last: bytearray) -> None:
-    """Read a stream up to its end, and keep its last bytes."""
-    with stream:
-        while block := os.read(stream.fileno(), 1 << 16):
-            last[:] = (last + block)[-constants.ALERT_OUTPUT_BYTES :]
 
 
 def notify() -> None:

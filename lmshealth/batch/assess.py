@@ -6,16 +6,16 @@ import logging
 from collections.abc import Callable, Container, Iterator, Sequence
 from concurrent.futures import CancelledError
 from dataclasses import dataclass, replace
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch.ingest import LogKey, unexpected
 from lmshealth.batch.store import (
-    Cached,
     Identified,
     PackedAssessment,
     Resources,
     Store,
+    cached,
     unpack_or_none,
 )
 from lmshealth.errors import LmshealthError
@@ -27,7 +27,6 @@ from lmshealth.machine.assessment import (
     with_calibration,
     with_fleet_prior,
 )
-from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.maintenance import Maintenance
@@ -35,8 +34,10 @@ from lmshealth.tracking.maintenance import Maintenance
 PackedLogs = tuple[tuple[str, bytes], ...]
 """Names of logs, and their packed estimates."""
 
-_Job = tuple["Machine", PackedLogs, dict[str, bytes]]
-_Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]  # with its key
+_Job = tuple["Machine", PackedLogs, bytes | None]  # with a packed `LifeState`
+# With the key of the result; without a prior the prognosis is calibrated by ended lives.
+_Update = tuple["Machine", str, FleetPrior | None, tuple[EndedLife, ...]]
+_UpdateJob = tuple[_Update, bytes | None, bytes | None]  # packed assessment and `LifeState`
 
 Part = TypeVar("Part")
 
@@ -81,17 +82,16 @@ def assess_all(
 
     def job(part: Sequence[Machine]) -> _Job:
         [one] = part
-        return one, packed_logs(one, store), {} if force else store.parts(one.name, one.key)
+        key = _life_key(one.stage, one.seed)
+        known = None if force else store.part(one.name, key, after=one.key)
+        return one, packed_logs(one, store), known
 
-    assessing: Cached[Machine, _Job, PackedAssessment | str | None] = Cached(
-        function=_assess_packed,
-        on_crash=lambda _, why: [why],
-        key=lambda one: fingerprint(one.name, one.key),
-        fetch=fetch,
-        job=job,
-    )
+    def key(one: Machine) -> str:
+        return fingerprint(one.name, one.key)
+
     resources.progress("assessing", 0, len(machines))
-    for k, ([(machine, made)], _) in enumerate(assessing.values(machines, resources), start=1):
+    found = cached(_assess_packed, machines, resources, key=key, fetch=fetch, job=job)
+    for k, ([(machine, made)], _) in enumerate(found, start=1):
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, machine.key, made)
         elif made is not None:
@@ -102,7 +102,7 @@ def assess_all(
 
 def packed_logs(machine: Machine, store: Store) -> PackedLogs:
     """Fetch the names and the packed estimates of the logs of a machine."""
-    contents = dict(store.packed_identified(key for _, key in machine.logs))
+    contents = dict(store.of_keys("identified", (key for _, key in machine.logs)))
     return tuple((log, contents[key]) for log, key in machine.logs if key in contents)
 
 
@@ -116,8 +116,7 @@ def unpack_logs(logs: PackedLogs) -> list[LogEstimates]:
 def pack_assessment(assessment: Assessment) -> PackedAssessment:
     """Encode an assessment for the store."""
     evidence = pack(FleetContribution(assessment.evidence, assessment.ended))
-    summary = pack(summarise(assessment, assessment.service()))
-    return PackedAssessment(pack(assessment), evidence, summary)
+    return PackedAssessment(pack(assessment), evidence)
 
 
 def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
@@ -125,11 +124,10 @@ def _assess_packed(job: _Job) -> list[PackedAssessment | str | None]:
     machine, logs, known = job
 
     def work() -> PackedAssessment:
-        readings, key = unpack_logs(logs), _life_key(machine.stage, machine.seed)
-        before = unpack_or_none(known.get(key), LifeState)
+        readings, before = unpack_logs(logs), unpack_or_none(known, LifeState)
         how = {"epochs": machine.epochs, "seed": machine.seed}
         found, after = assess_from(readings, machine.stage, machine.work, **how, before=before)
-        parts = {} if after is None else {key: pack(after)}
+        parts = {} if after is None else {_life_key(machine.stage, machine.seed): pack(after)}
         return replace(pack_assessment(found), parts=parts)
 
     return [reason_if_failed(work, machine.name, (CancelledError,))]
@@ -156,25 +154,12 @@ def apply_fleet_priors(
         return ((one, None) for one in of_part if store.has_assessment(one[0].name, one[1]))
 
     def job(part: Sequence[_Update]) -> _UpdateJob:
-        [(machine, key, prior, ended)] = part
-        return _UpdateJob(
-            machine=machine.name,
-            key=key,
-            content=store.assessment(machine.name, machine.key),
-            life=store.part(machine.name, _life_key(machine.stage, machine.seed)),
-            epochs=machine.epochs,
-            prior=prior,
-            ended=ended,
-        )
+        [one] = part
+        name, life_key = one[0].name, _life_key(one[0].stage, one[0].seed)
+        return one, store.get("assessed", one[0].key, name), store.part(name, life_key)
 
-    updating: Cached[_Update, _UpdateJob, PackedAssessment | str | None] = Cached(
-        function=_update,
-        on_crash=lambda _, why: [why],
-        key=lambda one: one[1],
-        fetch=fetch,
-        job=job,
-    )
-    for k, ([(one, made)], is_new) in enumerate(updating.values(updates, resources), start=1):
+    found = cached(_update, updates, resources, key=lambda one: one[1], fetch=fetch, job=job)
+    for k, ([(one, made)], is_new) in enumerate(found, start=1):
         machine, key, *_ = one
         if isinstance(made, PackedAssessment):
             store.put_assessment(machine.name, key, made)
@@ -200,7 +185,7 @@ def _machines_to_update(
     for fleet in fleets.values():
         evidence, ended = {}, list[EndedLife]()
         for name, machine in sorted(fleet.items()):
-            content = store.evidence(name, machine.key)
+            content = store.get("evidence", machine.key, name)
             if (own := unpack_or_none(content, FleetContribution)) is not None:
                 ended += own.ended
                 if own.evidence is not None:
@@ -211,33 +196,22 @@ def _machines_to_update(
             yield from ((fleet[m], None, tuple(ended)) for m in evidence if m not in priors)
 
 
-class _UpdateJob(NamedTuple):
-    """What is needed to recompute the prognosis of a machine, and the key of the result."""
-
-    machine: str
-    key: str
-    content: bytes | None  # packed assessment by the description
-    life: bytes | None  # packed `LifeState`
-    epochs: int
-    prior: FleetPrior | None  # None where the prognosis is calibrated instead
-    ended: tuple[EndedLife, ...]
-
-
 def _update(job: _UpdateJob) -> list[PackedAssessment | str | None]:
     """Recompute or calibrate a prognosis; None if it cannot be decoded, else why that fails."""
+    (machine, _, prior, ended), content, life = job
 
     def work() -> PackedAssessment | None:
-        found: Assessment | None = unpack_or_none(job.content, Assessment)
+        found: Assessment | None = unpack_or_none(content, Assessment)
         if found is None or found.track is None:
             return None
-        if job.prior is None:
+        if prior is None:
             is_open = found.prognosis is None
-            return None if is_open else pack_assessment(with_calibration(found, job.ended))
-        before = unpack_or_none(job.life, LifeState)
-        made = with_fleet_prior(found, job.prior, epochs=job.epochs, before=before)
+            return None if is_open else pack_assessment(with_calibration(found, ended))
+        before = unpack_or_none(life, LifeState)
+        made = with_fleet_prior(found, prior, epochs=machine.epochs, before=before)
         return pack_assessment(made)
 
-    return [reason_if_failed(work, job.machine)]
+    return [reason_if_failed(work, machine.name)]
 
 
 def reason_if_failed(

@@ -141,8 +141,17 @@ def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, A
     class Bounded(Connection[Any]):
         def wait(self, *given: Any, **more: Any) -> Any:
             # libpq waits without end for a server whose system still confirms packets.
-            late = Event()
-            timer = Timer(constants.ANSWER_TIMEOUT_S, _hang_up, [self.fileno(), late])
+            late, number = Event(), self.fileno()
+
+            def hang_up() -> None:
+                """Close both directions of the socket, which whoever waits for it notices."""
+                late.set()
+                connection = socket.socket(fileno=number)
+                with suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
+                connection.detach()
+
+            timer = Timer(constants.ANSWER_TIMEOUT_S, hang_up)
             timer.daemon = True
             timer.start()
             try:
@@ -156,15 +165,6 @@ def _connect_bounded(_: Any, __: Any, arguments: list[Any], options: dict[str, A
                 timer.cancel()
 
     return Bounded.connect(*arguments, **options)
-
-
-def _hang_up(number: int, late: Event) -> None:
-    """Close both directions of a socket, which whoever waits for it notices."""
-    late.set()
-    connection = socket.socket(fileno=number)
-    with suppress(OSError):
-        connection.shutdown(socket.SHUT_RDWR)
-    connection.detach()
 
 
 def _create_table(engine: Engine) -> bool:

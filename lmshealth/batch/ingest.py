@@ -15,7 +15,7 @@ from typing import Any, NamedTuple, Self
 from lmshealth._private.serialize import VERSION, fingerprint, pack
 from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
-from lmshealth.batch.store import Cached, Identified, Resources, Store
+from lmshealth.batch.store import Identified, Resources, Store, cached, unpack_or_none
 from lmshealth.batch.workers import Pool, Threads, cluster, processes
 from lmshealth.errors import BadLog
 from lmshealth.io.column_map import ColumnMap
@@ -152,27 +152,22 @@ def ingest(
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
 
-    def add(found: _Outcome) -> None:
-        lost.extend(found.refused)
-        owners[found.key[0]] = found.machine or owners.get(found.key[0])
-        if not found.refused:
-            own = groups.setdefault(str(found.machine), {}).setdefault(found.description, [])
-            own.append(found.key)
-
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
-    options: dict[str, Any] = {"stages": tuple(stages), "how": how}
-    identify = partial(_identify_logs, limit=settings.seconds_per_log, **options)
+    limit = settings.seconds_per_log
+    identify = partial(_identify_logs, stages=tuple(stages), how=how, limit=limit)
 
-    def fetch(part: Sequence[_Task]) -> Iterator[tuple[_Task, _Outcome]]:
-        for task, outcome in _cached(part, stages, store, settings.latest):
-            yield task, _Outcome.of(task, outcome, is_new=False)
-
+    fetch = partial(_cached, stages=stages, store=store, latest=settings.latest)
     n_cached = done = 0
     progress("identifying", 0, len(tasks))
     for part, is_new in _identified(tasks, identify, resources, fetch):
-        store.put_identified({one.key[1]: one.packed for one in part if one.packed is not None})
+        packed = {one.key[1]: one.packed for one in part if one.packed is not None}
+        store.put("identified", packed)
         for one in part:
-            add(one)
+            lost += one.refused
+            owners[one.key[0]] = one.machine or owners.get(one.key[0])
+            if not one.refused:
+                own = groups.setdefault(str(one.machine), {})
+                own.setdefault(one.description, []).append(one.key)
         n_cached += 0 if is_new else len(part)
         done += len(part)
         progress("identifying", done, len(tasks))
@@ -278,25 +273,18 @@ def _all_digests(
     store, digests = resources.store, dict[Path, str | BadLog]()
 
     def fetch(paths: Sequence[Path]) -> Iterator[tuple[Path, str]]:
-        known = store.digests(files[path][0] for path in paths)
-        return ((path, known[key]) for path in paths if (key := files[path][0]) in known)
+        known = dict(store.of_keys("hashed", (files[path][0] for path in paths)))
+        return ((path, known[key].decode()) for path in paths if (key := files[path][0]) in known)
 
-    hashing: Cached[Path, tuple[Path, ...], str | BadLog] = Cached(
-        function=_digests,
-        on_crash=lambda paths, why: [],  # a thread has none
-        key=lambda path: files[path][0],
-        fetch=fetch,
-        job=tuple,
-        most=constants.FILES_PER_HASH_TASK,
-    )
     resources.progress("reading", 0, len(files))
     # Threads hash at the same time, and start at once.
     in_threads = replace(resources, pool=Threads(resources.pool.size))
-    for part, is_new in hashing.values([*files], in_threads):
+    how: Any = {"key": lambda path: files[path][0], "most": constants.FILES_PER_HASH_TASK}
+    for part, is_new in cached(_digests, [*files], in_threads, fetch=fetch, **how):
         digests |= part
         if is_new:
             new = {files[path]: digest for path, digest in part if isinstance(digest, str)}
-            store.put_digests({key: digest for (key, is_old), digest in new.items() if is_old})
+            store.put("hashed", {key: one.encode() for (key, is_old), one in new.items() if is_old})
         resources.progress("reading", len(digests), len(files))
     return digests
 
@@ -314,7 +302,7 @@ def _digests(paths: Iterable[Path]) -> list[str | BadLog]:
 
 def _cached(
     tasks: Sequence[_Task], stages: Sequence[Stage], store: Store, latest: datetime | None
-) -> Iterator[tuple[_Task, Identified]]:
+) -> Iterator[tuple[_Task, _Outcome]]:
     """Yield the stored outcomes that are still valid.
 
     These are the outcomes that used no description, or that used the one which matches the log now,
@@ -322,14 +310,17 @@ def _cached(
     """
     digests = ["", _none_of(stages), *(stage.digest for stage in stages)]
     own = {task.key(digest): task for task in tasks for digest in digests}
-    for key, found in store.identified(own):
+    for key, content in store.of_keys("identified", own):
+        if (found := unpack_or_none(content, Identified)) is None:
+            continue
         matching = _matching(stages, Metadata(stage=found.stage, description=found.asked))
         used = "" if matching is None else matching.digest
         is_late = isinstance(found.outcome, LogEstimates) and is_future(
             found.outcome.metadata.recorded_at, latest
         )
         if found.description in ("", _none_of(stages), used) and not is_late:
-            yield own[key], found.renamed(own[key].name)
+            outcome = _Outcome.of(own[key], found.renamed(own[key].name), is_new=False)
+            yield own[key], outcome
 
 
 def _matching(stages: Sequence[Stage], metadata: Metadata) -> Stage | None:
@@ -353,15 +344,9 @@ def _identified(
     Yield some outcomes at a time, and whether they are new.
     """
     lost: list[tuple[_Task, ...]] = []
-    identifying: Cached[_Task, tuple[_Task, ...], _Outcome | None] = Cached(
-        function=identify,
-        on_crash=lambda part, why: [None] * len(part),
-        key=lambda task: task.key(""),
-        fetch=fetch,
-        job=tuple,
-        most=constants.LOGS_PER_TASK,
-    )
-    for part, is_new in identifying.values(tasks, resources):
+    how: Any = {"key": lambda task: task.key(""), "most": constants.LOGS_PER_TASK}
+    how |= {"on_crash": lambda part, why: [None] * len(part)}
+    for part, is_new in cached(identify, tasks, resources, fetch=fetch, **how):
         lost += [(task,) for task, outcome in part if outcome is None]
         yield [outcome for _, outcome in part if outcome is not None], is_new
     for _, outcomes in resources.pool.map_unordered(identify, lost, _crashed):

@@ -7,7 +7,7 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -15,6 +15,7 @@ from datetime import time as day_time
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
+from typing import Any
 
 import msgspec
 
@@ -32,8 +33,8 @@ from lmshealth.batch.assess import (
     reason_if_failed,
     unpack_logs,
 )
-from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
-from lmshealth.batch.store import Cached, Resources, Store, default_url, unpack_or_none
+from lmshealth.batch.ingest import NOT_LISTED, Settings, ingest
+from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
@@ -245,33 +246,46 @@ def run(
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
         judging = _judging(store, settings)
-        done, made, tables, excluded = _report(usable, refused, resources, out, judging)
+        rows, lacking, made = _report(usable, refused, resources, out, judging)
+        present = {name: output.status for name, output in made.items()}
+        tables = {name: output.tables for name, output in made.items()}
         with store.alone():  # a run that ends before its tables are written has announced nothing
-            statuses, changes, notes = announce(store, made, judging.moment, settings.alerts, scope)
+            found = announce(store, present, judging.moment, settings.alerts, scope)
+            statuses, changes, notes = found
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
             tables[""] = {name: pack(csv_text(name, own)) for name, own in of_run.items()}
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
             with in_language(settings.language):
-                write_index(out, done.rows, refused, today=judging.moment.date())
+                write_index(out, rows, refused, today=judging.moment.date())
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
-    counted, lost = _counted(done, ingested, refused, excluded)
+    excluded = {log for output in made.values() for log in output.excluded}
+    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
+    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
+    lost = (others - copies | excluded) & ingested.logs
+    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
             f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
-    return replace(
-        counted,
-        failed=failed | done.failed,
+    return RunResult(
+        index=out / "index.html",
+        rows=rows,
+        failed=failed | lacking,
+        n_logs=len(ingested.logs - copies),
+        n_refused=len(lost),
+        n_remembered=ingested.n_cached,
+        n_unlisted=len(unlisted),
+        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
         statuses=statuses,
         changes=tuple(changes),
         unsent=unsent,
-        notes=(*counted.notes, *notes),
+        notes=(*misspelt, *notes),
     )
 
 
@@ -293,19 +307,18 @@ def report(
     progress("reporting", 0, len(present))
     judging = _judging(store, settings)
     refused = store.refused(one.refused for one in present)
-    lost = _lost_of(refused)
+    record = _records(store, refused, settings.language)
     # A process takes longer to start than a page to write.
     few = replace(settings, workers=min(settings.workers, len(present)))
     with few.pool() as pool:
-        own = ((one.machine, one.key, files[one.machine]) for one in present)
-        records = (_record(*one, store, settings.language, lost) for one in own)
+        records = (record(one.machine, one.key, files[one.machine]) for one in present)
         made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]
         made = pool.map_unordered(output_or_reason, records, lambda _, why: [why])
-        for record, [output] in made:
+        for drawn, [output] in made:
             if isinstance(output, str):
-                failed[record.machine] = output
+                failed[drawn.machine] = output
             elif output is not None:
-                rows[record.machine] = judging.write(output, out / record.file)
+                rows[drawn.machine] = judging.write(output, out / drawn.file)
             progress("reporting", len(rows) + len(failed), len(present))
     if not rows and not failed:
         raise store.unfilled("no assessment that this version of lmshealth can read")
@@ -339,26 +352,6 @@ def _prepare(out: Path) -> None:
         raise LmshealthError(f"{out}: cannot be written to: {error.strerror}") from error
 
 
-def _counted(
-    result: RunResult, ingested: Ingested, refused: Sequence[Refusal], excluded: set[str]
-) -> tuple[RunResult, set[str]]:
-    """Add counts and notes to a result; return the logs that were refused as a whole too."""
-    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
-    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
-    lost = (others - copies | excluded) & ingested.logs
-    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
-    counted = replace(
-        result,
-        n_logs=len(ingested.logs - copies),
-        n_refused=len(lost),
-        n_remembered=ingested.n_cached,
-        n_unlisted=len(unlisted),
-        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
-        notes=(*result.notes, *misspelt),
-    )
-    return counted, lost
-
-
 def _others(folder: Path, logs: frozenset[str]) -> str:
     """Return the suffixes of the files of a folder without logs."""
     if logs:
@@ -390,18 +383,18 @@ def _report(
     resources: Resources,
     out: Path,
     judging: Judging,
-) -> tuple[RunResult, dict[str, Status], dict[str, dict[str, bytes]], set[str]]:
-    """Write pages; return the result without counts, statuses, packed tables, and excluded logs.
+) -> tuple[tuple[Summary, ...], dict[str, str], dict[str, MachineOutput]]:
+    """Write pages; return summaries, why machines have none, and all outputs without their pages.
 
     Machines whose assessment is missing, or cannot be decoded, are assessed once more.
     """
     store, names = resources.store, [machine.name for machine in machines]
     files, own_keys = file_names(names), {machine.name: machine.key for machine in machines}
-    refused_key, lost = store.put_refused(tuple(refused)), _lost_of(refused)
-    rows, excluded, made = dict[str, Summary](), set[str](), dict[str, Status]()
+    refused_key = store.put_refused(tuple(refused))
+    record = _records(store, refused, judging.language)
+    rows, made = dict[str, Summary](), dict[str, MachineOutput]()
     failed, not_updated = dict[str, str](), dict[str, str]()
     resources.progress("reporting", 0, len(machines))
-    tables = dict[str, dict[str, bytes]]()
     left = list(machines)
     for attempt in range(constants.ASSESSMENT_ATTEMPTS):
         if attempt:
@@ -409,48 +402,34 @@ def _report(
         force = {machine.name for machine in left} if attempt else ()
         keys, not_recomputed = apply_fleet_priors(machines, resources, force=force)
         not_updated |= not_recomputed
-        for name, output in _outputs(left, keys, files, resources, judging.language, lost):
+        records = {name: partial(record, name, keys[name], files[name]) for name in names}
+        for name, output in _outputs(left, records, resources):
             if isinstance(output, str):
                 failed[name] = output
                 continue
-            store.publish(name, (keys[name], own_keys[name]), refused_key)
-            tables[name] = output.tables
-            excluded.update(output.excluded)
-            made[name] = output.status
+            store.publish(name, (keys[name], own_keys[name]), output.summary, refused_key)
+            made[name] = replace(output, page="")
             rows[name] = judging.write(output, out / files[name])
             resources.progress("reporting", len(rows), len(machines))
         left = [m for m in left if m.name not in rows and m.name not in failed]
         if not left:
             break
     unread = {machine.name: "its assessment cannot be read back from the store" for machine in left}
-    result = RunResult(
-        index=out / "index.html",
-        rows=tuple(by_urgency(rows.values())),
-        failed=not_updated | unread | failed,
-    )
-    return result, made, tables, excluded
+    return tuple(by_urgency(rows.values())), not_updated | unread | failed, made
 
 
 def _outputs(
     machines: Sequence[Machine],
-    keys: Mapping[str, str],
-    files: Mapping[str, str],
+    records: Mapping[str, Callable[..., MachineRecord]],
     resources: Resources,
-    language: Language,
-    lost: Mapping[str, tuple[Refusal, ...]],
 ) -> Iterator[tuple[str, MachineOutput | str]]:
     """Yield the outputs of machines; those of unchanged results are taken from the store.
 
     A machine whose assessment is missing, or cannot be decoded, is left out.
     """
     store = resources.store
-
-    def record(machine: Machine, logs: PackedLogs | None = None) -> MachineRecord:
-        name = machine.name
-        return _record(name, keys[name], files[name], store, language, lost, logs)
-
     # Its logs, which are large, follow from their names and keys.
-    own = {one.name: fingerprint(VERSION, record(one), one.logs) for one in machines}
+    own = {one.name: fingerprint(VERSION, records[one.name](), one.logs) for one in machines}
 
     def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, MachineOutput]]:
         for machine in part:
@@ -460,45 +439,32 @@ def _outputs(
 
     def job(part: Sequence[Machine]) -> MachineRecord:
         [machine] = part
-        return record(machine, packed_logs(machine, store))
+        return records[machine.name](packed_logs(machine, store))
 
-    drawing: Cached[Machine, MachineRecord, MachineOutput | str | None] = Cached(
-        function=output_or_reason,
-        on_crash=lambda _, why: [why],
-        key=lambda machine: own[machine.name],
-        fetch=fetch,
-        job=job,
-    )
-    for [(machine, drawn)], is_new in drawing.values(machines, resources):
+    how: Any = {"key": lambda machine: own[machine.name], "fetch": fetch, "job": job}
+    for [(machine, drawn)], is_new in cached(output_or_reason, machines, resources, **how):
         name = machine.name
         if is_new and isinstance(drawn, MachineOutput):
-            store.put_part(name, own[name], pack(drawn))
+            store.put("parts", {own[name]: pack(drawn)}, name)
         if drawn is not None:
             yield name, drawn
 
 
-def _record(
-    machine: str,
-    key: str,
-    file: str,
-    store: Store,
-    language: Language,
-    lost: Mapping[str, tuple[Refusal, ...]],
-    logs: PackedLogs | None = None,
-) -> MachineRecord:
-    """Fetch the results of a machine from the store; ``lost`` are of all machines."""
-    assessment, before = store.assessment(machine, key), store.previous_summary(machine, key)
-    own = lost.get(machine, ())
-    return MachineRecord(machine, file, assessment, logs, before, own, language)
-
-
-def _lost_of(refused: Iterable[Refusal]) -> dict[str, tuple[Refusal, ...]]:
-    """Return the logs of each machine that were refused as a whole."""
-    found: dict[str, list[Refusal]] = {}
+def _records(
+    store: Store, refused: Iterable[Refusal], language: Language
+) -> Callable[..., MachineRecord]:
+    """Return what fetches the results of a machine, of which some logs were refused as a whole."""
+    lost: dict[str, list[Refusal]] = {}
     for one in refused:
         if one.reason not in _COPIES:
-            found.setdefault(one.machine, []).append(one)
-    return {machine: tuple(own) for machine, own in found.items()}
+            lost.setdefault(one.machine, []).append(one)
+
+    def record(name: str, key: str, file: str, logs: PackedLogs | None = None) -> MachineRecord:
+        assessment, before = store.get("assessed", key, name), store.previous_summary(name, key)
+        own = tuple(lost.get(name, ()))
+        return MachineRecord(name, file, assessment, logs, before, own, language)
+
+    return record
 
 
 # Watch

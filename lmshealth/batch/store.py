@@ -3,7 +3,7 @@
 The key of a value is a fingerprint of everything that it depends on. A change of any of it gives
 another key, so that only stale values are computed again. A value that is damaged is removed and
 counts as absent, and so does one that this version cannot decode. Every write may be repeated, and
-may be made by two runs at once: runs may be killed, and may share a store. `Cached` functions are
+may be made by two runs at once: runs may be killed, and may share a store. `cached` functions are
 computed where the store lacks their values; the runs on a store divide that work.
 """
 
@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Se
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Generic, Self, TypeVar
+from typing import Any, Self, TypeVar
 
 import sqlalchemy as sql
 from sqlalchemy.dialects import postgresql
@@ -23,17 +23,8 @@ from sqlalchemy.engine import URL, Connection
 from sqlalchemy.exc import DBAPIError, SQLAlchemyError
 
 from lmshealth._private.serialize import fingerprint, pack, unpack
-from lmshealth.batch import constants
-from lmshealth.batch.database import (
-    INSERT,
-    VALUES,
-    StoreError,
-    connect,
-    is_older,
-    next_step,
-    reason,
-    shown_address,
-)
+from lmshealth.batch import constants, database
+from lmshealth.batch.database import VALUES, StoreError
 from lmshealth.batch.workers import OnCrash, Pool, Progress, Task
 from lmshealth.io.log import Refusal
 from lmshealth.machine.status import Change, Status
@@ -85,7 +76,7 @@ def _renamed(refused: tuple[Refusal, ...], log: str) -> tuple[Refusal, ...]:
 
 @dataclass(frozen=True, slots=True)
 class PackedAssessment:
-    """An assessment as bytes: as a whole, its evidence for a fleet prior, and its summary.
+    """An assessment as bytes: as a whole, and its evidence for a fleet prior.
 
     ``parts`` are those of its results that the next assessment may use, by key; None if all that
     are stored stay.
@@ -93,7 +84,6 @@ class PackedAssessment:
 
     content: bytes
     evidence: bytes
-    summary: bytes
     parts: dict[str, bytes] | None = None
 
 
@@ -112,11 +102,11 @@ class Published:
 
 @dataclass(frozen=True, slots=True)
 class _Report:
-    """Packed summary of a published assessment, its key, and its number for the machine."""
+    """Summary of a published assessment, its key, and its number for the machine."""
 
     key: str
     number: int
-    summary: bytes
+    summary: Summary
 
 
 @dataclass(frozen=True, slots=True)
@@ -166,8 +156,8 @@ def default_url(folder: Path) -> URL:
     return URL.create("sqlite", database=str(path))
 
 
-_ASSESSMENT = "assessed", "evidence", "summary"
-"""Kinds of the values of an assessment: as a whole, its evidence for a fleet, its summary."""
+_ASSESSMENT = "assessed", "evidence"
+"""Kinds of the values of an assessment: as a whole, and its evidence for a fleet."""
 
 
 class Store:
@@ -177,8 +167,8 @@ class Store:
     """
 
     def __init__(self, url: str | URL, *, create: bool = True) -> None:
-        self._engine, self._address, self._made_anew = connect(url, create=create)
-        self._shown, self._writes = shown_address(self._address), create
+        self._engine, self._address, self._made_anew = database.connect(url, create=create)
+        self._shown, self._writes = database.shown_address(self._address), create
         self._claims: Connection | None = None
         self._open: Connection | None = None  # transaction
         self.damaged: Counter[str] = Counter()  # values that were damaged, by their kind
@@ -186,7 +176,7 @@ class Store:
             tables = sql.inspect(self._engine).get_table_names()
         if VALUES.name not in tables:
             found = "no results"
-            if is_older(tables):
+            if database.is_older(tables):
                 found = "only results of another version of lmshealth"
             self.close()
             raise self.unfilled(f"{found} (no table {VALUES.name})")
@@ -287,101 +277,57 @@ class Store:
                 connection.exec_driver_sql("BEGIN IMMEDIATE")
             yield
 
-    # Logs
-
-    def digests(self, keys: Iterable[str]) -> dict[str, str]:
-        """Fetch the digests of the content of those files that are known by their keys."""
-        return {key: content.decode() for key, content in self._of_keys("hashed", keys)}
-
-    def put_digests(self, digests: Mapping[str, str]) -> None:
-        """Store digests of the content of files."""
-        self._put("hashed", {key: digest.encode() for key, digest in digests.items()})
-
-    def identified(self, keys: Iterable[str]) -> Iterator[tuple[str, Identified]]:
-        """Fetch the outcomes of those logs that are stored, under their names of that time."""
-        for key, content in self.packed_identified(keys):
-            if (found := unpack_or_none(content, Identified)) is not None:
-                yield key, found
-
-    def packed_identified(self, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
-        """Fetch the same as bytes, for `unpack_or_none` in a worker."""
-        yield from self._of_keys("identified", keys)
-
-    def put_identified(self, outcomes: Mapping[str, bytes]) -> None:
-        """Store packed outcomes of logs by their keys."""
-        self._put("identified", outcomes)
-
     # Machines
 
     def has_assessment(self, machine: str, key: str) -> bool:
         """Return whether a machine has an undamaged assessment under a key."""
-        return all(self._get(kind, key, machine) is not None for kind in _ASSESSMENT)
-
-    def assessment(self, machine: str, key: str) -> bytes | None:
-        """Fetch a packed assessment; None where it is not stored."""
-        return self._get("assessed", key, machine)
-
-    def evidence(self, machine: str, key: str) -> bytes | None:
-        """Fetch the packed evidence of an assessment for a fleet prior; None as before."""
-        return self._get("evidence", key, machine)
+        return all(self.get(kind, key, machine) is not None for kind in _ASSESSMENT)
 
     def put_assessment(self, machine: str, key: str, made: PackedAssessment) -> None:
         """Store an assessment of a machine, and its parts in place of those stored before."""
-        contents = made.content, made.evidence, made.summary
         with self.transaction():
-            for kind, content in zip(_ASSESSMENT, contents, strict=True):
-                self._put(kind, {key: content}, machine)
+            for kind, content in zip(_ASSESSMENT, (made.content, made.evidence), strict=True):
+                self.put(kind, {key: content}, machine)
             if made.parts is not None:
                 self._keep("parts", machine, made.parts)
-                self._put("parts", made.parts, machine)
+                self.put("parts", made.parts, machine)
 
-    def put_part(self, machine: str, key: str, content: bytes) -> None:
-        """Store one more part of the last assessment of a machine."""
-        self._put("parts", {key: content}, machine)
+    def part(self, machine: str, key: str, *, after: str = "") -> bytes | None:
+        """Fetch a part of the last assessment of a machine; None where it is not stored.
 
-    def part(self, machine: str, key: str) -> bytes | None:
-        """Fetch a part of the last assessment of a machine; None where it is not stored."""
-        return self._get("parts", key, machine)
-
-    def parts(self, machine: str, key: str = "") -> dict[str, bytes]:
-        """Fetch the parts of the last assessment of a machine, for the next one, by their keys.
-
-        There are none for one that was lost: from its own parts it would have other draws.
+        There is none for the assessment under the key ``after`` if that was the last and is lost:
+        from its own parts it would have other draws.
         """
-        if any(key in one.kept for one in self._decoded("present", Published, machine)):
-            return {}
-        return dict(self._all("parts", machine))
+        present = self._decoded("present", Published, machine) if after else []
+        is_lost = any(after in one.kept for one in present)
+        return None if is_lost else self.get("parts", key, machine)
 
     def put_refused(self, refused: tuple[Refusal, ...]) -> str:
         """Store a list of logs that were refused as a whole, and return its key."""
         key = fingerprint(refused)
-        self._put("refused", {key: pack(refused)})
+        self.put("refused", {key: pack(refused)})
         return key
 
-    def publish(self, machine: str, keys: Sequence[str], refused: str) -> None:
+    def publish(self, machine: str, keys: Sequence[str], summary: Summary, refused: str) -> None:
         """Make an assessment the present one of a machine, and delete its other assessments.
 
         The keys are that of the assessment, and those of others of the machine that stay;
         ``refused`` is that of the list of logs that were refused as a whole.
         """
         key = keys[0]
-        summary = self._get("summary", key, machine)
         reports = self._decoded("reports", _Report, machine)
         number = 1 + max((one.number for one in reports), default=0)
         with self.transaction():
             present = Published(machine, key, refused, tuple(keys))
-            self._put("present", {"": pack(present)}, machine)
-            if summary is not None:
-                self._put("reports", {key: pack(_Report(key, number, summary))}, machine)
+            self.put("present", {"": pack(present)}, machine)
+            self.put("reports", {key: pack(_Report(key, number, summary))}, machine)
             for kind in _ASSESSMENT:
                 self._keep(kind, machine, keys)
 
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
-        reports = (one for one in self._decoded("reports", _Report, machine) if one.key != key)
-        newest_first = sorted(reports, key=lambda one: one.number, reverse=True)
-        summaries = (unpack_or_none(one.summary, Summary) for one in newest_first)
-        return next((summary for summary in summaries if summary is not None), None)
+        reports = [one for one in self._decoded("reports", _Report, machine) if one.key != key]
+        return max(reports, key=lambda one: one.number).summary if reports else None
 
     def published(self) -> tuple[Published, ...]:
         """List the published assessments of all machines by name; `StoreError` if none is."""
@@ -395,7 +341,7 @@ class Store:
         asked = dict.fromkeys(keys)
         found = {
             key: unpack_or_none(content, tuple[Refusal, ...]) or ()
-            for key, content in self._of_keys("refused", asked)
+            for key, content in self.of_keys("refused", asked)
         }
         return tuple(dict.fromkeys(one for key in asked for one in found.get(key, ())))
 
@@ -405,40 +351,19 @@ class Store:
         """Fetch what was announced of each machine last."""
         return {one.status.stage: one for one in self._decoded("announced", Announced)}
 
-    def put_announced(self, announced: Iterable[Announced]) -> None:
-        """Store what was announced of machines."""
-        for one in announced:
-            self._put("announced", {"": pack(one)}, one.status.stage)
-
     def unsent(self) -> list[Unsent]:
         """Fetch the changes that are to be delivered, the oldest first."""
         found = self._decoded("unsent", Unsent)
         return sorted(found, key=lambda one: (one.number, one.change.stage))
 
-    def put_unsent(self, unsent: Iterable[Unsent]) -> None:
-        """Store changes that are to be delivered."""
-        for one in unsent:
-            self._put("unsent", {one.key: pack(one)}, one.change.stage)
-
-    def remove_unsent(self, sent: Iterable[Unsent]) -> None:
-        """Remove changes that were delivered."""
-        for one in sent:
-            self._remove("unsent", machine_key(one.change.stage), one.key)
-
     # Values
 
-    def _get(self, kind: str, key: str, machine: str) -> bytes | None:
+    def get(self, kind: str, key: str, machine: str) -> bytes | None:
         """Fetch a value of a machine; None where there is none, or it is damaged."""
-        return dict(self._all(kind, machine, VALUES.c.key == key)).get(key)
+        found = self._intact(kind, VALUES.c.owner == machine_key(machine), VALUES.c.key == key)
+        return dict(found).get(key)
 
-    def _all(
-        self, kind: str, machine: str | None, *where: sql.ColumnElement[bool]
-    ) -> list[tuple[str, bytes]]:
-        """Fetch the values of a machine, or of all (None), with their keys."""
-        own = () if machine is None else (VALUES.c.owner == machine_key(machine),)
-        return self._intact(kind, *own, *where)
-
-    def _of_keys(self, kind: str, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
+    def of_keys(self, kind: str, keys: Iterable[str]) -> Iterator[tuple[str, bytes]]:
         """Fetch the values of no machine that are there under keys, some rows in each query."""
         asked = list(dict.fromkeys(keys))
         for first in range(0, len(asked), constants.ROWS_PER_QUERY):
@@ -447,7 +372,8 @@ class Store:
 
     def _decoded(self, kind: str, of: type[Record], machine: str | None = None) -> list[Record]:
         """Fetch those values of a machine, or of all, that this version can decode."""
-        found = (unpack_or_none(content, of) for _, content in self._all(kind, machine))
+        own = () if machine is None else (VALUES.c.owner == machine_key(machine),)
+        found = (unpack_or_none(content, of) for _, content in self._intact(kind, *own))
         return [one for one in found if one is not None]
 
     def _intact(self, kind: str, *where: sql.ColumnElement[bool]) -> list[tuple[str, bytes]]:
@@ -465,11 +391,11 @@ class Store:
             self.damaged[kind] += 1
             _logger.info("damaged row of %s in the store %s", kind, self._shown)
             if self._writes:
-                self._remove(kind, owner, key)
+                self.remove(kind, owner, key)
         return found
 
-    def _put(self, kind: str, values: Mapping[str, bytes], machine: str | None = None) -> None:
-        """Write sealed values of a machine, or of none, in one statement; later ones replace."""
+    def put(self, kind: str, values: Mapping[str, bytes], machine: str | None = None) -> None:
+        """Write values of a machine, or of none, sealed in one statement; later ones replace."""
         if not values:
             return
         owner = "" if machine is None else machine_key(machine)
@@ -478,7 +404,7 @@ class Store:
             for key, content in values.items()
             for sealed in [_seal(content, kind, owner, key) + content]
         ]
-        insert = INSERT[self._engine.dialect.name](VALUES).values(rows[0])
+        insert = database.INSERT[self._engine.dialect.name](VALUES).values(rows[0])
         keys = [column.name for column in VALUES.primary_key]
         rest = {name: insert.excluded[name] for name in rows[0] if name not in keys}
         with self.transaction() as connection:
@@ -491,7 +417,8 @@ class Store:
         with self.transaction() as connection:
             connection.execute(sql.delete(VALUES).where(*where, VALUES.c.key.not_in([*keys])))
 
-    def _remove(self, kind: str, owner: str, key: str) -> None:
+    def remove(self, kind: str, owner: str, key: str) -> None:
+        """Delete a value of an owner (`machine_key`)."""
         with self.transaction() as connection:
             connection.execute(sql.delete(VALUES).filter_by(kind=kind, owner=owner, key=key))
 
@@ -517,8 +444,8 @@ class Store:
         try:
             yield
         except SQLAlchemyError as error:
-            why = reason(error, self._address)
-            step = next_step(error, self._address)
+            why = database.reason(error, self._address)
+            step = database.next_step(error, self._address)
             step = step or "its results are kept, run again to continue"
             # The cause would quote the row.
             raise StoreError(f"the store {self._shown} failed: {why}; {step}") from None
@@ -556,8 +483,8 @@ def _seal(content: bytes, *place: Any) -> bytes:
 # Cached functions
 
 Piece = TypeVar("Piece")
-Job = TypeVar("Job")
 Value = TypeVar("Value")
+Pairs = list[tuple[Piece, Value]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -569,71 +496,64 @@ class Resources:
     progress: Progress = lambda step, done, total: None
 
 
-Pairs = list[tuple[Piece, Value]]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Cached(Generic[Piece, Job, Value]):
-    """A pure function of pieces of work, whose values a store keeps.
+def cached(
+    function: Task[Any, Sequence[Value]],
+    pieces: Sequence[Piece],
+    resources: Resources,
+    *,
+    key: Callable[[Piece], str],
+    fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]],
+    job: Callable[[Sequence[Piece]], Any] = tuple,
+    most: int = 1,
+    on_crash: OnCrash[Any, Any] = lambda _, why: [why],
+) -> Iterator[tuple[Pairs[Piece, Value], bool]]:
+    """Yield pieces of work with their values by a pure function, and whether these are new.
 
     ``key`` is the fingerprint of all that the value of a piece depends on, and ``fetch`` yields
     those pieces whose value is in the store, with it. Of the others a run claims some, at most
     ``most`` at a time, and makes a ``job`` of those that it gets, of which a worker computes the
-    function: a list of their values. ``on_crash`` makes that of a job that ends its worker.
+    function: a list of their values. ``on_crash`` makes that of a job that ends its worker; by
+    default it is the reason. What other runs have claimed is looked at again in the end: they store
+    its value, or end without. The caller stores new values before it asks for the next.
     """
+    store = resources.store
 
-    function: Task[Job, Sequence[Value]]
-    on_crash: OnCrash[Job, Sequence[Value]]
-    key: Callable[[Piece], str]
-    fetch: Callable[[Sequence[Piece]], Iterable[tuple[Piece, Value]]]
-    job: Callable[[Sequence[Piece]], Job]
-    most: int = 1
-
-    def values(
-        self, pieces: Sequence[Piece], resources: Resources
-    ) -> Iterator[tuple[Pairs[Piece, Value], bool]]:
-        """Yield all pieces with their values, some at a time, and whether these are new.
-
-        What other runs have claimed is looked at again in the end: they store its value, or end
-        without. The caller stores new values before it asks for the next.
-        """
-        left, is_waiting = pieces, False
-        while left:
-            known = set[str]()
-            for piece, value in self.fetch(left):
-                known.add(self.key(piece))
-                yield [(piece, value)], False
-            if is_waiting and not known:
-                time.sleep(constants.OTHERS_POLL_S)
-            left = [piece for piece in left if self.key(piece) not in known]
-            others = yield from self._unclaimed(left, resources)
-            left, is_waiting = others, len(others) == len(left)
-
-    def _unclaimed(
-        self, pieces: Sequence[Piece], resources: Resources
+    def compute(
+        pieces: Sequence[Piece],
     ) -> Generator[tuple[Pairs[Piece, Value], bool], None, list[Piece]]:
         """Compute the values of unclaimed pieces; return the other pieces."""
-        store, others, claimed = resources.store, list[Piece](), dict[int, list[Piece]]()
+        others, claimed = list[Piece](), dict[int, list[Piece]]()
         # A few are spread over the workers.
-        size = min(self.most, max(1, len(pieces) // (4 * resources.pool.size)))
+        size = min(most, max(1, len(pieces) // (4 * resources.pool.size)))
 
-        def jobs() -> Iterator[Job]:
+        def jobs() -> Iterator[Any]:
             for first in range(0, len(pieces), size):
-                part = [(self.key(piece), piece) for piece in pieces[first : first + size]]
-                own = store.claim([key for key, _ in part])
+                part = [(key(piece), piece) for piece in pieces[first : first + size]]
+                own = store.claim([one for one, _ in part])
                 if store.is_divided:  # another run may have done it since this one began
-                    mine = [piece for key, piece in part if key in own]
-                    done = {self.key(piece) for piece, _ in self.fetch(mine)}
+                    done = {key(piece) for piece, _ in fetch([p for k, p in part if k in own])}
                     store.release([*done])
                     own -= done
-                others.extend(piece for key, piece in part if key not in own)
-                if mine := [piece for key, piece in part if key in own]:
-                    job = self.job(mine)
-                    claimed[id(job)] = mine
-                    yield job
+                others.extend(piece for one, piece in part if one not in own)
+                if mine := [piece for one, piece in part if one in own]:
+                    made = job(mine)
+                    claimed[id(made)] = mine
+                    yield made
 
-        for job, values in resources.pool.map_unordered(self.function, jobs(), self.on_crash):
-            mine = claimed.pop(id(job))
+        for made, values in resources.pool.map_unordered(function, jobs(), on_crash):
+            mine = claimed.pop(id(made))
             yield list(zip(mine, values, strict=True)), True
-            store.release([self.key(piece) for piece in mine])
+            store.release([key(piece) for piece in mine])
         return others
+
+    left, is_waiting = pieces, False
+    while left:
+        known = set[str]()
+        for piece, value in fetch(left):
+            known.add(key(piece))
+            yield [(piece, value)], False
+        if is_waiting and not known:
+            time.sleep(constants.OTHERS_POLL_S)
+        left = [piece for piece in left if key(piece) not in known]
+        others = yield from compute(left)
+        left, is_waiting = others, len(others) == len(left)

@@ -15,14 +15,7 @@ import socket
 import threading
 import warnings
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import (
-    BrokenExecutor,
-    CancelledError,
-    Executor,
-    Future,
-    ThreadPoolExecutor,
-    wait,
-)
+from concurrent import futures
 from contextlib import contextmanager
 from functools import partial
 from itertools import chain, islice
@@ -85,7 +78,7 @@ class Threads(Pool):
         self, function: Task[Item, Result], items: Iterable[Item], on_crash: OnCrash[Item, Result]
     ) -> Iterator[tuple[Item, Result]]:
         """Apply a function to items, at most ``size`` at a time."""
-        with ThreadPoolExecutor(self.size) as executor:
+        with futures.ThreadPoolExecutor(self.size) as executor:
             for item, future in _completed(executor, function, iter(items), self.size):
                 yield item, future.result()
 
@@ -119,26 +112,19 @@ class _ProcessPool(Pool):
                     first = self.executor.submit(os.getpid)
                 first.result()
                 return
-            except BrokenExecutor:
-                self.kill()
+            except futures.BrokenExecutor:
+                self.close(kill=True)
             except BaseException:
-                self.kill()
+                self.close(kill=True)
                 raise
         found = f"worker processes end as they start ({constants.START_ATTEMPTS} attempts)"
         raise LmshealthError(f"{found}: is there enough memory? Use fewer --workers")
 
-    def kill(self) -> None:
-        """End all processes at once, whatever they are doing."""
-        self._end(kill_workers=True)
-
-    def close(self) -> None:
-        """Wait for the tasks that are running, and end the processes."""
-        self._end()
-
-    def _end(self, **how: bool) -> None:
+    def close(self, *, kill: bool = False) -> None:
+        """End all processes, after the tasks that are running, or at once."""
         if self._n_started:
             self._n_started = 0
-            self.executor.shutdown(**how)
+            self.executor.shutdown(kill_workers=kill)
             self._open_end.close()
 
     def map_unordered(
@@ -154,7 +140,7 @@ class _ProcessPool(Pool):
             for item, future in _completed(self.executor, function, left, self.size):
                 try:
                     result = future.result()
-                except BrokenExecutor:
+                except futures.BrokenExecutor:
                     interrupted.append(item)
                     continue
                 yield item, result
@@ -162,7 +148,7 @@ class _ProcessPool(Pool):
                 return
             # One of these items ended its process, and with it the pool. Each is run again alone,
             # so that only that one is lost.
-            self.kill()
+            self.close(kill=True)
             self.start(len(first))
             with _process_pool(1) as single:
                 for item in interrupted:
@@ -178,31 +164,31 @@ class _ProcessPool(Pool):
             try:
                 result: Result = self.executor.submit(function, item).result()
                 return result
-            except BrokenExecutor:
-                self.kill()
+            except futures.BrokenExecutor:
+                self.close(kill=True)
         ended = f"the process that worked on it alone ended {constants.ATTEMPTS_ALONE} times"
         return on_crash(item, ended)
 
 
 def _completed(
-    executor: Executor, function: Task[Item, Result], items: Iterator[Item], size: int
-) -> Iterator[tuple[Item, Future[Result]]]:
+    executor: futures.Executor, function: Task[Item, Result], items: Iterator[Item], size: int
+) -> Iterator[tuple[Item, futures.Future[Result]]]:
     """Yield items with their futures when these are done; after a crash take no more items."""
-    running: dict[Future[Result], Item] = {}
+    running: dict[futures.Future[Result], Item] = {}
     while True:
         for item in islice(items, constants.TASKS_AHEAD * size - len(running)):
             try:
                 future = executor.submit(function, item)
-            except BrokenExecutor as error:
-                future = Future()
+            except futures.BrokenExecutor as error:
+                future = futures.Future()
                 future.set_exception(error)
             running[future] = item
             if future.done():
                 break  # perhaps by a crash: see below before more items are taken
         if not running:
             return
-        for future in wait(running, return_when="FIRST_COMPLETED").done:
-            if isinstance(future.exception(), BrokenExecutor):
+        for future in futures.wait(running, return_when="FIRST_COMPLETED").done:
+            if isinstance(future.exception(), futures.BrokenExecutor):
                 items = iter(())
             yield running.pop(future), future
 
@@ -216,7 +202,7 @@ def _process_pool(size: int) -> Iterator[_ProcessPool]:
         try:
             yield pool
         except BaseException:
-            pool.kill()
+            pool.close(kill=True)
             raise
         pool.close()
 
@@ -297,7 +283,7 @@ class _Cluster(Pool):
                 item = running.pop(future)
                 try:
                     result = future.result()
-                except (BrokenExecutor, KilledWorker):
+                except (futures.BrokenExecutor, KilledWorker):
                     result = on_crash(item, "every worker that took it ended")
                 yield item, result
         finally:
@@ -338,7 +324,7 @@ def cluster(address: str) -> Iterator[Pool]:
         yield _Cluster(client)
     except TimeoutError as error:
         raise SchedulerError(f"the Dask scheduler {shown} has no workers: start some") from error
-    except (CancelledError, comm_closed) as error:
+    except (futures.CancelledError, comm_closed) as error:
         kept = "finished results are stored: run again to continue"
         raise SchedulerError(f"lost the Dask scheduler {shown}; {kept}") from error
     finally:
@@ -401,7 +387,7 @@ def _close(client: Any) -> None:
     try:
         if client.status != "newly-created":  # such a client has nothing to close
             client.close(timeout=constants.SCHEDULER_TIMEOUT_S)
-    except (OSError, CancelledError) as error:
+    except (OSError, futures.CancelledError) as error:
         logging.getLogger(__name__).debug("%s", error)
     # Python closes an open client when it deletes it, in whichever thread that happens: in the
     # thread of a client being opened it would wait for the lock that the opening holds.

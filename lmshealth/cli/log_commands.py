@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import click
 from msgspec.structs import replace
@@ -34,10 +34,6 @@ from lmshealth.report import log_figures, tables
 from lmshealth.signal.readings import find_growth, loop_error, read_error
 from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
-
-if TYPE_CHECKING:
-    from lmshealth.modal.identification import ModalReading
-    from lmshealth.modal.modes import Modes
 
 Result = TypeVar("Result")
 
@@ -161,12 +157,14 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
     """
     from lmshealth.modal.identification import read_modes
 
-    used = [one.name for one in log.channels if one.kind != "current"][:_TRIED]
+    used, band = [one.name for one in log.channels if one.kind != "current"][:_TRIED], None
     try:
         with terminal.progress_bars(terminal.PATIENCE) as report:
             find = partial(read_modes, log, progress=report)
             modes = find(channels=used).modes
-            if band := _band_of(modes):
+            clear = modes.frequency[modes.snr >= _CLEAR]
+            if clear.size:
+                band = int(clear.min() / _BESIDE), math.ceil(clear.max() * _BESIDE)
                 with suppress(BadLog):  # those of few channels then
                     modes = find(band=band).modes
         _save(path, LogEstimates(log.name, log.digest, log.metadata, modes), odometer=odometer)
@@ -174,12 +172,6 @@ def _propose_stage(path: Path, log: Log, odometer: bool) -> tuple[int, int] | No
         terminal.print_notes([f"{path.name}: {why}"])
         return None
     return band
-
-
-def _band_of(modes: "Modes") -> tuple[int, int] | None:
-    """Return a band in Hz around the clear modes, None without any."""
-    clear = modes.frequency[modes.snr >= _CLEAR]
-    return (int(clear.min() / _BESIDE), math.ceil(clear.max() * _BESIDE)) if clear.size else None
 
 
 @options.command(
@@ -228,9 +220,17 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
     """
     stage, band = given["stage"], given["band"]
     _check_outputs(given)
+    chosen: Any = {"channels": given["channels"], "band": band}
 
     def estimate(log: Log) -> LogEstimates:
-        reading = _read_modes(log, given, ctx.obj)
+        # Late: help and refusals of files need none of it.
+        from lmshealth.modal.identification import read_ambient, read_decays, read_modes
+
+        read = read_ambient if given["part"] == "constant" else read_modes
+        if given["part"] == "settling":
+            reading = read_decays(log, stage, **chosen)
+        else:
+            reading = read(log, stage, **chosen, progress=ctx.obj)
         if given["plot"]:
             figure = log_figures.modes_figure(log, reading, stage, band=band)
             log_figures.write_figure(given["plot"], figure)
@@ -251,10 +251,7 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         if content["modes"] and stage is None and band is None:
             terminal.print_text(_NO_BAND)
 
-    _print(ctx, content, refused, found, lost, show)
-    if given["save"] and found:
-        _save(given["save"], found[0])
-    _exit(ctx, found, lost)
+    _finish(ctx, content, refused, found, lost, show)
 
 
 def _modes_content(found: Sequence[LogEstimates], stage: Stage | None) -> dict[str, list[Row]]:
@@ -280,18 +277,6 @@ def _names(listed: str) -> list[str]:
     if "" in names:
         raise click.BadParameter(f"{listed!r} has an empty name", param_hint="--channels")
     return list(names)
-
-
-def _read_modes(log: Log, given: dict[str, Any], report: Callable[..., None]) -> "ModalReading":
-    """Identify the modes of a log by the chosen part of it."""
-    # Late, as below: help and refusals of files need none of it.
-    from lmshealth.modal.identification import read_ambient, read_decays, read_modes
-
-    chosen: Any = {"channels": given["channels"], "band": given["band"]}
-    if given["part"] == "settling":
-        return read_decays(log, given["stage"], **chosen)
-    read = read_ambient if given["part"] == "constant" else read_modes
-    return read(log, given["stage"], **chosen, progress=report)
 
 
 def _check_outputs(given: dict[str, Any]) -> None:
@@ -359,8 +344,7 @@ def error(ctx: click.Context, /, **given: Any) -> None:
     harmonics = [row for pair in pairs for row in tables.harmonics_rows(*pair)]
     refused = [refusal for log, _ in found for refusal in log.refused]
     show = partial(views.print_error, rows, harmonics)
-    _print(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
-    _exit(ctx, found, lost)
+    _finish(ctx, {"error": rows, "harmonics": harmonics}, refused, found, lost, show)
 
 
 @options.command(
@@ -392,8 +376,7 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     refused = [refusal for own in found for refusal in own.refused]
     content = {"magnitudes": rows, "growth": tables.growth_rows(growth), "lines": lines}
     show = partial(views.print_magnitudes, rows, lines)
-    _print(ctx, content, refused, found, lost, show)
-    _exit(ctx, found, lost)
+    _finish(ctx, content, refused, found, lost, show)
 
 
 @options.command(
@@ -492,8 +475,7 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         notes = [f"{one.log}: {why}" for one in estimates for why in why_unnamed(one.modes, stage)]
         terminal.print_notes(notes)
     show = partial(views.print_frf, content["fit"], content["frf"], rows)
-    _print(ctx, content, refused, found, lost, show)
-    _exit(ctx, found, lost)
+    _finish(ctx, content, refused, found, lost, show)
 
 
 def _responses(
@@ -517,15 +499,15 @@ def _responses(
     )
 
 
-def _print(
+def _finish(
     ctx: click.Context,
     content: dict[str, list[Row]],
     refused: Sequence[Refusal],
-    found: Sequence[object],
+    found: Sequence[Any],
     lost: Sequence[Refusal],
     show: Callable[[list[Row]], None],
 ) -> None:
-    """Print results as csv (the first table of the content), json, or tables.
+    """Print results as csv (the first table of the content), json, or tables; save them, and exit.
 
     Tables list refused parts of logs, but not lost logs.
     """
@@ -536,6 +518,9 @@ def _print(
         terminal.print_json({**content, "refused": tables.refused_rows([*lost, *refused])})
     elif found:
         show(tables.refused_rows(refused))
+    if ctx.params.get("save") and found:
+        _save(ctx.params["save"], found[0])
+    _exit(ctx, found, lost)
 
 
 def _each(

@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import shlex
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from datetime import date, datetime
 from functools import partial, reduce
 from importlib.util import find_spec
@@ -74,11 +74,6 @@ def _band(
             detail = f"needs LOW < HIGH, got {low:g} {high:g}"
             raise click.BadParameter(detail, param_hint="--band")
     return next(iter(given), None)
-
-
-def once(ctx: click.Context, option: click.Parameter, values: Iterable[Any]) -> tuple[Any, ...]:
-    """Use a value that is given several times once."""
-    return tuple(dict.fromkeys(values))
 
 
 def _words(ctx: click.Context, option: click.Parameter, command: str | None) -> tuple[str, ...]:
@@ -203,8 +198,8 @@ ALLOW_FUTURE = click.option(
 )
 TODAY = click.option(
     "--today",
+    type=day,
     metavar="DAY",
-    callback=lambda ctx, option, given: None if given is None else day(given),
     help="Judge status and silence as on this day, for runs that repeat; default now.",
 )
 PART = click.option(

@@ -73,7 +73,7 @@ def _detections(
     "--seconds",
     type=options.Finite(0, 1e9, min_open=True),
     multiple=True,
-    callback=options.once,
+    callback=lambda ctx, option, values: tuple(dict.fromkeys(values)),
     help="Length of a log in s; may be given several times. Default 10 to 600 s.",
 )
 @options.format_option("table", "json")

@@ -19,7 +19,6 @@ import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from textwrap import wrap
 from typing import Any, TextIO
@@ -46,19 +45,8 @@ def readable(text: str) -> str:
     return text.encode(_charset(), _ERRORS).decode(_charset())
 
 
-def is_unicode() -> bool:
-    """Return whether standard output encodes all characters."""
-    return codecs.lookup(_charset()).name.startswith("utf")
-
-
 def _charset() -> str:
     return getattr(sys.stdout, "charset", None) or sys.stdout.encoding or "utf-8"
-
-
-def _lost() -> OSError | None:
-    """Return why standard output takes no more, if it does not."""
-    found: OSError | None = getattr(sys.stdout, "lost", None)
-    return found
 
 
 def _replace(error: UnicodeError) -> tuple[str, int]:
@@ -139,7 +127,7 @@ def standard_streams() -> Iterator[None]:
         yield
     except SystemExit as end:
         sys.stdout.flush()
-        error = _lost()
+        error: OSError | None = getattr(sys.stdout, "lost", None)
         if error is None:
             raise
         if error.errno != errno.EPIPE:  # of `| head`, which has read what it needs
@@ -188,7 +176,7 @@ def print_json(content: Mapping[str, Any], *, indent: int = 1) -> None:
     # msgspec writes null for NaN and infinity.
     encoded = msgspec.json.encode(content, enc_hook=lambda number: number.item())
     text = msgspec.json.format(encoded, indent=indent).decode()
-    if not is_unicode():
+    if not codecs.lookup(_charset()).name.startswith("utf"):
         text = re.sub(r"[^\0-\x7f]", lambda found: json.dumps(found[0])[1:-1], text)
     click.echo(text)
 
@@ -237,36 +225,11 @@ def _wrapped(text: str, width: int, indent: str = "", *, fold: bool = True) -> I
 
 def print_refused(rows: Sequence[Row]) -> None:
     """Print refusals and their reasons, and apart from them warnings about what is used."""
+    # Whole logs are refused for the same reasons as parts, without a channel.
+    parts = [row["reason"] in WARNINGS and bool(row["channel"]) for row in rows]
     for title, in_part in (("Refused", False), ("Used in part", True)):
-        if own := [row for row in rows if _is_warning(row) == in_part]:
+        if own := [row for row, is_part in zip(rows, parts, strict=True) if is_part == in_part]:
             print_view(title, "refused", short_names(own))
-
-
-def _is_warning(row: Row) -> bool:
-    # Whole logs are refused for the same reasons, without a channel.
-    return row["reason"] in WARNINGS and bool(row["channel"])
-
-
-@dataclass(frozen=True, slots=True)
-class _Column:
-    """Column of a table: its heading, cells as texts or numbers, least and natural width."""
-
-    name: str
-    cells: list[str]
-    is_text: bool
-    least: int
-    widest: int
-
-    @classmethod
-    def of(cls, name: str, cells: list[str], *, is_text: bool, is_last: bool) -> _Column:
-        """Measure a column."""
-        splits = is_text or not any(map(str.isdecimal, "".join(cells)))
-        words = [*name.split(), *(word for cell in cells for word in cell.split())]
-        least = max(map(cell_len, words if splits else [*name.split(), *cells]), default=1)
-        # Names of usual length are not split, and the last text is the longest.
-        least = min(least, _SHORT if is_last else _NAME) if is_text else least
-        lines = [line for text in (name, *cells) for line in text.split("\n")]
-        return cls(name, cells, is_text, max(least, 1), max(1, *map(cell_len, lines)))
 
 
 def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) -> None:
@@ -276,31 +239,37 @@ def print_table(title: str, rows: Sequence[dict[str, str]], n_texts: int = 1) ->
     each cell. In a pipe every row is one line.
     """
     print_line(title)
-    columns = [
-        _Column.of(
-            readable(name),
-            [plain(readable(row[name])) for row in rows],
-            is_text=place < n_texts,
-            is_last=place == n_texts - 1,
-        )
-        for place, name in enumerate(rows[0])
-    ]
+    heads = [readable(name) for name in rows[0]]
+    columns = [[plain(readable(row[name])) for row in rows] for name in rows[0]]
+    each = enumerate(zip(heads, columns, strict=True))
+    widths = [_widths(*one, is_text=k < n_texts, is_last=k == n_texts - 1) for k, one in each]
     width = _width(sys.stdout) or _UNLIMITED
-    widths = _fitting(columns, width - 2 * len(columns))
-    if widths is None:
-        _print_records(columns, width)
+    fitting = _fitting(widths, width - 2 * len(heads))
+    if fitting is None:
+        _print_records(heads, columns, n_texts, width)
         return
     table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0), pad_edge=False)
-    for column, own in zip(columns, widths, strict=True):
-        justify: Any = "left" if column.is_text else "right"
-        table.add_column(column.name, overflow="fold", justify=justify, width=own)
-    for row in zip(*(column.cells for column in columns), strict=True):
+    for k, (head, own) in enumerate(zip(heads, fitting, strict=True)):
+        justify: Any = "left" if k < n_texts else "right"
+        table.add_column(head, overflow="fold", justify=justify, width=own)
+    for row in zip(*columns, strict=True):
         table.add_row(*row)
     # Brackets in the cells are not markup.
     console = Console(file=io.StringIO(), markup=False, emoji=False, highlight=False, width=width)
     with console.capture() as captured:
         console.print(table)
     click.echo(captured.get(), nl=False)
+
+
+def _widths(name: str, cells: list[str], *, is_text: bool, is_last: bool) -> tuple[int, int]:
+    """Return the least and the natural width of a column."""
+    splits = is_text or not any(map(str.isdecimal, "".join(cells)))
+    words = [*name.split(), *(word for cell in cells for word in cell.split())]
+    least = max(map(cell_len, words if splits else [*name.split(), *cells]), default=1)
+    # Names of usual length are not split, and the last text is the longest.
+    least = min(least, _SHORT if is_last else _NAME) if is_text else least
+    lines = [line for text in (name, *cells) for line in text.split("\n")]
+    return max(least, 1), max(1, *map(cell_len, lines))
 
 
 def print_view(
@@ -320,25 +289,26 @@ def print_view(
     print_table(title, cells(columns, rows), [*is_text, False].index(False))
 
 
-def _fitting(columns: Sequence[_Column], room: int) -> list[int] | None:
+def _fitting(widths: Sequence[tuple[int, int]], room: int) -> list[int] | None:
     """Return widths of columns, the widest of them reduced first; None if the least do not fit."""
-    widths = [column.widest for column in columns]
-    if sum(column.least for column in columns) > room:
+    found = [widest for _, widest in widths]
+    if sum(least for least, _ in widths) > room:
         return None
-    while sum(widths) > room:
-        reducible = [k for k, column in enumerate(columns) if widths[k] > column.least]
-        widths[max(reducible, key=widths.__getitem__)] -= 1
-    return widths
+    while sum(found) > room:
+        reducible = [k for k, (least, _) in enumerate(widths) if found[k] > least]
+        found[max(reducible, key=found.__getitem__)] -= 1
+    return found
 
 
-def _print_records(columns: Sequence[_Column], width: int) -> None:
+def _print_records(
+    heads: Sequence[str], columns: Sequence[Sequence[str]], n_texts: int, width: int
+) -> None:
     """Print each row of a table as lines of heading and cell; numbers stay whole."""
-    for row in range(len(columns[0].cells)):
-        for column in columns:
-            cell = column.cells[row]
-            cell = cell if column.is_text else cell.replace(" ", GAP)
-            line = f"{column.name}: {cell}" if column.name else cell
-            if cell.strip():
+    for row in zip(*columns, strict=True):
+        for k, (head, cell) in enumerate(zip(heads, row, strict=True)):
+            own = cell if k < n_texts else cell.replace(" ", GAP)
+            if own.strip():
+                line = f"{head}: {own}" if head else own
                 click.echo(plain("\n".join(_wrapped(line, width, " "))))
         click.echo()
 

@@ -9,6 +9,7 @@ from datetime import date
 from itertools import combinations, permutations, zip_longest
 from typing import TYPE_CHECKING
 
+from lmshealth._private.arrays import FloatArray
 from lmshealth._private.tables import TABLES, Row, spell
 from lmshealth.cli.terminal import (
     print_line,
@@ -20,30 +21,11 @@ from lmshealth.cli.terminal import (
 )
 from lmshealth.life.health import Health
 from lmshealth.machine.constants import RUL_LEVELS
-from lmshealth.machine.service import ProbabilityBounds, Service
+from lmshealth.machine.service import Service
 from lmshealth.machine.summary import Life, ParameterHealth, Summary
-from lmshealth.report import constants
+from lmshealth.report import constants, text
 from lmshealth.report.tables import events_rows, to_rows, track_rows
-from lmshealth.report.text import (
-    GAP,
-    count,
-    day,
-    fixed,
-    headline,
-    in_brackets,
-    interval,
-    km,
-    next_step,
-    number,
-    percent,
-    probability,
-    probability_range,
-    service_on_day,
-    service_text,
-    time_left,
-    travel_left,
-    whole_km,
-)
+from lmshealth.report.text import GAP
 from lmshealth.signal.segments import distinct_velocities
 from lmshealth.tracking.track import Track
 
@@ -61,9 +43,9 @@ def print_modes(rows: Sequence[Row], refused: Sequence[Row], off: Sequence[Row] 
     shown = short_names(rows)
     for row in shown:
         frequency, std = row["frequency_hz"], row["frequency_std_hz"]
-        row["frequency"] = f"{fixed(frequency, 3)} ± {fixed(std, 3)}"
+        row["frequency"] = f"{text.fixed(frequency, 3)} ± {text.fixed(std, 3)}"
         if std >= 1:
-            row["frequency"] = f"{number(frequency, 4)} ± {number(std, 2)}"
+            row["frequency"] = f"{text.number(frequency, 4)} ± {text.number(std, 2)}"
     if rows:
         print_view("Modes (± one standard deviation)", "modes", shown)
         for flag in sorted({flag for row in rows for flag in row["flags"].split()}):
@@ -158,7 +140,7 @@ def _print_response(fit: Row, frf: Sequence[Row]) -> None:
     print_text(methods[fit["method"]])
     if fit["distortion"] > 0:
         print_text(
-            f"The fit misses {percent(fit['distortion'], 1)} of the response beyond the noise "
+            f"The fit misses {text.percent(fit['distortion'], 1)} of the response beyond the noise "
             f"(reduced chi-square {fit['chi_square']:.3g}): nonlinearity or a missing mode; the "
             "standard deviations are widened accordingly."
         )
@@ -192,7 +174,8 @@ def _print_harmonics(rows: Sequence[Row], harmonics: Sequence[Row]) -> None:
     print_text("Strongest harmonics, Hz (amplitude in µm):")
     for row in rows:
         own = [h for h in harmonics if (h["log"], h["channel"]) == (row["log"], row["channel"])]
-        texts = [f"{h['frequency_hz']:.5g}{GAP}({number(h['amplitude_um'])})" for h in own[:most]]
+        pairs = ((f"{h['frequency_hz']:.5g}", text.number(h["amplitude_um"])) for h in own[:most])
+        texts = [f"{frequency}{GAP}({amplitude})" for frequency, amplitude in pairs]
         more = f" and {len(own) - most} more (see --format json)" if len(own) > most else ""
         if own:
             print_text(f"{row['log']}, {row['channel']}: {', '.join(texts)}{more}.")
@@ -243,7 +226,7 @@ def _print_channel(title: str, rows: Sequence[Row]) -> None:
             own = at.get((band, speed), [])
             is_line = key == "magnitude_mm_s2" and any(row["line"] for row in own)
             mean = sum(row[key] for row in own) / max(len(own), 1)
-            level = number(mean, 3 if mean >= 0.1 else 2) if own else ""
+            level = text.number(mean, 3 if mean >= 0.1 else 2) if own else ""
             cell["unknown" if speed < 0 else f"{float(f'{speed:.3g}'):g}"] = level + (
                 "~" if is_line else " "
             )
@@ -290,23 +273,19 @@ def print_stage(content: dict[str, list[Row]]) -> None:
         title = "Standard deviation of the parameters"
         print_view(title, "stage_parameters", parameters, "identifiability")
         print_text(TABLES["stage_parameters"].legend.format_map(stage))
-        _print_sensitivities(content)
+        modes: dict[str, dict[str, str]] = {}
+        for row in content["sensitivities"]:
+            ends = [text.number(row[key], 2) for key in ("at_baseline", "at_limits")]
+            own = modes.setdefault(row["mode"], {"mode": row["mode"]})
+            own[row["parameter"]] = " → ".join(ends)
+        title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
+        print_table(title, list(modes.values()))
+        for row in content["correlations"]:
+            pair = f"{row['parameter_a']} and {row['parameter_b']}"
+            print_line(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
+        print_line("")
     for row in content["findings"]:
         print_text(row["text"], "+ " if row["good"] else "! ")
-
-
-def _print_sensitivities(content: dict[str, list[Row]]) -> None:
-    modes: dict[str, dict[str, str]] = {}
-    for row in content["sensitivities"]:
-        ends = [number(row[key], 2) for key in ("at_baseline", "at_limits")]
-        own = modes.setdefault(row["mode"], {"mode": row["mode"]})
-        own[row["parameter"]] = " → ".join(ends)
-    title = "Sensitivity d ln f / d ln parameter, at the baseline → at the limits"
-    print_table(title, list(modes.values()))
-    for row in content["correlations"]:
-        pair = f"{row['parameter_a']} and {row['parameter_b']}"
-        print_line(f"Correlation of {pair} after these logs: {row['correlation']:+.2f}")
-    print_line("")
 
 
 def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
@@ -321,7 +300,7 @@ def print_plans(detect: Sequence[Row], plan: Sequence[Row]) -> None:
             if row["parameter"] == name and row["loss"] == asked["loss"]
         ]
         title = (
-            f"{name}: to detect a loss of {percent(asked['loss'], 1)} with power "
+            f"{name}: to detect a loss of {text.percent(asked['loss'], 1)} with power "
             f"{asked['power']:g}, false-alarm probability {asked['false_alarm']:g}"
         )
         head = "loss, N logs"
@@ -343,11 +322,6 @@ def print_track(track: Track) -> None:
     print_view(title, "track", track_rows(track)[-len(track.modes) :])
     if track.events:
         print_view("Events", "events", events_rows(track))
-    print_text(_consistency(track))
-
-
-def _consistency(track: Track) -> str:
-    """Return whether the innovations of the filter agree with its model."""
     found = track.consistency()
     values = (
         f"normalised innovations squared {found.nis:.2f} (expected 1, p = {found.p_value:.2g}), "
@@ -355,7 +329,8 @@ def _consistency(track: Track) -> str:
     )
     if found.holds:
         less = {"below": " (they vary less than expected)", "above": " (they vary more)"}
-        return f"The filter is consistent with its logs{less.get(found.side, '')}: {values}."
+        print_text(f"The filter is consistent with its logs{less.get(found.side, '')}: {values}.")
+        return
     remedy = "The logs vary less than expected: its standard deviations are too large."
     if track.widening[-1] > 1:
         remedy = (
@@ -363,7 +338,7 @@ def _consistency(track: Track) -> str:
             "missing: a covariate, a change of servo tuning, or wrong standard deviations in the "
             "table."
         )
-    return f"The filter is NOT consistent with its logs: {values}. {remedy}"
+    print_text(f"The filter is NOT consistent with its logs: {values}. {remedy}")
 
 
 def print_health(health: Health) -> None:
@@ -371,7 +346,7 @@ def print_health(health: Health) -> None:
     rows = to_rows(health.to_columns())[-len(health.parameters) :]
     for row in rows:
         row["interval"] = "{q05:.3f} to {q95:.3f}".format(**row)
-    when, n_epochs = day(health.recorded_at[-1]), len(health.recorded_at)
+    when, n_epochs = text.day(health.recorded_at[-1]), len(health.recorded_at)
     title = f"{health.stage}: health at {when}, the last of {n_epochs} epochs"
     print_view(title, "health", rows)
     print_text(TABLES["health"].legend)
@@ -404,7 +379,7 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
     if len(summaries) <= constants.TERMINAL_MACHINES:
         for one in summaries:
             print_text(f"{one.identity}: {_verdict(one)}. {one.why}")
-            if to_do := next_step(one.step):
+            if to_do := text.next_step(one.step):
                 print_text(f"  {to_do}")
             for parameter in one.health:
                 print_text(f"  {_parameter(parameter)}")
@@ -417,39 +392,37 @@ def print_summaries(summaries: Sequence[Summary]) -> None:
             "verdict": _verdict(one),
             "health": "\n".join(map(_parameter, one.health)),
             "remaining life": _travel_left(one.life),
-            "service": service_on_day(one),
+            "service": text.service_on_day(one),
         }
         for one in summaries[: constants.TERMINAL_ROWS]
     ]
-    n = count(len(summaries), "stage")
+    n = text.count(len(summaries), "stage")
     title = f"{n}, most urgent first (medians with 90 % intervals)"
     print_table(title, shown, 5)
     if rest := len(summaries) - len(shown):
-        print_line(f"{count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
+        print_line(f"{text.count(rest, 'more stage')}; verdict.csv and prognosis.csv list all.")
 
 
 def _verdict(one: Summary) -> str:
     """Return the verdict of a machine with its probability, and whether its last log is too old."""
-    found = one.verdict + in_brackets(one.probability)
-    return f"{headline(one)}; at the last log {found}" if one.unknown else found
+    found = one.verdict + text.in_brackets(one.probability)
+    return f"{text.headline(one)}; at the last log {found}" if one.unknown else found
 
 
 def _parameter(one: ParameterHealth) -> str:
     if not one.determined:
         return f"{spell(one.name)} not determined"
-    return f"{spell(one.name)} {percent(one.median, 0)} ({interval(one.low, one.high)})"
+    return f"{spell(one.name)} {text.percent(one.median, 0)} ({text.interval(one.low, one.high)})"
 
 
 def _travel_left(life: Life | None) -> str:
     if life is None:
         return "–"
-    low, middle, high = (travel_left(life.any.travel[k], life.horizon) for k in (0, 3, 6))
+    low, middle, high = (text.travel_left(life.any.travel[k], life.horizon) for k in (0, 3, 6))
     return middle if low == high else f"{middle} ({low} to {high})"
 
 
-def print_life(
-    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
-) -> None:
+def print_life(life: Life, service: Service, before: tuple[date, FloatArray] | None = None) -> None:
     """Print the quantiles of the remaining life for each limit and any, then the service.
 
     ``before`` is a day with the probabilities that each limit is reached before it.
@@ -458,10 +431,8 @@ def print_life(
     # Rows of any limit that are those of one limit, but for its name, are not repeated.
     *each, last = ([("", *rows[0][1:]), *rows[1:]] for rows in blocks)
     same = blocks[each.index(last)][0][0] if last in each else None
-    title = (
-        f"{life.stage}: remaining life after {day(life.recorded_at)}, at {whole_km(life.travel)} "
-        f"(horizon {km(life.horizon)})"
-    )
+    place = f"{text.day(life.recorded_at)}, at {text.whole_km(life.travel)}"
+    title = f"{life.stage}: remaining life after {place} (horizon {text.km(life.horizon)})"
     heads = ("until", "probability %", "travel", "time", "date")
     rows = [row for block in (blocks if same is None else blocks[:-1]) for row in block]
     print_table(title, [dict(zip_longest(heads, row, fillvalue="")) for row in rows])
@@ -471,8 +442,8 @@ def print_life(
         laws = []
         for law in life.laws:
             if law.parameter == name and law.probability >= constants.LAW_SHOWN:
-                begin = f" from {km(law.begin)} after the baseline" if law.begin else ""
-                laws.append(f"{law.kind}{begin} {probability(law.probability)}")
+                begin = f" from {text.km(law.begin)} after the baseline" if law.begin else ""
+                laws.append(f"{law.kind}{begin} {text.probability(law.probability)}")
         print_text(f"Law of {spell(name)}: {', '.join(laws)}.")
     if life.undetermined:
         names = ", ".join(map(spell, life.undetermined))
@@ -483,51 +454,50 @@ def print_life(
 
 
 def _limit_cells(
-    life: Life, index: int, before: tuple[date, ProbabilityBounds] | None
+    life: Life, index: int, before: tuple[date, FloatArray] | None
 ) -> Iterator[tuple[str, ...]]:
     """Yield one row per quantile, then the probabilities of the limit, one row each."""
     one, levels = life.limits[index], RUL_LEVELS
-    text = one.name if one.parameter == "any" else f"{one.name} below {percent(one.share)}"
+    name = one.name if one.parameter == "any" else f"{one.name} below {text.percent(one.share)}"
     for level, travel, days, when in zip(levels, one.travel, one.days, one.dates, strict=True):
         share = f"{100 * level:.0f}"
         if math.isinf(days):
             share = share if level == levels[-1] else f"{share} to {100 * levels[-1]:.0f}"
-            yield text, share, travel_left(travel, life.horizon), "–", "–"
+            yield name, share, text.travel_left(travel, life.horizon), "–", "–"
             break
         calendar = "out of range" if when is None else when.isoformat()
-        yield text, share, travel_left(travel, life.horizon), time_left(days), calendar
-        text = ""
-    yield (f"  already: {probability(one.already_past)}",)
-    yield (f"  beyond horizon: {probability(one.beyond_horizon)}",)
+        yield name, share, text.travel_left(travel, life.horizon), text.time_left(days), calendar
+        name = ""
+    yield (f"  already: {text.probability(one.already_past)}",)
+    yield (f"  beyond horizon: {text.probability(one.beyond_horizon)}",)
     if before is not None:
         asked, bounds = before
-        chance = probability_range((bounds.at_least[index], bounds.at_most[index]))
-        yield (f"  before {asked}: {chance}",)
+        yield (f"  before {asked}: {text.probability_range(bounds[:, index].tolist())}",)
 
 
 def _advice(life: Life, service: Service) -> Iterator[str]:
     """Yield when to service, by which rule, and the risk of a planned service."""
     if service.max_risk:
-        rule = f"accepted risk {percent(service.max_risk)}"
+        rule = f"accepted risk {text.percent(service.max_risk)}"
     else:
         rule = f"least cost, where a failure costs {service.cost_ratio:.3g} times a service"
-    yield f"Service: {service_text(service)} ({rule})."
-    risk = probability(service.risk) if service.risk >= 0 else ""
+    yield f"Service: {text.service_text(service)} ({rule})."
+    risk = text.probability(service.risk) if service.risk >= 0 else ""
     if service.kind == "later":
         shown = " for what the modes show" if life.undetermined else ""
-        yield f"No service is needed within {km(life.horizon)}{shown}."
+        yield f"No service is needed within {text.km(life.horizon)}{shown}."
     elif service.by is None:
         yield "The usage is too low for a calendar date."
     elif service.kind == "now":
         yield f"Probability that a limit has already been reached, at most: {risk}."
-    elif not service.max_risk or risk != percent(service.max_risk):
+    elif not service.max_risk or risk != text.percent(service.max_risk):
         yield f"Probability that a limit is reached before that day, at most: {risk}."
     if service.inspect_by is not None:
         every = service.inspect_every
-        often = f", then every {whole_km(every)}" if math.isfinite(every) else ""
+        often = f", then every {text.whole_km(every)}" if math.isfinite(every) else ""
         yield f"Inspect (record a log) by {service.inspect_by}{often}."
     if service.planned is not None:
-        planned = probability_range(service.planned_risk)
+        planned = text.probability_range(service.planned_risk)
         yield f"Before the service planned for {service.planned}: {planned}."
 
 

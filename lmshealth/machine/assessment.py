@@ -16,16 +16,7 @@ from lmshealth._private.serialize import fingerprint, seed_of
 from lmshealth._private.tables import fact
 from lmshealth.errors import LmshealthError, NotEnoughData
 from lmshealth.io.log import Notice, Refusal
-from lmshealth.life import constants
-from lmshealth.life.fleet_prior import (
-    Calibration,
-    EndedLife,
-    FleetPrior,
-    MachineEvidence,
-    calibrate,
-    ended_lives,
-    machine_evidence,
-)
+from lmshealth.life import constants, fleet_prior
 from lmshealth.life.health import Health, epochs_to_publish, health_of
 from lmshealth.life.posterior.exploration import LifeStart
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
@@ -75,12 +66,12 @@ class Assessment:
     latest: LogEstimates | None = None
     at_baseline: LogEstimates | None = None
     # Evidence for the fleet prior; None without a posterior of the life.
-    evidence: MachineEvidence | None = None
+    evidence: fleet_prior.MachineEvidence | None = None
     # Fleet prior of the prognosis; None when it rests on the prior of the description.
-    fleet: FleetPrior | None = None
+    fleet: fleet_prior.FleetPrior | None = None
     # Lives before the present baseline, and what those of the fleet support; None with too few.
-    ended: tuple[EndedLife, ...] = ()
-    calibration: Calibration | None = None
+    ended: tuple[fleet_prior.EndedLife, ...] = ()
+    calibration: fleet_prior.Calibration | None = None
     doubt: str = ""  # why names of modes, odometer or dates are in doubt; then there is no health
     today: date | None = None  # day of its status; None for that of the last log
     lost: tuple[Refusal, ...] = ()  # its logs that were refused as a whole, without estimates
@@ -306,7 +297,7 @@ class LifeState:
     n_logs: int
     verdict: str
     past: str  # fingerprint of the logs before the baseline, and the lives that ended with them
-    ended: tuple[EndedLife, ...]
+    ended: tuple[fleet_prior.EndedLife, ...]
 
 
 def _with_results(
@@ -322,7 +313,7 @@ def _with_results(
     past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
     if before is not None and before.past != past:  # draws of another life are no start of this
         before = None
-    ended = ended_lives(history, stage, seed) if before is None else before.ended
+    ended = fleet_prior.ended_lives(history, stage, seed) if before is None else before.ended
     chains = before is None or len(history.logs) // every > before.n_logs // every
     start = None if before is None else before.start
     life = fit_life(history, stage, seed, chains=chains, before=start)
@@ -330,7 +321,7 @@ def _with_results(
     if before is not None and not chains and found.judgement.verdict != before.verdict:
         life = fit_life(history, stage, seed, before=start)
         found = _with_life(made, life, history, epochs)
-    found = replace(found, ended=ended, evidence=machine_evidence(stage, life))
+    found = replace(found, ended=ended, evidence=fleet_prior.machine_evidence(stage, life))
     n_logs, verdict = len(history.logs), found.judgement.verdict
     return found, LifeState(life.start, n_logs, verdict, past, ended)
 
@@ -350,7 +341,7 @@ def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: 
 
 
 def with_fleet_prior(
-    found: Assessment, prior: FleetPrior, *, epochs: int, before: LifeState | None
+    found: Assessment, prior: fleet_prior.FleetPrior, *, epochs: int, before: LifeState | None
 ) -> Assessment:
     """Recompute health, prognosis and verdict with the prior of a fleet; there must be a track.
 
@@ -367,7 +358,7 @@ def with_fleet_prior(
     return replace(made, stage=found.stage, fleet=prior)
 
 
-def with_calibration(found: Assessment, ended: Sequence[EndedLife]) -> Assessment:
+def with_calibration(found: Assessment, ended: Sequence[fleet_prior.EndedLife]) -> Assessment:
     """Calibrate a prognosis by the ended lives of the fleet; there must be one."""
     assert found.prognosis is not None
-    return replace(found, calibration=calibrate(found.prognosis, tuple(ended)))
+    return replace(found, calibration=fleet_prior.calibrate(found.prognosis, tuple(ended)))

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from lmshealth._private.arrays import FloatArray, ReadOnly
+from lmshealth._private.arrays import FloatArray
 from lmshealth.life.posterior.data import SECONDS_PER_DAY
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.machine import constants
@@ -14,18 +14,6 @@ from lmshealth.stage.constants import MAX_RISK
 from lmshealth.stage.description import Decision
 
 _SHORTER = 0.9  # factor between the intervals of logs that are tried
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class ProbabilityBounds(ReadOnly):
-    """Bounds of the probability to reach each limit, ``any`` last, ``(n_parameters + 1,)``.
-
-    They differ if draws pass the horizon before that day, beyond which nothing is published: such
-    a draw counts as no failure in the lower bound and as a failure in the upper one.
-    """
-
-    at_least: FloatArray
-    at_most: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,8 +73,8 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     kind: Literal["now", "by", "later", "unknown"] = "later" if np.isinf(wait) else "unknown"
     if by is not None:
         kind = "now" if by <= prognosis.recorded_at.date() else "by"
-    risk = np.nan if by is None else _any_risk(prognosis, by)[1]
-    planned_risk = unknown if planned is None else _any_risk(prognosis, planned)
+    risk = np.nan if by is None else risk_before(prognosis, by)[1]
+    planned_risk = unknown if planned is None else risk_before(prognosis, planned)
     every, earliest = _inspection(prognosis, decision)
     next_log = day_after(prognosis, every / float(np.median(prognosis.usage)))
     end = day_after(prognosis, earliest)
@@ -94,10 +82,10 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     return Service(kind, by, wait, risk, planned, planned_risk, *criterion, log_by, every, end)
 
 
-def _any_risk(prognosis: Prognosis, day: date) -> tuple[float, float]:
+def risk_before(prognosis: Prognosis, day: date) -> tuple[float, float]:
     """Return the bounds of the probability to reach any limit before a day."""
-    reached = probability_before(prognosis, day)
-    return float(reached.at_least[-1]), float(reached.at_most[-1])
+    low, high = probability_before(prognosis, day)[:, -1].tolist()
+    return low, high
 
 
 def cheapest_travel(prognosis: Prognosis, cost_ratio: float) -> float:
@@ -137,10 +125,12 @@ def _inspection(prognosis: Prognosis, decision: Decision) -> tuple[float, float]
     return every, days
 
 
-def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
-    """Return the probability to reach each limit, and any, before a day begins.
+def probability_before(prognosis: Prognosis, day: date) -> FloatArray:
+    """Return bounds of the probability to reach each limit, and any, before a day begins.
 
-    The day is in the time zone of the last log; a day before that log counts as its moment.
+    Shape ``(2, n_parameters + 1)``: at least, at most. They differ if draws pass the horizon before
+    that day, beyond which nothing is published: such a draw is a failure in the upper one only. The
+    day is in the time zone of the last log; a day before that log counts as its moment.
     """
     moment = prognosis.recorded_at
     ahead = datetime.combine(day, time(), moment.tzinfo) - moment
@@ -148,7 +138,7 @@ def probability_before(prognosis: Prognosis, day: date) -> ProbabilityBounds:
     within = np.minimum(prognosis.remaining, prognosis.horizon)
     maybe = within <= days * prognosis.usage[:, None]
     surely = maybe & (prognosis.remaining <= prognosis.horizon)
-    return ProbabilityBounds(at_least=np.mean(surely, axis=0), at_most=np.mean(maybe, axis=0))
+    return np.asarray(np.stack([surely, maybe]).mean(axis=1))
 
 
 def remaining_days(prognosis: Prognosis) -> FloatArray:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
-from functools import partial
 from typing import Any, Literal
 
 import msgspec
@@ -13,7 +12,7 @@ import numpy as np
 from scipy.special import chdtrc, gammaincinv
 
 from lmshealth._private.arrays import FloatArray, finite_or_none
-from lmshealth._private.tables import FLAGS, fact, spell
+from lmshealth._private.tables import FLAGS, NOTICES, fact, spell
 from lmshealth.io.log import WARNINGS, Notice, Refusal
 from lmshealth.life.constants import LONE_NAMED, MIN_FIT
 from lmshealth.life.verdict import (
@@ -25,7 +24,7 @@ from lmshealth.life.verdict import (
 )
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.summary import Summary, days_between, prognosis_rows
+from lmshealth.machine.summary import Summary, prognosis_rows, step_of
 from lmshealth.tracking.contradictions import are_many
 
 _SEVERITIES = "serious", "caution", "note"
@@ -34,9 +33,14 @@ _SEVERITIES = "serious", "caution", "note"
 def notices(assessment: Assessment) -> tuple[Notice, ...]:
     """Return the notices about a machine, the serious ones first: rows of ``warnings.csv``."""
     found = [*assessment.notices, *_of_names(assessment), *_of_track(assessment)]
-    found += [*_of_health(assessment), *_of_laws(assessment), *_of_channels(assessment)]
-    found += _of_lost_logs(assessment)
+    found += [*_of_health(assessment), *_of_laws(assessment), *_of_refused(assessment)]
     return tuple(sorted(found, key=lambda one: _SEVERITIES.index(one.severity)))
+
+
+def _noticed(key: str, where: str = "", code: str = "", **values: object) -> Notice:
+    """Return a notice of `NOTICES`, whose key begins with its code unless that is another one."""
+    severity, what, to_do = NOTICES[key]
+    return Notice(code or key.split(",")[0], severity, where, what.format(**values), to_do)
 
 
 def _listed(modes: Iterable[str]) -> str:
@@ -56,59 +60,34 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
         for flag in (one for one in own.split() if one not in WARNINGS.values()):
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
-        names = _listed(dict.fromkeys(modes))
-        told = {"flag": flag, "names": names, "meaning": FLAGS.get(flag) or fact("see modes.csv.")}
-        what = fact("The last log has the flag {flag} at {names}: {meaning}", **told)
-        yield Notice(flag, "caution", names, what)
+        names, meaning = _listed(dict.fromkeys(modes)), FLAGS.get(flag) or fact("see modes.csv.")
+        yield _noticed("flag", names, flag, flag=flag, names=names, meaning=meaning)
 
 
 def _of_track(assessment: Assessment) -> Iterator[Notice]:
     """Yield notices about drifts, jumps and the consistency of the filter."""
     track = assessment.track
+    n_logs = len(assessment.history.logs) - assessment.history.baseline
     for mode, (size, n_std) in assessment.drifted.items():
-        n_logs = len(assessment.history.logs) - assessment.history.baseline
         moved = f"{100 * np.expm1(size):+.2f}".replace("-", "−")
-        what = fact(
-            "{mode} has moved by {size} % in {n} logs, {n_std:.0f} standard deviations: no scatter "
-            "explains it.",
-            mode=spell(mode).capitalize(),
-            size=moved,
-            n=n_logs,
-            n_std=n_std,
-        )
-        to_do = fact(
-            "Record a log at once; check work, payload, sensor and servo tuning since then."
-        )
-        yield Notice("large-drift", "serious", mode, what, to_do)
+        name = spell(mode).capitalize()
+        yield _noticed("large-drift", mode, mode=name, size=moved, n=n_logs, n_std=n_std)
     left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
     for n in sorted(set(left.values())):
         names = _listed(mode for mode, own in left.items() if own == n)
-        told = {"n": n, "names": names}
-        one = fact("The last log is far from those before it at {names}, and left out.", **told)
-        more = fact(
-            "The last {n} logs are far from those before them at {names}, and left out: health is "
-            "that of then.",
-            **told,
-        )
-        to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
-        severity: Literal["serious", "caution"] = "serious" if n > 1 else "caution"
-        yield Notice("last-logs-left-out", severity, names, more if n > 1 else one, to_do)
+        key = "last-logs-left-out, more" if n > 1 else "last-logs-left-out, one"
+        yield _noticed(key, names, n=n, names=names)
     if track is not None and track.suspected is not None:
         day = track.recorded_at[track.suspected.first].date().isoformat()
-        what = fact(
-            "The logs since {day} agree with each other, and not with those before: a jump that is "
-            "not certain yet.",
-            day=day,
+        yield _noticed("step-suspected", day=day)
+    if track is not None and not (found := track.consistency()).holds:
+        notice = _noticed(
+            "filter-inconsistent", p=f"{min(found.p_value, found.autocorrelation_p_value):.1g}"
         )
-        to_do = fact("Record a log now, and enter work since then in maintenance.csv.")
-        yield Notice("step-suspected", "caution", "", what, to_do)
-    if track is not None and not track.consistency().holds:
-        p = f"{min(track.consistency().p_value, track.consistency().autocorrelation_p_value):.1g}"
-        what = fact("The logs do not vary as the filter of the modes expects (p = {p}).", p=p)
         if (factor := track.widening[-1]) > 1:
-            what += " " + fact("Its intervals are {factor:.1f} times as wide.", factor=factor)
-        to_do = fact("Look for a cause that the logs do not contain: payload, temperature, tuning.")
-        yield Notice("filter-inconsistent", "caution", "", what, to_do)
+            wide = fact("Its intervals are {factor:.1f} times as wide.", factor=factor)
+            notice = replace(notice, what=f"{notice.what} {wide}")
+        yield notice
 
 
 def _of_health(assessment: Assessment) -> Iterator[Notice]:
@@ -117,60 +96,31 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
     if health is None:
         return
     if not health.explained:
-        what = fact("No life of the parameters explains the modes (p = {p:.1g}).", p=health.fit[-1])
-        to_do = fact("Check what else moved the modes, and the map.")
-        yield Notice("unexplained-drifts", "serious", "", what, to_do)
-    least = health.latest(np.array(0.05))
-    for name, low, known in zip(
-        health.parameters, least, health.publishable_parameters(), strict=True
-    ):
-        if known and low > constants.RISEN:
-            what = fact(
-                "{name} is above its baseline value, which no wear does.",
-                name=spell(name).capitalize(),
-            )
-            to_do = fact("Enter work since the baseline in maintenance.csv, or check the map.")
-            yield Notice("above-baseline", "caution", name, what, to_do)
+        yield _noticed("unexplained-drifts", p=health.fit[-1])
+    known = health.publishable_parameters()
+    for name, low, own in zip(health.parameters, health.latest(np.array(0.05)), known, strict=True):
+        if own and low > constants.RISEN:
+            yield _noticed("above-baseline", name, name=spell(name).capitalize())
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
-            what = fact(
-                "The interval of {name} ends at an end of the map, which bounds it.",
-                name=spell(name),
-            )
-            yield Notice("end-of-map", "caution", name, what, fact("Extend the map."))
+            yield _noticed("end-of-map", name, name=spell(name))
 
 
-def _of_channels(assessment: Assessment) -> Iterator[Notice]:
-    """Yield notices about channels whose samples are faulty, repaired or left out."""
+def _of_refused(assessment: Assessment) -> Iterator[Notice]:
+    """Yield notices about channels that are faulty, repaired or left out, and refused logs."""
     found: dict[tuple[str, str], list[Refusal]] = {}
     for row in assessment.refused:
         if row.reason in WARNINGS and row.channel:
             found.setdefault((row.reason, row.channel), []).append(row)
     for (reason, channel), rows in found.items():
-        logs = len({row.log for row in rows})
-        own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": logs}
-        what = fact("{channel}: {detail} (last in {log}; such logs: {n}).", **own)
-        repaired = not WARNINGS[reason]
-        to_do = fact("refused.csv lists all.")
-        yield Notice(reason, "note" if repaired else "caution", channel, what, to_do)
-
-
-def _of_lost_logs(assessment: Assessment) -> Iterator[Notice]:
-    """Yield a notice about logs that were refused as a whole."""
-    lost = {row.log: row.reason for row in assessment.lost}
-    if not lost:
-        return
-    total = len(lost) + len(assessment.history.logs)
-    what = fact(
-        "Of {total} logs of this machine, refused as a whole: {n} ({reasons}).",
-        n=len(lost),
-        total=total,
-        reasons=", ".join(dict.fromkeys(lost.values())),
-    )
-    to_do = fact("refused.csv has the reasons.")
-    yield Notice(
-        "logs-refused", "caution" if are_many(len(lost), total) else "note", max(lost), what, to_do
-    )
+        key, n = "channel" if WARNINGS[reason] else "channel, repaired", len({r.log for r in rows})
+        own = {"channel": channel, "detail": rows[-1].detail, "log": rows[-1].log, "n": n}
+        yield _noticed(key, channel, reason, **own)
+    if lost := {row.log: row.reason for row in assessment.lost}:
+        n, total = len(lost), len(lost) + len(assessment.history.logs)
+        key = "logs-refused, many" if are_many(n, total) else "logs-refused"
+        reasons = ", ".join(dict.fromkeys(lost.values()))
+        yield _noticed(key, max(lost), n=n, total=total, reasons=reasons)
 
 
 def _of_laws(assessment: Assessment) -> Iterator[Notice]:
@@ -179,27 +129,16 @@ def _of_laws(assessment: Assessment) -> Iterator[Notice]:
     if prognosis is None:
         return
     for name in prognosis.unidentifiable:
-        what = fact(
-            "The limit of {name} is left out of the life: the modes do not show it.",
-            name=spell(name),
-        )
-        yield Notice("limit-not-included", "caution", name, what)
+        yield _noticed("limit-not-included", name, name=spell(name))
     for lone in prognosis.modes_off:
         if lone.probability >= LONE_NAMED:
             what = lone_sentence(lone, assessment.stage)
             yield Notice("mode-off-map", "caution", lone.mode, what)
-    dof = prognosis.degrees_of_freedom
-    if dof > 0 and prognosis.chi_square > chi_square_band(np.array(dof))[1]:
+    dof, value = prognosis.degrees_of_freedom, prognosis.chi_square
+    if dof > 0 and value > chi_square_band(np.array(dof))[1]:
         # One of forty machines is above the band by chance.
-        by_chance = chdtrc(dof, prognosis.chi_square) >= MIN_FIT
-        what = fact(
-            "No law of degradation fits the logs (χ² {value:.0f} of {dof:.0f}).",
-            value=prognosis.chi_square,
-            dof=dof,
-        )
-        rely = fact("Do not rely on the remaining life, and record further logs soon.")
-        to_do = fact("Record further logs soon.") if by_chance else rely
-        yield Notice("laws-do-not-fit", "caution" if by_chance else "serious", "", what, to_do)
+        by_chance = ", perhaps by chance" if chdtrc(dof, value) >= MIN_FIT else ""
+        yield _noticed(f"laws-do-not-fit{by_chance}", value=value, dof=dof)
 
 
 def chi_square_band(dof: FloatArray) -> FloatArray:
@@ -215,25 +154,15 @@ DeviceHealth = Literal["NORMAL", "FAILURE", "CHECK_FUNCTION", "OFF_SPEC", "MAINT
 
 Severity = Literal["serious", "caution", "note"]
 
-CHANGES: dict[str, tuple[Severity, str]] = {
-    "alarm": ("serious", "a mode has an undeclared alarm"),
-    "verdict": ("serious", "the verdict is a loss, `step` or `outside-map`"),
-    "limit-reached": ("serious", "a limit is reached with probability 0.5 or more"),
-    "large-drift": ("serious", "a drift that no scatter explains, before a verdict is possible"),
-    "unreliable": ("caution", "a serious warning beside a verdict, or `unexplained-drifts`"),
-    "service-due": ("caution", "the service date has passed or is within 30 days"),
-    "inspection-overdue": ("caution", "`inspect_by` has passed"),
-    "silent": ("caution", "no log for long"),
-    "no-log-since-maintenance": ("note", "no log after the last work"),
-    "unconfirmed-jump": ("note", "the last logs are far from those before them"),
-    "verdict, no loss": ("note", "the verdict is `healthy`, or none is possible"),
-    "recovered": (
-        "note",
-        "a verdict, silence, alarm, late log, jump or, by work, another state has ended",
-    ),
+CHANGES: dict[str, Severity] = {
+    **dict.fromkeys(("alarm", "verdict", "limit-reached", "large-drift"), "serious"),
+    **dict.fromkeys(("unreliable", "service-due", "inspection-overdue", "silent"), "caution"),
+    **dict.fromkeys(("no-log-since-maintenance", "unconfirmed-jump"), "note"),
+    **dict.fromkeys(("verdict, no loss", "recovered"), "note"),
 }
-"""Kinds of changes, with severity and meaning. Each change of a machine is one of them, once. A
-kind that is a code of `conditions` begins with that; ``recovered`` has what ended in ``before``."""
+"""Severity of the kinds of changes; report/README.md states when each begins. Each change of a
+machine is one of them, once. A kind that is a code of `conditions` begins with that; ``recovered``
+has what ended in ``before``."""
 
 # Conditions that begin once per baseline: their dates and probabilities move with each log. Others
 # begin anew after they have ended, which is a change too.
@@ -423,7 +352,7 @@ def _judged(status: Status, today: date) -> Status:
         status,
         conditions=found,
         device_health=state,
-        days_without_log=days_between(status.recorded_at, today),
+        days_without_log=max((today - status.recorded_at.date()).days, 0),
         silent="silent" in found,
         unknown_since=status.recorded_at.date() if unknown else None,
         verdict=UNKNOWN if unknown else verdict,
@@ -461,7 +390,8 @@ def on_day(summary: Summary, status: Status, today: date) -> Summary:
     postponed = [row for row in summary.postponed if row[0] >= today][: constants.POSTPONED_SHOWN]
     # Logs as rare as the step allows would let the machine become silent.
     often = min(summary.step.log_every, status.silent_after_days or np.inf)
-    step = replace(summary.step.on("overdue" if is_past else late), log_every=often)
+    kind = step_of(*summary.step.case, "overdue" if is_past else late)
+    step = replace(summary.step, kind=kind, log_every=often)
     return replace(found, today=today, step=step, postponed=tuple(postponed))
 
 
@@ -481,14 +411,10 @@ def compare(
     changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
     changes += _transitions(before, now)
-    severity = partial(_severity, now=now)
-    return now, [Change(now.stage, *one, now.recorded_at, severity(one[0])) for one in changes]
-
-
-def _severity(what: str, now: Status) -> Severity:
-    """Return the severity of a change; of a verdict by what it is now."""
-    calm = what == "verdict" and not _is_loss(_at_last_log(now))
-    return CHANGES["verdict, no loss" if calm else what][0]
+    severities = dict(CHANGES)
+    if not _is_loss(_at_last_log(now)):
+        severities["verdict"] = severities["verdict, no loss"]
+    return now, [Change(now.stage, *one, now.recorded_at, severities[one[0]]) for one in changes]
 
 
 def _detail(code: str, now: Status) -> str:

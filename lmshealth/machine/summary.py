@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from datetime import date, datetime
 from typing import Literal
 
@@ -17,23 +17,14 @@ from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import (
-    ProbabilityBounds,
-    Service,
-    day_after,
-    probability_before,
-    remaining_days,
-)
+from lmshealth.machine.service import Service, day_after, remaining_days, risk_before
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[
     "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
     "service-now", "overdue", "confirm", "schedule", "plan", "later",
 ]  # fmt: skip
-"""What to do: inspect the machine, find what moved a mode, confirm a drift by a log at once, or a
-loss after which the machine was perhaps repaired, record a log that is late, nothing, record logs,
-service it now, service it after its date, confirm a service date by further logs, plan the service
-of a sound or of a worn machine, or nothing within the horizon."""
+"""What to do; the sentence of each is in `[steps]` of ``_private/tables.toml``."""
 
 # First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
 # step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
@@ -80,10 +71,6 @@ class NextStep:
     horizon: float = np.nan  # travel in m beyond which nothing is claimed
     partial: bool = False  # whether a limit is left out, because the modes do not show it
     case: tuple[str, str, str] = ("open", "unknown", "young")  # verdict, service and age
-
-    def on(self, day: str) -> NextStep:
-        """Return the step on an ``overdue`` or ``late`` day, or on another (``""``)."""
-        return replace(self, kind=step_of(*self.case, day))
 
 
 def next_step(assessment: Assessment, service: Service) -> NextStep:
@@ -256,16 +243,6 @@ class Summary:
     today: date | None = None
     unknown: bool = False  # whether its last log is too old for the verdict that it allows
 
-    @property
-    def days_without_log(self) -> int:
-        """Days from the last log to the day of the summary."""
-        return days_between(self.recorded_at, self.today)
-
-
-def days_between(last: datetime, today: date | None) -> int:
-    """Return the days from the last log to a day, at least 0; 0 without one."""
-    return 0 if today is None else max((today - last.date()).days, 0)
-
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
     """Summarise an assessment, with its page and the result of `Assessment.service`."""
@@ -277,6 +254,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     state = "bad" if assessment.alarmed else states.get(judgement.verdict, "bad")
     words = degraded_words(judgement.verdict)
     lost = [spec.name for spec in assessment.stage.parameters if spec.word in words]
+    modes, deviates = assessment.track.modes if assessment.track else (), (*assessment.left_out,)
+    if set(modes) == {*deviates}:
+        deviates = ("all",)
     return Summary(
         file=file,
         identity=judgement.stage,
@@ -296,15 +276,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
         step=next_step(assessment, service),
-        deviates=_deviating(assessment) if judgement.probability >= 0 else (),
+        deviates=deviates if judgement.probability >= 0 else (),
         postponed=tuple(_postponed(prognosis, service)),
     )
-
-
-def _deviating(assessment: Assessment) -> tuple[str, ...]:
-    """Return the modes in which the last logs are left out as `Summary` has them."""
-    modes = assessment.track.modes if assessment.track else ()
-    return ("all",) if set(modes) == assessment.left_out.keys() else (*assessment.left_out,)
 
 
 def _postponed(
@@ -314,8 +288,7 @@ def _postponed(
     for weeks in constants.POSTPONED_WEEKS if prognosis and service.by else ():
         assert prognosis is not None
         if (day := day_after(prognosis, max(service.wait, 0.0) + 7 * weeks)) is not None:
-            reached = probability_before(prognosis, day)
-            yield day, weeks or None, (float(reached.at_least[-1]), float(reached.at_most[-1]))
+            yield day, weeks or None, risk_before(prognosis, day)
 
 
 def summarise_life(
@@ -328,12 +301,12 @@ def summarise_life(
     limits = []
     for k, name in enumerate(prognosis.parameters):
         baseline = baselines.get(name, 1.0)
-        wait = _quantiles(days[:, k])
+        wait = quantiles(days[:, k])
         limits.append(
             LimitLife(
                 parameter=name,
                 limit=float(prognosis.limits[k]),
-                travel=_quantiles(travel[:, k]),
+                travel=quantiles(travel[:, k]),
                 days=wait,
                 dates=tuple(day_after(prognosis, one) for one in wait),
                 already_past=float(past[k]),
@@ -353,9 +326,10 @@ def summarise_life(
     )
 
 
-def _quantiles(values: FloatArray) -> tuple[float, ...]:
+def quantiles(
+    values: FloatArray, levels: tuple[float, ...] = constants.RUL_LEVELS
+) -> tuple[float, ...]:
     """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
-    levels = constants.RUL_LEVELS
     return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
 
 
@@ -395,7 +369,7 @@ def _parameters(assessment: Assessment) -> Iterator[ParameterHealth]:
 
 
 def prognosis_rows(
-    life: Life, service: Service, before: tuple[date, ProbabilityBounds] | None = None
+    life: Life, service: Service, before: tuple[date, FloatArray] | None = None
 ) -> list[Row]:
     """Return a remaining life, one row per limit and one for any, which has the service.
 
@@ -405,11 +379,8 @@ def prognosis_rows(
     of_any = (
         *(service.kind, service.by, service.risk, service.inspect_by),
         *(finite_or_none(service.inspect_every / _KM), service.earliest_end),
-        *(
-            (finite_or_none(fleet.travel / _KM), fleet.coverage, fleet.n_lives)
-            if fleet
-            else [None] * 3
-        ),
+        finite_or_none(fleet.travel / _KM) if fleet else None,
+        *((fleet.coverage, fleet.n_lives) if fleet else (None, None)),
     )
     rows = []
     for j, one in enumerate(life.limits):
@@ -425,7 +396,7 @@ def prognosis_rows(
         )
         if before is not None:
             day, reached = before
-            at_least, at_most = reached.at_least[j], reached.at_most[j]
+            at_least, at_most = reached[:, j]
             row |= {"before": day, "probability_at_least": at_least, "probability_at_most": at_most}
         rows.append(row)
     return rows

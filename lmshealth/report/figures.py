@@ -22,24 +22,15 @@ from lmshealth.errors import BadQuestion
 from lmshealth.io.log import SI_UNITS, Log
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
+from lmshealth.machine.constants import LEVELS
 from lmshealth.machine.service import Service
 from lmshealth.machine.status import chi_square_band
+from lmshealth.machine.summary import quantiles
 from lmshealth.modal.modes import Modes
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.report import constants
+from lmshealth.report import constants, text
 from lmshealth.report.language import decimal, language, mark, tr
-from lmshealth.report.text import (
-    GAP,
-    covariate,
-    ends,
-    fixed,
-    km,
-    moment,
-    quantiles,
-    signed,
-    spell,
-    whole_km,
-)
+from lmshealth.report.text import GAP, spell
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import CovariateEffect, Track
 
@@ -114,14 +105,11 @@ def _compact(text: str) -> str:
     text = re.sub(r'(?<=\sd=")[^"]*', lambda m: re.sub(r"\s*([A-Za-z])\s*", r"\1", m[0]), text)
     text = re.sub(r'style="[^"]*"', lambda m: re.sub(r"([:;,]) ", r"\1", m[0]), text)
     # Successive equal markers share their style.
-    text = re.sub(r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+', _once, text)
+    runs = r'(?:<use [^>]*? (style="[^"]*")/>\n)(?:<use [^>]*? \1/>\n)+'
+    text = re.sub(runs, lambda m: f"<g {m[1]}>\n{m[0].replace(f' {m[1]}', '')}</g>\n", text)
     used = set(re.findall(r'(?:href="|url\()#([^")]+)', text))
     text = re.sub(r'\sid="([^"]*)"', lambda m: m[0] if m[1] in used else "", text)
     return re.sub(r"<g>\n(<(?:use|path) [^>]*/>)\n</g>", r"\1", text)
-
-
-def _once(found: re.Match[str]) -> str:
-    return f"<g {found[1]}>\n{found[0].replace(f' {found[1]}', '')}</g>\n"
 
 
 def print_figure(
@@ -212,8 +200,6 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
     For two parameters: highest-density regions of 50 and 90 %, baseline, medians and marginal 90 %
     intervals (bars along the axes). For one parameter: its density.
     """
-    if len(parameters) not in (1, 2):
-        raise ValueError(f"cannot plot {len(parameters)} parameters; needed are 1 or 2")
     columns = [health.parameters.index(name) for name in parameters]
     draws = 100 * health.samples[-1][:, columns]
     draws = draws[np.isfinite(draws).all(axis=1)]
@@ -234,11 +220,11 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     name = tr("health by all logs") if informed else tr("mostly prior, not measured")
     _bands(ax, health.travel / _KM, bands, name, informed=informed)
     if informed:  # else no values are published
-        texts = [
-            f"{moment(when)}, {whole_km(travel)}\n{spell(parameter)} {fixed(q[2], 1)}{GAP}%, "
-            f"90{GAP}%: {ends(fixed(q[0], 1), fixed(q[4], 1))}{GAP}%"
-            for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True)
-        ]
+        texts = []
+        for when, travel, q in zip(health.recorded_at, health.travel, bands.T, strict=True):
+            least, _, median, _, most = (text.fixed(one, 1) for one in q)
+            own = f"{spell(parameter)} {median}{GAP}%, 90{GAP}%: {text.ends(least, most)}{GAP}%"
+            texts.append(f"{text.moment(when)}, {text.whole_km(travel)}\n{own}")
         hints(ax, health.travel / _KM, bands[2], texts)
     _levels(ax, limit)
     # Show bands up to 250 %, baseline and limit.
@@ -250,13 +236,7 @@ def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -
     return odometer(ax)
 
 
-def plot_life(
-    ax: Axes,
-    prognosis: Prognosis,
-    parameter: str,
-    *,
-    baseline: float = 1.0,
-) -> Axes:
+def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float = 1.0) -> Axes:
     """Plot a parameter since the baseline and up to the horizon, by its laws.
 
     The bar on the limit is the 90 % interval of its first passage. `baseline` is the value of the
@@ -270,12 +250,11 @@ def plot_life(
     _levels(ax, limit)
     ax.axvline(now, color=INK, lw=1.2, ls=":", label=tr("now"))
     end = now + prognosis.horizon / _KM
-    low, middle, high = np.array(quantiles(prognosis.remaining[:, column])) / _KM
+    low, middle, high = np.array(quantiles(prognosis.remaining[:, column], LEVELS)) / _KM
     if np.isfinite(low) and low < prognosis.horizon / _KM:
         _passage(ax, now, np.array([low, middle, high]), 100 * limit)
     right = min(end, now + max(1.3 * high, 0.25 * now)) if np.isfinite(high) else end
-    shown = right >= 0.55 * end
-    if shown:
+    if shown := right >= 0.55 * end:
         right = end
         ax.axvline(end, color=MUTED, lw=1.2, ls="-.", label=tr("horizon"))
     left = min(float(travel.min()), now)
@@ -284,9 +263,8 @@ def plot_life(
     ax.set_ylabel(tr("% of baseline"))
     odometer(ax)
     if not shown:
-        ax.set_xlabel(
-            tr("odometer in km (horizon at {distance}, not shown)", distance=whole_km(_KM * end))
-        )
+        label = tr("odometer in km (horizon at {distance}, not shown)")
+        ax.set_xlabel(label.format(distance=text.whole_km(_KM * end)))
     return ax
 
 
@@ -319,32 +297,21 @@ def plot_survival(ax: Axes, prognosis: Prognosis, *, service: Service | None = N
     ax.plot(ahead, chance_left(left[:, -1], ahead), color=BLUE, lw=2.2, label=label)
     some = np.linspace(0, end, 25)
     chance = chance_left(left[:, -1], some)
-    pairs = zip(_KM * some, chance, strict=True)
-    hints(
-        ax,
-        some,
-        chance,
-        [
-            tr("after {distance}: {share}", distance=whole_km(x), share=f"{y:.0f}{GAP}%")
-            for x, y in pairs
-        ],
-    )
+    texts = [
+        tr("after {distance}: {share}", distance=text.whole_km(x), share=f"{y:.0f}{GAP}%")
+        for x, y in zip(_KM * some, chance, strict=True)
+    ]
+    hints(ax, some, chance, texts)
     if service is not None and service.kept_risk is not None:
-        risk = decimal(f"{100 * service.kept_risk:.3g}")
-        accepted, cheapest = (
-            tr("accepted risk {risk} %", risk=risk),
-            tr("risk at least cost {risk} %", risk=risk),
-        )
-        label = accepted if service.max_risk else cheapest
+        risk, label = decimal(f"{100 * service.kept_risk:.3g}"), tr("accepted risk {risk} %")
+        label = tr("risk at least cost {risk} %") if service.cost_ratio else label
+        label = label.format(risk=risk)
         ax.axhline(100 * (1 - service.kept_risk), color=RED, lw=1.2, ls=(0, (5, 2)), label=label)
     ax.set_xlim(0, end)
     ax.set_ylim(0, 103)
     grouped(ax)
-    ax.set_xlabel(
-        tr("travel from now in km (ends at the horizon)")
-        if end == horizon
-        else tr("travel from now in km")
-    )
+    whole = tr("travel from now in km (ends at the horizon)")
+    ax.set_xlabel(whole if end == horizon else tr("travel from now in km"))
     ax.set_ylabel(tr("probability in %"))
     return legend(ax)
 
@@ -375,16 +342,14 @@ def _passage(ax: Axes, now: float, ahead: FloatArray, level: float) -> None:
     right = where[2] if np.isfinite(where[2]) else 1e9  # beyond the figure
     ax.plot([where[0], right], [level, level], color=RED, lw=5, alpha=0.55, solid_capstyle="butt")
     if np.isfinite(where[1]):
-        ax.plot(
-            where[1], level, "D", color=RED, mec=PAPER, ms=6, zorder=5, label=tr("limit reached")
-        )
-    for x, far, name in zip(
-        where, ahead, (tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")), strict=True
-    ):
+        style: Any = {"color": RED, "mec": PAPER, "ms": 6, "zorder": 5}
+        ax.plot(where[1], level, "D", label=tr("limit reached"), **style)
+    names = tr("Early (5 %)"), tr("Median"), tr("Late (95 %)")
+    for x, far, name in zip(where, ahead, names, strict=True):
         if np.isfinite(x):
-            ahead_, at = km(_KM * far), whole_km(_KM * x)
-            text = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
-            hints(ax, np.array([x]), np.array([level]), [text])
+            ahead_, at = text.km(_KM * far), text.whole_km(_KM * x)
+            hint = tr("{name}: in {ahead}, at {odometer}", name=name, ahead=ahead_, odometer=at)
+            hints(ax, np.array([x]), np.array([level]), [hint])
 
 
 def _regions(ax: Axes, draws: FloatArray) -> None:
@@ -605,9 +570,7 @@ def plot_track(ax: Axes, track: Track, mode: str) -> Axes:
     k = track.modes.index(mode)
     x = along(track)
     _filtered(ax, x, track.ln_frequency[:, k], track.ln_frequency_std[:, k], 1.0)
-    names = {
-        kind: tr(words) for kind, words in _WORDS.items()
-    }  # each kind has one entry in the legend
+    names = {kind: tr(words) for kind, words in _WORDS.items()}  # each in the legend once
     own = (step for step in track.steps if step.mode in ("", mode))
     for kind, first in dict.fromkeys((step.kind, step.first) for step in own):
         style: Any = {"color": RED, "ls": "-"} if kind == "step" else {"color": INK, "ls": ":"}
@@ -640,16 +603,10 @@ def plot_nis(ax: Axes, track: Track) -> Axes:
     ax.fill_between(x, low, high, step="mid", color=BLUE, alpha=0.18, lw=0, label=tr("95 % band"))
     inside = (nis >= low) & (nis <= high)
     ax.plot(x[inside], nis[inside], "o", color=BLUE, ms=4, label=tr("inside"))
-    texts = [
-        f"{title(track, k)}\n"
-        + tr(
-            "NIS {value}; expected {low} to {high}",
-            value=fixed(value, 1),
-            low=fixed(a, 1),
-            high=fixed(b, 1),
-        )
-        for k, value, a, b in zip(seen.tolist(), nis, low, high, strict=True)
-    ]
+    texts, words = [], tr("NIS {value}; expected {low} to {high}")
+    for k, *values in zip(seen.tolist(), nis, low, high, strict=True):
+        value, least, most = (text.fixed(one, 1) for one in values)
+        texts.append(f"{title(track, k)}\n{words.format(value=value, low=least, high=most)}")
     hints(ax, x, nis, texts)
     if not inside.all():
         ax.plot(x[~inside], nis[~inside], "D", color=RED, ms=5, label=tr("outside"))
@@ -679,9 +636,14 @@ def plot_waterfall(
     sides = _columns(history.travel / _KM)
     x, level = sides.ravel(), np.full((waterfall.level.shape[1], 2 * len(sides) - 1), np.nan)
     level[:, ::2] = waterfall.level.T
-    low, high = _shown_levels(waterfall)
+    free = waterfall.level.copy()  # without spectral lines
+    for row, lines in zip(free, waterfall.lines, strict=True):
+        for at in np.searchsorted(waterfall.edges, [line.frequency for line in lines]):
+            row[max(at - 3, 0) : at + 2] = np.nan
+    low, high = np.nanquantile(free, [0.02, 0.998])
     # As an image: rectangles would need a hundred times the bytes.
-    colours: Any = {"cmap": "cividis", "vmin": low, "vmax": high}
+    steps = {"vmin": 5 * float(np.floor(low / 5)), "vmax": 5 * float(np.ceil(high / 5))}
+    colours: Any = {"cmap": "cividis", **steps}
     picture = ax.pcolormesh(x, waterfall.edges, level, rasterized=True, **colours)
     bar = ax.figure.colorbar(picture, ax=ax, extend="both", pad=0.02, aspect=30)
     bar.set_label(tr("level in dB"))
@@ -716,16 +678,13 @@ def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Ax
     ax.plot(grid, line, color=BLUE, lw=1.6, label=tr("effect"))
     ax.plot(x, before, "o", mfc="none", mec=MUTED, ms=4.5, mew=1.0, label=tr("as measured"))
     ax.plot(x, after, "o", color=INK, ms=2.8, label=tr("corrected"))
-    name, unit = covariate(influence.covariate)
-    texts = [
-        f"{title(history, k)}\n{name} {decimal(f'{value:.4g}')}{GAP}{unit}\n"
-        + tr(
-            "as measured {before}, corrected {after}",
-            before=f"{signed(a, 2)}{GAP}%",
-            after=f"{signed(b, 2)}{GAP}%",
-        )
-        for k, value, a, b in zip(epochs, x, before, after, strict=True)
-    ]
+    name, unit = text.covariate(influence.covariate)
+    texts, words = [], tr("as measured {before}, corrected {after}")
+    for k, value, *both in zip(epochs, x, before, after, strict=True):
+        measured, corrected = (f"{text.signed(one, 2)}{GAP}%" for one in both)
+        own = words.format(before=measured, after=corrected)
+        there = f"{name} {decimal(f'{value:.4g}')}{GAP}{unit}"
+        texts.append(f"{title(history, k)}\n{there}\n{own}")
     hints(ax, x, before, texts)
     ax.set_xlabel(plain_label(tr("{name} in {unit}", name=name, unit=unit) if unit else name))
     ax.set_ylabel(tr("change of frequency in %"))
@@ -744,7 +703,7 @@ def _logs(
     style: Any = {"fmt": "o", "ms": 3, "color": MUTED, "elinewidth": 0.7, "alpha": 0.85}
     ax.errorbar(x, bounds[1], np.diff(bounds, axis=0), label=tr("each log, ±2σ"), **style)
     texts = [
-        f"{title(history, k)}\n{fixed(value, 2)} ± {fixed(value * std[k], 2)}{GAP}{name}"
+        f"{title(history, k)}\n{text.fixed(value, 2)} ± {text.fixed(value * std[k], 2)}{GAP}{name}"
         for k, value in zip(seen.tolist(), bounds[1], strict=True)
     ]
     hints(ax, x, bounds[1], texts)
@@ -753,7 +712,7 @@ def _logs(
 
 def title(lives: History | Track, k: int) -> str:
     """Return name, time and odometer of a log, for hints."""
-    return f"{lives.logs[k]}\n{moment(lives.recorded_at[k])}, {whole_km(lives.travel[k])}"
+    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}, {text.whole_km(lives.travel[k])}"
 
 
 def _filtered(ax: Axes, x: FloatArray, level: FloatArray, std: FloatArray, unit: float) -> None:
@@ -786,16 +745,6 @@ def _columns(x: FloatArray) -> FloatArray:
     return np.stack([x - np.append(usual / 2, half), x + np.append(half, usual / 2)], axis=1)
 
 
-def _shown_levels(waterfall: Waterfall) -> tuple[float, float]:
-    """Return the range of colours in dB, without spectral lines, in steps of 5 dB."""
-    free = waterfall.level.copy()
-    for row, lines in zip(free, waterfall.lines, strict=True):
-        for at in np.searchsorted(waterfall.edges, [line.frequency for line in lines]):
-            row[max(at - 3, 0) : at + 2] = np.nan
-    low, high = np.nanquantile(free, [0.02, 0.998])
-    return 5 * float(np.floor(low / 5)), 5 * float(np.ceil(high / 5))
-
-
 def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: History) -> None:
     """Add a hint to each column: its log and the frequencies of its modes."""
     from matplotlib.collections import PolyCollection
@@ -807,7 +756,7 @@ def _column_hints(ax: Axes, sides: FloatArray, waterfall: Waterfall, history: Hi
     texts = []
     for k, ln_f in enumerate(history.ln_frequency):
         lines = [
-            f"{spell(history.series[i].mode)} {fixed(np.exp(ln_f[i]), 2)}{GAP}Hz"
+            f"{spell(history.series[i].mode)} {text.fixed(np.exp(ln_f[i]), 2)}{GAP}Hz"
             for i in np.flatnonzero(np.isfinite(ln_f))
         ]
         texts.append("\n".join([title(history, k), *lines]))
@@ -827,17 +776,12 @@ def _waterfall_lines(ax: Axes, waterfall: Waterfall, history: History) -> None:
         name = tr("other line") if kind == "unknown" else tr("{kind} line", kind=spell(kind))
         label = plain_label(name)
         ax.plot(x, y, marker, color=RED, ms=3.5, mew=1.0, path_effects=_halo(2.0), label=label)
-        texts = [
-            f"{title(history, k)}\n"
-            + tr(
-                "{name} at {frequency}, {amplitude} in {channel}",
-                name=name,
-                frequency=f"{fixed(line.frequency, 2)}{GAP}Hz",
-                amplitude=f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}",
-                channel=line.channel,
-            )
-            for line, k in own
-        ]
+        texts, words = [], tr("{name} at {frequency}, {amplitude} in {channel}")
+        for line, k in own:
+            at = f"{text.fixed(line.frequency, 2)}{GAP}Hz"
+            size = f"{decimal(f'{line.amplitude:.2g}')}{GAP}{line.unit}"
+            found = words.format(name=name, frequency=at, amplitude=size, channel=line.channel)
+            texts.append(f"{title(history, k)}\n{found}")
         hints(ax, x, y, texts)
 
 

@@ -22,7 +22,7 @@ from lmshealth.modal.spectra_summary import WIDE, SpectraSummary, density, summa
 from lmshealth.report import figures, tables
 from lmshealth.report.language import decimal, tr
 from lmshealth.report.rendering import render
-from lmshealth.report.text import reason, spell
+from lmshealth.report.text import spell
 from lmshealth.signal.spectral_lines import expected_orders
 from lmshealth.stage.description import ChannelSpec, Stage
 
@@ -134,7 +134,10 @@ def plot_shapes(
             plot_shape(axes[0], shapes, i, places)
         axes[-1].set_axis_on()
         _plot_components(axes[-1], shapes, i, before)
-        _name_shape(axes[0], shapes, i, float(mac[i]))
+        own = {"MPC": float(shapes.complexity[i]), "MAC": float(mac[i])}
+        values = (f"{name} {decimal(f'{one:.2f}')}" for name, one in own.items() if one == one)
+        title = f"{spell(shapes.names[i])}\n{', '.join(values)}"
+        axes[0].set_title(figures.plain_label(title), size=9)
         axes[-1].tick_params(labelleft=column == 0)
     handles, labels = grid[len(heights) - 1, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower left", ncols=4)
@@ -172,15 +175,6 @@ def _plot_components(ax: Axes, shapes: ModeShapes, i: int, before: ModeShapes | 
     ax.set_xticks([-1, 0, 1])
     ax.set_yticks(y, [figures.plain_label(name) for name in shapes.channels])
     ax.invert_yaxis()
-
-
-def _name_shape(ax: Axes, shapes: ModeShapes, i: int, mac: float) -> None:
-    """Write the mode above its shape, with its phase collinearity and its MAC."""
-    values = {"MPC": float(shapes.complexity[i]), "MAC": mac}
-    text = ", ".join(
-        f"{name} {decimal(f'{value:.2f}')}" for name, value in values.items() if np.isfinite(value)
-    )
-    ax.set_title(figures.plain_label(f"{spell(shapes.names[i])}\n{text}"), size=9)
 
 
 def plot_shape(ax: Axes, shapes: ModeShapes, i: int, places: Sequence[ChannelSpec]) -> Axes:
@@ -263,7 +257,7 @@ def plot_spectra(
                 middle, *(fit * range_), **style, label=tr("95 % range of the data, by the fit")
             )
         label = figures.plain_label(name) + ("\n" + tr("(2nd derivative)") if derived else "")
-        label += f"\n({reason(refused[name])})" if name in refused else ""
+        label += f"\n({tr(refused[name])})" if name in refused else ""
         _name_panel(ax, label)
         _mark_lines(ax, modes, name, middle, own)
     for k, values in enumerate(singular):
@@ -414,11 +408,8 @@ def _mark_lines(
         own = [line for line in seen if (line.kind, line.channel) == (kind, channel)]
         x = np.array([line.frequency for line in own])
         y = 1.5 * np.interp(x, frequency, level)
-        name = (
-            tr("line of unknown origin")
-            if kind == "unknown"
-            else tr("line: {kind}", kind=spell(kind))
-        )
+        unknown = tr("line of unknown origin")
+        name = unknown if kind == "unknown" else tr("line: {kind}", kind=spell(kind))
         label = figures.plain_label(name)
         ax.plot(x, y, marker, color=figures.RED, ms=4, mew=0, label=label)
 
@@ -445,10 +436,9 @@ def _annotate(
     for k, f in enumerate(modes.frequency.tolist()):
         reach = 1.96 * float(np.sqrt(modes.cov[k, k]))
         for ax in panels:
-            ax.axvspan(
-                f * np.exp(-reach), f * np.exp(reach),
-                color=figures.BLUE, alpha=0.35, lw=0, label=tr("mode, 95 % interval"),
-            )  # fmt: skip
+            span: Any = {"color": figures.BLUE, "alpha": 0.35, "lw": 0}
+            label = tr("mode, 95 % interval")
+            ax.axvspan(f * np.exp(-reach), f * np.exp(reach), label=label, **span)
             ax.axvline(f, color=figures.BLUE, lw=0.6)
         name = spell(modes.names[k] or tr("unnamed"))
         labels.append((f, f"{name}\n{_value(f, float(modes.frequency_std[k]))}", figures.BLUE))
@@ -457,18 +447,15 @@ def _annotate(
     for declared in sought.values():
         style: Any = {"color": figures.GREEN, "ms": 6, "mew": 0, "clip_on": False}
         if band[0] <= declared <= band[1]:
-            panels[-1].plot(
-                declared, 0, "^", transform=place, label=tr("declared frequency"), **style
-            )
+            label = tr("declared frequency")
+            panels[-1].plot(declared, 0, "^", transform=place, label=label, **style)
     for refusal in modes.refused:
         refused = refusal.frequency or sought.get(refusal.mode)
         if refused is not None and band[0] <= refused <= band[1]:
             style = {"color": figures.RED, "lw": 1, "ls": (0, (4, 3))}
             for ax in panels:
                 ax.axvline(refused, **style, label=tr("refused, or not found"))
-            labels.append(
-                (refused, f"{spell(refusal.mode)}\n{reason(refusal.reason)}", figures.RED)
-            )
+            labels.append((refused, f"{spell(refusal.mode)}\n{tr(refusal.reason)}", figures.RED))
     panels[-1].set_xlabel(tr("frequency in Hz"))
     panels[-1].set_xlim(*band)
     if band[1] > WIDE * band[0] > 0:
@@ -519,14 +506,8 @@ def _notes(modes: Modes) -> list[str]:
     """Return the refusals in lines that fit."""
     lines = []
     for refusal in modes.refused:
-        what = spell(refusal.mode) or refusal.channel or tr("modes")
-        text = figures.plain_label(
-            tr(
-                "{what} refused, {reason}: {detail}",
-                what=what,
-                reason=reason(refusal.reason),
-                detail=refusal.detail,
-            )
-        )
+        what, why = spell(refusal.mode) or refusal.channel or tr("modes"), tr(refusal.reason)
+        own = {"what": what, "reason": why, "detail": refusal.detail}
+        text = figures.plain_label(tr("{what} refused, {reason}: {detail}", **own))
         lines += textwrap.wrap(text, _NOTE_COLUMNS, subsequent_indent="    ")
     return lines

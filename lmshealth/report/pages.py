@@ -6,7 +6,6 @@ This module collects results and figures; wording and markup are in ``templates/
 import re
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
 from datetime import date, timedelta
 from functools import partial
 from itertools import combinations
@@ -29,24 +28,12 @@ from lmshealth.machine.constants import LEVELS, RUL_LEVELS
 from lmshealth.machine.service import Service
 from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
 from lmshealth.machine.summary import Summary, first_limit, limit_of
-from lmshealth.report import constants, figures
+from lmshealth.report import constants, figures, text
 from lmshealth.report.language import mark, tr, tr_month
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
 from lmshealth.report.rendering import read, render
 from lmshealth.report.tables import track_rows
-from lmshealth.report.text import (
-    GAP,
-    changes,
-    coarse,
-    ends,
-    headline,
-    km,
-    next_step,
-    number,
-    service_on_day,
-    spell,
-    verdict_text,
-)
+from lmshealth.report.text import GAP, spell
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import History
 from lmshealth.tracking.track import (
@@ -63,12 +50,7 @@ _MARK = "<!--day-->"  # no other comment is in a page: everything else is escape
 _SIZES = {"waterfall": (4.5, 3.6), "influence": (3.8, 2.6)}  # in inches; others: figures.SIZE
 
 
-def make_page(
-    assessment: Assessment,
-    summary: Summary,
-    *,
-    before: Summary | None = None,
-) -> str:
+def make_page(assessment: Assessment, summary: Summary, *, before: Summary | None = None) -> str:
     """Make the page of one machine (HTML), with marks that `date_page` replaces.
 
     Parameters
@@ -78,23 +60,28 @@ def make_page(
     before : Summary, optional
         Summary of the machine in its previous report.
     """
-    service = summary.service
+    prognosis, health, fleet = assessment.prognosis, assessment.latest_health, assessment.fleet
     highest = max((one.high for one in summary.health), default=1.0)
     content = {
         "assessment": assessment,
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
-        "first_limit": first_limit(assessment.prognosis),
+        "first_limit": first_limit(prognosis),
         "before": before,
         "mark": _MARK,
         "outside": list(_outside_map(assessment)),
-        "news": before and [*changes(before, summary)],
+        "news": before and [*text.changes(before, summary)],
         **_track_content(assessment),
-        **_health_content(assessment),
+        "health": health,
+        "pairs": [] if health is None else list(_pairs(health)),
+        "fleet": fleet,
+        "scatter": list(_scatter(fleet, assessment.stage)),
+        "pace": _pace,
+        "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
     }
     draw = _track_pictures(assessment, content["influences"])
-    draw |= _health_pictures(assessment, service)
+    draw |= _health_pictures(assessment, summary.service)
     pictures = {
         key: figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
         for k, (key, plot) in enumerate(draw.items())
@@ -103,7 +90,7 @@ def make_page(
         pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
     content["picture"] = {
-        key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", text) for key, text in pictures.items()
+        key: re.sub(r'\sxmlns(:xlink)?="[^"]*"', "", svg) for key, svg in pictures.items()
     }
     return render("stage.html.j2", **content)
 
@@ -121,10 +108,10 @@ def date_page(page: str, summary: Summary, status: Status) -> str:
         summary=summary,
         status=status,
         states=coming_states(status, summary.today),
-        headline=headline(summary),
-        verdict=verdict_text(summary),
-        to_do=next_step(summary.step),
-        due=service_on_day(summary),
+        headline=text.headline(summary),
+        verdict=text.verdict_text(summary),
+        to_do=text.next_step(summary.step),
+        due=text.service_on_day(summary),
     ).split(_MARK)
     pieces = page.split(_MARK)[1:]  # the page begins with a mark
     return "".join(part + piece for part, piece in zip(parts, pieces, strict=True))
@@ -206,19 +193,6 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
     }
 
 
-def _health_content(assessment: Assessment) -> dict[str, Any]:
-    """Collect what the page shows of health, laws and samplers."""
-    prognosis, health = assessment.prognosis, assessment.latest_health
-    return {
-        "health": health,
-        "pairs": [] if health is None else list(_pairs(health)),
-        "fleet": assessment.fleet,
-        "scatter": list(_scatter(assessment.fleet, assessment.stage)),
-        "pace": _pace,
-        "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
-    }
-
-
 def _grouped(items: Iterable[Item], key: Callable[[Item], Any]) -> dict[Any, list[Item]]:
     groups: dict[Any, list[Item]] = {}
     for item in items:
@@ -289,12 +263,12 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     """Format the prior of the life of a law, or of its rate: median and 90 % interval."""
     low, middle, high = (float(q) for q in pace.quantile(np.array(LEVELS)))
     if law.field == "life_km":
-        spread = ends(coarse(low), coarse(high))
-        return tr("life {distance} ({interval})", distance=km(1e3 * middle), interval=spread)
+        spread = text.ends(text.coarse(low), text.coarse(high))
+        return tr("life {distance} ({interval})", distance=text.km(1e3 * middle), interval=spread)
     low, middle, high = (1e5 * rate for rate in (low, middle, high))  # % per 1,000 km
-    spread = ends(coarse(low), f"{coarse(high)}{GAP}%")
-    rate = f"{coarse(middle)}{GAP}%"
-    return tr("{rate} per {distance} ({interval})", rate=rate, distance=km(1e6), interval=spread)
+    spread = text.ends(text.coarse(low), f"{text.coarse(high)}{GAP}%")
+    own = {"rate": f"{text.coarse(middle)}{GAP}%", "distance": text.km(1e6), "interval": spread}
+    return tr("{rate} per {distance} ({interval})", **own)
 
 
 def _track_pictures(
@@ -330,20 +304,16 @@ def _mac(assessment: Assessment) -> dict[str, float]:
 
 def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, float]]]:
     """Return what draws the last log beside the one at the baseline, and the size in inches."""
-    latest, stage, before = assessment.latest, assessment.stage, assessment.compared
-    if latest is None:
-        return {}
+    latest, before = assessment.latest, assessment.compared
     found: dict[str, tuple[Any, tuple[float, float]]] = {}
-    if latest.spectra is not None:
-        plot = partial(plot_spectra, summary=latest.spectra, modes=latest.modes)
+    if latest and latest.spectra is not None:
+        plot = partial(plot_spectra, summary=latest.spectra, modes=latest.modes, before=before)
         size = spectra_size(latest.spectra, latest.modes)
-        found["latest"] = partial(plot, stage=stage, before=before), size
-    if latest.shapes is not None and (size := shapes_size(latest.shapes, stage))[1]:
-        earlier = before.shapes if before is not None else None
-        found["shapes"] = (
-            partial(plot_shapes, shapes=latest.shapes, stage=stage, before=earlier),
-            size,
-        )
+        found["latest"] = partial(plot, stage=assessment.stage), size
+    if latest and latest.shapes is not None:
+        plot = partial(plot_shapes, shapes=latest.shapes, before=before.shapes if before else None)
+        size = shapes_size(latest.shapes, assessment.stage)
+        found |= {"shapes": (partial(plot, stage=assessment.stage), size)} if size[1] else {}
     return found
 
 
@@ -362,9 +332,8 @@ def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str
         drawn = partial(figures.plot_life, prognosis=prognosis)
         for name in prognosis.parameters[:-1]:
             draw["life", name] = partial(drawn, parameter=name, baseline=specs[name].baseline)
-        draw["survival", "any"] = partial(
-            figures.plot_survival, prognosis=prognosis, service=service
-        )
+        drawn = partial(figures.plot_survival, prognosis=prognosis)
+        draw["survival", "any"] = partial(drawn, service=service)
     return draw
 
 
@@ -397,16 +366,6 @@ _WORDS = (
     mark('`${shown} of ${rows.length} stage${rows.length === 1 ? "" : "s"}, ${way}`'),
     mark('"Most urgent first"'),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Month:
-    """Number of services due in a month; ``before`` is the day after its last."""
-
-    label: str
-    year: str
-    before: date
-    count: int
 
 
 def file_names(identities: Iterable[str]) -> dict[str, str]:
@@ -448,12 +407,12 @@ def write_index(
         (reason, count, [one for one in refused if one.reason == reason][: constants.REFUSED_SHOWN])
         for reason, count in Counter(one.reason for one in refused).most_common()
     ]
-    text = render(
+    content = render(
         "index.html.j2",
         rows=ranked,
-        headline=headline,
-        verdict_text=verdict_text,
-        due=service_on_day,
+        headline=text.headline,
+        verdict_text=text.verdict_text,
+        due=text.service_on_day,
         silent=sum(one.unknown for one in ranked),
         today=today,
         parameters=list(dict.fromkeys(own.name for one in ranked for own in one.health)),
@@ -467,7 +426,7 @@ def write_index(
         script=script,
     )
     path = folder / "index.html"
-    write_text(path, text)
+    write_text(path, content)
     write_text(folder / "how-to-read.html", render("how_to_read.html.j2"))
     return path
 
@@ -477,23 +436,25 @@ def _lives(summaries: Sequence[Summary]) -> list[tuple[str, int]]:
     median = len(RUL_LEVELS) // 2
     left = [one.life.any.travel[median] / 1000 for one in summaries if one.life]
     edges = [0.0, *constants.LIFE_EDGES, np.inf]
-    labels = [tr("passed"), *(tr("to {distance}", distance=number(edge)) for edge in edges[1:-1])]
-    labels += [tr("more"), tr("beyond")]
+    inner = [tr("to {distance}", distance=text.number(edge)) for edge in edges[1:-1]]
+    labels = [tr("passed"), *inner, tr("more"), tr("beyond")]
     places = Counter(int(np.searchsorted(edges, km)) + (km == np.inf) for km in left)
     return [(label, places[k]) for k, label in enumerate(labels)] if left else []
 
 
-def _months(summaries: Sequence[Summary], today: date) -> list[Month]:
-    """Count the services due now and in each month of a year; empty without any."""
+def _months(summaries: Sequence[Summary], today: date) -> list[dict[str, Any]]:
+    """Count the services due now and in each month of a year, ``before`` a day; empty without."""
     due = [one.service.by for one in summaries if one.service.by is not None]
     today = min(today, date.max - timedelta(days=31 * (constants.CALENDAR_MONTHS + 1)))
     # Due now: everything due on or before this day.
     counts = Counter(day.replace(day=1) for day in due if day > today)
-    months = [Month(tr("now"), "", today + timedelta(days=1), sum(day <= today for day in due))]
+    now = sum(day <= today for day in due)
+    months = [{"label": tr("now"), "year": "", "before": today + timedelta(days=1), "count": now}]
     begin = today.replace(day=1)
     for k in range(constants.CALENDAR_MONTHS):
         year = f"{begin:%Y}" if k == 0 or begin.month == 1 else ""
         after = (begin + timedelta(days=31)).replace(day=1)
-        months.append(Month(tr_month(begin), year, after, counts[begin]))
+        month = {"label": tr_month(begin), "year": year, "before": after, "count": counts[begin]}
+        months.append(month)
         begin = after
-    return months if any(month.count for month in months) else []
+    return months if any(month["count"] for month in months) else []

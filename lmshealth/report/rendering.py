@@ -7,12 +7,14 @@ import os
 import re
 import warnings
 from base64 import b64encode
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from collections.abc import Iterable
+from contextlib import redirect_stdout, suppress
 from functools import cache
 from importlib import metadata, resources
 from pathlib import Path
 from typing import Any
+
+from markupsafe import Markup
 
 from lmshealth._private.files import write_bytes
 from lmshealth._private.tables import TABLES
@@ -80,22 +82,16 @@ def _environment() -> Any:
 
 def _translated(message: str, /, **values: Any) -> Any:
     """Translate a message of a template, which may have marks of HTML; its values are escaped."""
-    from markupsafe import Markup
-
     return Markup(language.tr(message)).format(**values)  # noqa: S704
 
 
 def _counted(one: str, many: str, n: int, /, **values: Any) -> Any:
     """Translate a message of a template by number, as `_translated` does."""
-    from markupsafe import Markup
-
     return Markup(language.tr_either(one, many, n)).format(n=n, **values)  # noqa: S704
 
 
 def translated_svg(svg: Any) -> Any:
     """Translate the labels of a figure (Markup) that was drawn in English."""
-    from markupsafe import Markup
-
     if language.language() == "en":
         return svg
     label = language.label
@@ -112,15 +108,19 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
     The bytes are reproducible, and nothing is loaded from the network or other files. `PdfError` if
     WeasyPrint is missing or cannot lay out a page.
     """
+    from unittest.mock import patch  # late: only this needs it
+
     html, fetcher = load_pdf_library()
     style, written = read("pdf.css"), []
+    # Of fonts by fontTools, which WeasyPrint uses without HarfBuzz-Subset.
+    time = {"SOURCE_DATE_EPOCH": os.environ.get("SOURCE_DATE_EPOCH") or "0"}
     for page in pages:
         source = page.read_text(encoding="utf-8").replace("</style>", f"{style}</style>", 1)
         # WeasyPrint does not resolve CSS variables inside SVG.
         source = re.sub(r"var\(--\w+, (#\w+)\)", r"\1", source)
         target = page.with_suffix(".pdf")
         try:
-            with _reproducible():
+            with patch.dict(os.environ, time):
                 content = html(string=source, url_fetcher=fetcher).write_pdf()
         except Exception as error:  # any failure: the HTML page exists
             found = f"cannot be made: {type(error).__name__} {error}"
@@ -128,19 +128,6 @@ def write_pdfs(pages: Iterable[Path]) -> list[Path]:
         write_bytes(target, content)
         written.append(target)
     return written
-
-
-@contextmanager
-def _reproducible() -> Iterator[None]:
-    """Fix the time in fonts by fontTools, which WeasyPrint uses without HarfBuzz-Subset."""
-    name = "SOURCE_DATE_EPOCH"
-    before = os.environ.get(name)
-    os.environ[name] = before or "0"
-    try:
-        yield
-    finally:
-        if before is None:
-            del os.environ[name]
 
 
 def load_pdf_library() -> tuple[Any, Any]:

@@ -74,7 +74,14 @@ def _lines(rows: Iterable[Iterable[Any]]) -> str:
 
 def log_tables(reading: LogEstimates) -> dict[str, str]:
     """Return the tables of one log as CSV, by name."""
-    rows = {"modes": modes_rows(reading), "modes_cov": _modes_cov_rows(reading)}
+    modes, table = reading.modes, TABLES["modes_cov"]
+    names = list(zip(modes.sources, modes.names, strict=True))
+    cov = [
+        table.row(reading.log, *names[a], *names[b], float(modes.cov[a, b]))
+        for a, b in combinations(range(len(names)), 2)
+        if modes.cov[a, b] != 0
+    ]
+    rows = {"modes": modes_rows(reading), "modes_cov": cov}
     return {name: csv_text(name, own) for name, own in rows.items()}
 
 
@@ -141,16 +148,6 @@ def shapes_rows(log: str, shapes: ModeShapes) -> tuple[list[Row], list[Row]]:
     pairs_ = combinations(range(len(names)), 2)
     return rows, [
         mac.row(log, names[i], names[j], finite_or_none(shapes.mac[i, j])) for i, j in pairs_
-    ]
-
-
-def _modes_cov_rows(reading: LogEstimates) -> list[Row]:
-    modes, table = reading.modes, TABLES["modes_cov"]
-    names = list(zip(modes.sources, modes.names, strict=True))
-    return [
-        table.row(reading.log, *names[a], *names[b], float(modes.cov[a, b]))
-        for a, b in combinations(range(len(names)), 2)
-        if modes.cov[a, b] != 0
     ]
 
 

@@ -5,7 +5,7 @@ They are those of the language of `report.language`: English on terminals.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import date, datetime
 from string import Formatter
 from typing import TYPE_CHECKING, Any, get_args
@@ -13,18 +13,8 @@ from typing import TYPE_CHECKING, Any, get_args
 import numpy as np
 
 from lmshealth._private import tables
-from lmshealth._private.arrays import FloatArray
-from lmshealth.machine.constants import LEVELS
 from lmshealth.report import constants
-from lmshealth.report.language import (
-    decimal,
-    mark,
-    mark_either,
-    sentence,
-    tr,
-    tr_day,
-    tr_either,
-)
+from lmshealth.report.language import decimal, mark, mark_either, sentence, tr, tr_day, tr_either
 
 if TYPE_CHECKING:  # above, so that --help needs no scipy
     from lmshealth.machine.service import Service
@@ -37,11 +27,12 @@ _UNITS = {"c": "°C", "kg": "kg", "mm": "mm", "db": "dB", "percent": "%"}
 
 Number = float | np.floating[Any]
 
+day = tr_day  # of a date, or of a moment
+
 # Names in the shipped descriptions, and of covariates.
 _NAMES = (
-    *(mark("guide preload"), mark("mount stiffness"), mark("any limit")),
-    *(mark("roll"), mark("pitch"), mark("yaw")),
-    *(mark("temperature"), mark("payload"), mark("position")),
+    *(mark("guide preload"), mark("mount stiffness"), mark("any limit"), mark("roll")),
+    *(mark("pitch"), mark("yaw"), mark("temperature"), mark("payload"), mark("position")),
 )
 # Conditions of a state by NAMUR NE 107, kinds of events and of spectral lines, and labels of the
 # pictures of how-to-read.html.
@@ -96,35 +87,20 @@ def law(kind: str) -> str:
     return sentence(str(labels.get(kind, kind)))
 
 
-def reason(code: str) -> str:
-    """Return the code of a refusal in words; in English the code itself."""
-    return tr(code)
-
-
 def reason_and_code(code: str) -> str:
     """Return the code of a refusal, with its words where they differ."""
     return code if tr(code) == code else f"{tr(code)} ({code})"
 
 
-def condition(words: str) -> str:
-    """Return a condition of a state by NAMUR NE 107 in words."""
-    return tr(words)
-
-
 def moment(when: datetime) -> str:
     """Format date, time and zone."""
-    return f"{tr_day(when)} {when:%H:%M %Z}".strip()
+    return f"{day(when)} {when:%H:%M %Z}".strip()
 
 
 def age(last: date, today: date) -> str:
     """Return for how long there has been no log on a day."""
     n = (today - last).days
     return tr_either("no log for {n} day", "no log for {n} days", n).format(n=_grouped(n))
-
-
-def day(when: date) -> str:
-    """Format a day, or that of a moment."""
-    return tr_day(when)
 
 
 def number(value: Number, digits: int = 3) -> str:
@@ -257,11 +233,6 @@ def service_text(service: Service) -> str:
     return {"now": tr("now"), "later": tr("no service needed yet")}.get(service.kind, tr("no date"))
 
 
-def quantiles(values: FloatArray, levels: tuple[float, ...] = LEVELS) -> tuple[float, ...]:
-    """Return quantiles of draws, shape ``(n_draws,)``, that may be infinite: each is a draw."""
-    return tuple(np.quantile(values, levels, method="inverted_cdf").tolist())
-
-
 class _Cells(Formatter):
     """Format strings with functions of this module, as in ``{drift:change {drift_std}}``.
 
@@ -279,8 +250,7 @@ class _Cells(Formatter):
         if value is None or value != value:  # NaN
             return "–"
         name, *options = format_spec.split() or [""]
-        function = globals().get(name)
-        if function:
+        if function := globals().get(name):
             return function(value, *map(_option, options))
         text = format(value, format_spec)
         # without a format it may be an argument of another one
@@ -322,12 +292,12 @@ def cells(
     A row is a mapping, a sequence or an object. A cell whose first value is missing is a dash.
     """
     common = [values or {}]
-    return [{head: _cell(form, row, common) for head, form in columns.items()} for row in rows]
 
+    def cell(form: str, row: Any) -> str:
+        value, _ = _FORMATTER.get_field(first_field(form), common, row)
+        return "–" if value is None or value != value else _FORMATTER.vformat(form, common, row)
 
-def _cell(form: str, row: Any, common: Sequence[Mapping[str, Any]]) -> str:
-    value, _ = _FORMATTER.get_field(first_field(form), common, row)
-    return "–" if value is None or value != value else _FORMATTER.vformat(form, common, row)
+    return [{head: cell(form, row) for head, form in columns.items()} for row in rows]
 
 
 # Sentences of a summary
@@ -398,47 +368,6 @@ def service_on_day(summary: Summary) -> str:
 
 # Work that restores a parameter; of any other: work on it.
 _WORK = {"preload": mark("a preload adjustment"), "mount": mark("a tightening of the mount")}
-# Sentence of each step, of the work, the day of the service and how often to record a log.
-_STEPS = {
-    "inspect": mark(
-        "Inspect guide and mount now, and look for work, loads or tunings that the logs lack; then "
-        "record a log."
-    ),
-    "find-cause": mark(
-        "Find out what moved the mode: its sensor, cables, payload or attachments; then record a "
-        "log."
-    ),
-    "check-drift": mark(
-        "Record a log at once: a mode has moved by more than logs scatter. If it stays, look for "
-        "work, payload, sensor or tuning as the cause."
-    ),
-    "check-loss": mark(
-        "Record a log at once: the last one deviates from those before. If the machine was "
-        "repaired in between, enter that in maintenance.csv; if not, {work} is due {by}."
-    ),
-    "log-now": mark(
-        "Record a log now: it is overdue, and the state since the last one is unknown."
-    ),
-    "none": "",
-    "record": mark("Record further logs; the reasons are below."),
-    "service-now": mark(
-        "Do {work} now, before the machine travels on, and record logs for a new baseline."
-    ),
-    "overdue": mark("Do {work} now: its date, {by}, has passed. Record logs for a new baseline."),
-    "confirm": mark(
-        "Record {often}, and order nothing yet: with so few logs the service before {by} rests on "
-        "the prior of the laws."
-    ),
-    "schedule": mark(
-        "No work is needed yet. Plan {work} for {by} at the latest; until then {often}."
-    ),
-    "plan": mark("Order and plan {work} before {by}; until then {often}."),
-    "later": mark("No service is needed within {horizon}; record {often}."),
-}
-
-_LATER_IN_PART = mark(
-    "No service is needed within {horizon} for what the modes show; record {often}."
-)
 
 
 def next_step(step: NextStep) -> str:
@@ -448,18 +377,15 @@ def next_step(step: NextStep) -> str:
     by = "" if step.by is None else day(step.by)
     if step.kind == "check-loss":
         by = tr("now") if step.case[1] == "now" else tr("by {day}", day=by)
-    often, horizon = _often(step.log_every), km(step.horizon)
-    words = _LATER_IN_PART if step.partial and step.kind == "later" else _STEPS[step.kind]
-    return tr(words, work=work, by=by, often=often, horizon=horizon)
-
-
-def _often(days: float) -> str:
-    """Return how often to record a log."""
-    if days < 2:
-        return tr("a log a day")
+    days, horizon = min(step.log_every, 182), km(step.horizon)
+    often = tr("a log every {n} weeks", n=int(days // 7))
     if days < 14:
-        return tr("a log a week") if 7 <= days < 8 else tr("a log every {n} days", n=int(days))
-    return tr("a log every {n} weeks", n=int(min(days, 182) // 7))
+        often = tr("a log every {n} days", n=int(days))
+    if days < 2 or 7 <= days < 8:
+        often = tr("a log a day") if days < 2 else tr("a log a week")
+    in_part = step.partial and step.kind == "later"
+    words = tables.STEPS["later-in-part" if in_part else step.kind]
+    return tr(words, work=work, by=by, often=often, horizon=horizon)
 
 
 # Changes since the last report
@@ -489,7 +415,15 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
         yield tr("Verdict: still {now}, before {probability}.", now=present, probability=earlier)
     yield from _health_changes(before, now)
     if before.life is not None or now.life is not None:
-        yield _life_change(before, now)
+        low, middle, high = (
+            [
+                travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
+                for life in (before.life, now.life)
+            ]
+            for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
+        )
+        spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
+        yield tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
     if before.service.by is not None or now.service.by is not None:
         yield _service_change(before.service.by, now.service.by)
     more, travel = now.n_logs - before.n_logs, now.travel - before.travel
@@ -515,18 +449,6 @@ def _health_changes(before: Summary, now: Summary) -> Iterator[str]:
         own = present.get(name)
         spread = f" (90{GAP}%: {interval(own.low, own.high)})" if own else ""
         yield f"{capitalize(spell(name))}: {' → '.join(medians)}{spread}."
-
-
-def _life_change(before: Summary, now: Summary) -> str:
-    low, middle, high = (
-        [
-            travel_left(life.any.travel[k], life.horizon) if life else tr("not known")
-            for life in (before.life, now.life)
-        ]
-        for k in (0, 3, 6)  # quantiles of 5, 50 and 95 %
-    )
-    spread = f" (90{GAP}%: {ends(low[1], high[1])})" if now.life and low[1] != high[1] else ""
-    return tr("Remaining life, median: {change}.", change=f"{_from_to(*middle)}{spread}")
 
 
 def _service_change(before: date | None, now: date | None) -> str:

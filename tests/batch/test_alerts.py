@@ -392,7 +392,7 @@ def test_a_run_that_ends_while_it_delivers_delivers_again(nights: Nights) -> Non
         pass
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Store, "remove_unsent", lambda *_: (_ for _ in ()).throw(Killed()))
+        patch.setattr(Store, "remove", lambda *_: (_ for _ in ()).throw(Killed()))
         with pytest.raises(Killed):
             nights.run(N_BEFORE + 3)
     nights.run(N_BEFORE + 3)

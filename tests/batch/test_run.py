@@ -35,6 +35,7 @@ from lmshealth.batch import constants, workers
 from lmshealth.batch import ingest as ingesting
 from lmshealth.batch import run as running
 from lmshealth.batch.alerts import Alerts
+from lmshealth.batch.assess import Machine
 from lmshealth.batch.ingest import Settings
 from lmshealth.batch.run import RunResult, report, run
 from lmshealth.batch.store import PackedAssessment, Store, default_url, unpack_or_none
@@ -60,6 +61,7 @@ from lmshealth.report.pages import make_page
 from lmshealth.report.tables import machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
+from lmshealth.tracking.maintenance import NO_MAINTENANCE
 from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
 from studies.harness import servers
@@ -98,7 +100,7 @@ def tables(out: Path) -> dict[str, bytes]:
 def assessments(out: Path) -> list[Assessment]:
     """Fetch what a run kept of its machines."""
     with closing(Store(default_url(out), create=False)) as store:
-        packed = [store.assessment(one.machine, one.key) for one in store.published()]
+        packed = [store.get("assessed", one.key, one.machine) for one in store.published()]
     return [unpack_or_none(content, Assessment) for content in packed if content is not None]
 
 
@@ -1040,15 +1042,16 @@ def test_a_fleet_prior_continues_from_the_draws_by_the_description(
     chains = Mock(side_effect=NotConverged("not here", np.empty(0)))
     monkeypatch.setattr(life_posterior, "sample", chains)
     stored = LifeState(start, 15, "healthy", "", ())
-    job = assessing._UpdateJob("M7-Y", "key", pack(own), pack(stored), 40, prior, ())
-    [made] = assessing._update(job)
+    machine = Machine("M7-Y", (), own.stage, NO_MAINTENANCE, 40, 0)
+    update = machine, "key", prior, ()
+    [made] = assessing._update((update, pack(own), pack(stored)))
     assert isinstance(made, PackedAssessment)
     whole = unpack(made.content, Assessment)
     assert whole.health is not None and set(whole.health.sampler) == {"importance"}
     found = whole.prognosis
     assert apart(found, fresh) < 4 < apart(found, alone)
     assert not chains.called
-    assessing._update(job._replace(life=None))
+    assessing._update((update, pack(own), None))
     assert chains.called
 
 
@@ -1057,9 +1060,8 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     own = make()
     assert own.prognosis is not None
     lives = tuple(EndedLife(0.01, reached=True) for _ in range(9))
-    [made] = assessing._update(
-        assessing._UpdateJob("M7-Y", "key", pack(own), None, 40, None, lives)
-    )
+    machine = Machine("M7-Y", (), own.stage, NO_MAINTENANCE, 40, 0)
+    [made] = assessing._update(((machine, "key", None, lives), pack(own), None))
     assert isinstance(made, PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
     tables = machine_tables(found)
@@ -1068,8 +1070,7 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     assert row["rul_km_calibrated"] == pytest.approx(travel / 1000)
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
     assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
-    job = assessing._UpdateJob("M7-Y", "key", pack(own), None, 40, None, lives[:8])
-    [few] = assessing._update(job)
+    [few] = assessing._update(((machine, "key", None, lives[:8]), pack(own), None))
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None
 

@@ -92,12 +92,15 @@ def url(store_url: str) -> str:
 def put_in(store: Store, key: str, outcome: Outcome) -> None:
     """Keep what became of a log."""
     found = Identified(outcome, "e" * 64, "test-A")
-    store.put_identified({key: pack(found)})
+    store.put("identified", {key: pack(found)})
 
 
 def got_from(store: Store, key: str, log: str) -> Outcome | None:
     """Fetch what became of a log, under its present name."""
-    return next((found.renamed(log).outcome for _, found in store.identified([key])), None)
+    found = (
+        unpack_or_none(content, Identified) for _, content in store.of_keys("identified", [key])
+    )
+    return next((one.renamed(log).outcome for one in found if one is not None), None)
 
 
 @pytest.fixture
@@ -245,7 +248,7 @@ def test_a_frozen_server_is_not_waited_for(
             postgres.signal(signal.SIGCONT)
             os.kill(frozen, signal.SIGCONT)
         assert time.monotonic() - begun < 30
-        assert [key for key, _ in store.identified(["before"])] == ["before"]
+        assert [key for key, _ in store.of_keys("identified", ["before"])] == ["before"]
 
 
 def test_runs_on_a_server_divide_their_work(database: str) -> None:
@@ -280,10 +283,10 @@ def test_a_run_whose_claims_are_lost_goes_on(database: str) -> None:
 def test_digests_come_back_by_key(url: str) -> None:
     """Those that are there, and the last one of a key."""
     with closing(Store(url)) as store:
-        store.put_digests({"k": "0" * 64, "m": "1" * 64})
-        store.put_digests({"k": "2" * 64})
-        assert store.digests(["k", "none"]) == {"k": "2" * 64}
-        store.put_digests({})
+        store.put("hashed", {"k": b"0" * 64, "m": b"1" * 64})
+        store.put("hashed", {"k": b"2" * 64})
+        assert dict(store.of_keys("hashed", ["k", "none"])) == {"k": b"2" * 64}
+        store.put("hashed", {})
 
 
 def _ask(store: Store, statement: str) -> list[tuple[object, ...]]:
@@ -328,7 +331,7 @@ def test_columns_that_a_damaged_file_lacks_are_damage(file_url: str, tmp_path: P
     with closing(sqlite3.connect(path)) as file, file:
         file.execute(f"ALTER TABLE {VALUES} RENAME COLUMN content TO contens")
     with closing(Store(file_url)) as store, pytest.raises(StoreError, match="delete"):
-        store.digests(["k"])
+        dict(store.of_keys("hashed", ["k"]))
     full = sqlite3.OperationalError("database or disk is full")
     full.sqlite_errorname = "SQLITE_FULL"
     store = Store(file_url)
@@ -343,14 +346,15 @@ def fill(store: Store, folder: Path) -> dict[str, Callable[[], bool]]:
     status = make_status(assessment, summarise(assessment, assessment.service()))
     change = Change("A", "alarm", "", "roll", status.recorded_at)
     put_in(store, "k", reading())
-    store.put_digests({"k": "0" * 64})
+    store.put("hashed", {"k": b"0" * 64})
     keep(store, "A", "k1", assessment)
-    store.put_part("A", "p", b"part")
-    store.put_announced([Announced(status, "/logs", (), 1)])
-    store.put_unsent([Unsent(change, "--notify", 1)])
+    store.put("parts", {"p": b"part"}, "A")
+    store.put("announced", {"": pack(Announced(status, "/logs", (), 1))}, status.stage)
+    unsent = Unsent(change, "--notify", 1)
+    store.put("unsent", {unsent.key: pack(unsent)}, "A")
     key = store.put_refused((Refusal("a", "gap", ""),))
     return {
-        "hashed": lambda: bool(store.digests(["k"])),
+        "hashed": lambda: bool(dict(store.of_keys("hashed", ["k"]))),
         "identified": lambda: got_from(store, "k", "a.h5") is not None,
         "assessed": lambda: store.has_assessment("A", "k1"),
         "parts": lambda: store.part("A", "p") is not None,
@@ -411,9 +415,9 @@ def test_a_lost_assessment_is_made_from_nothing(file_url: str, tmp_path: Path) -
     """Its own parts would give it other draws; the next assessment uses them."""
     with closing(Store(file_url)) as store:
         keep(store, "A", "k1", worn(tmp_path))
-        store.put_part("A", "p", b"part")
-        assert store.parts("A", "k2") == {"p": b"part"}
-        assert store.parts("A", "k1") == {}
+        store.put("parts", {"p": b"part"}, "A")
+        assert store.part("A", "p", after="k2") == b"part"
+        assert store.part("A", "p", after="k1") is None
 
 
 def test_one_run_at_a_time_is_alone(url: str) -> None:
@@ -424,20 +428,20 @@ def test_one_run_at_a_time_is_alone(url: str) -> None:
         def wait() -> None:
             with second.alone():
                 order.append("second")
-                assert second.digests(["k", "l"]) == {"k": "1"}
+                assert dict(second.of_keys("hashed", ["k", "l"])) == {"k": b"1"}
 
         with ThreadPoolExecutor(1) as threads:
             with first.alone():
                 waiting = threads.submit(wait)
-                first.put_digests({"k": "1"})
+                first.put("hashed", {"k": b"1"})
                 time.sleep(0.3)
                 order.append("first")
             waiting.result()
         assert order == ["first", "second"]
         with pytest.raises(KeyboardInterrupt), first.alone():
-            first.put_digests({"l": "2"})
+            first.put("hashed", {"l": b"2"})
             raise KeyboardInterrupt
-        assert second.digests(["k", "l"]) == {"k": "1"}
+        assert dict(second.of_keys("hashed", ["k", "l"])) == {"k": b"1"}
 
 
 def test_a_store_in_a_read_only_folder_is_read(
@@ -445,15 +449,15 @@ def test_a_store_in_a_read_only_folder_is_read(
 ) -> None:
     """Without files beside it; where a run has left results there, the message names them."""
     with closing(Store(file_url)) as store:
-        store.put_digests({"k": "1"})
+        store.put("hashed", {"k": b"1"})
     path = tmp_path / "store.sqlite"
     path.chmod(0o444)
     monkeypatch.setattr(os, "access", lambda *_: False)
     with closing(Store(file_url, create=False)) as store:
-        assert store.digests(["k"]) == {"k": "1"}
+        assert dict(store.of_keys("hashed", ["k"])) == {"k": b"1"}
         assert [one.name for one in tmp_path.iterdir()] == ["store.sqlite"]
     with closing(Store(file_url, create=False)) as store, pytest.raises(StoreError) as refusal:
-        store.put_digests({"l": "2"})
+        store.put("hashed", {"l": b"2"})
     assert f"copy {path} and {path}-wal" in str(refusal.value)
 
 
@@ -463,12 +467,13 @@ def test_a_store_in_a_read_only_folder_is_read(
 def keep(store: Store, machine: str, key: str, assessment: Assessment) -> None:
     """Store an assessment as a run does, and publish it."""
     store.put_assessment(machine, key, pack_assessment(assessment))
-    store.publish(machine, [key], store.put_refused(()))
+    summary = summarise(assessment, assessment.service())
+    store.publish(machine, [key], summary, store.put_refused(()))
 
 
 def recall(store: Store, machine: str, key: str) -> Assessment | None:
     """Fetch an assessment, as far as it can be read."""
-    content = store.assessment(machine, key)
+    content = store.get("assessed", key, machine)
     found: Assessment | None = None if content is None else unpack_or_none(content, Assessment)
     return found
 
@@ -500,14 +505,15 @@ def test_what_an_assessment_lacks_it_lacks_again(url: str, tmp_path: Path) -> No
 
 def test_only_the_published_assessment_and_its_source_are_kept(url: str, tmp_path: Path) -> None:
     """Publishing deletes the other assessments of the same machine, not of others."""
-    one = pack_assessment(worn(tmp_path))
+    made = worn(tmp_path)
+    one, summary = pack_assessment(made), summarise(made, made.service())
     with closing(Store(url)) as store:
         for machine, key in (("A", "k1"), ("B", "k1"), ("A", "k2"), ("A", "k3")):
             store.put_assessment(machine, key, one)
         assert store.has_assessment("A", "k1")
-        store.publish("A", ["k3", "k2"], "")
+        store.publish("A", ["k3", "k2"], summary, "")
         assert [store.has_assessment("A", key) for key in ("k1", "k2", "k3")] == [False, True, True]
-        assert store.assessment("A", "k1") is None
+        assert store.get("assessed", "k1", "A") is None
         assert store.has_assessment("B", "k1")
         assert not store.has_assessment("C", "k1")
         assert [(one.machine, one.key) for one in store.published()] == [("A", "k3")]
@@ -534,11 +540,12 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
 def test_refused_logs_are_those_of_the_last_run_of_each_machine(url: str, tmp_path: Path) -> None:
     """A later run replaces what an earlier one refused, where it published the same machines."""
     one, two, three = ((Refusal(log, "gap", ""),) for log in ("one", "two", "three"))
+    summary = summarise(worn(tmp_path), worn(tmp_path).service())
     with closing(Store(url)) as store:
 
         def publish(machines: str, refused: tuple[Refusal, ...]) -> tuple[Refusal, ...]:
             for machine in machines:
-                store.publish(machine, ["k1"], store.put_refused(refused))
+                store.publish(machine, ["k1"], summary, store.put_refused(refused))
             return store.refused(one.refused for one in store.published())
 
         assert publish("ABC", ()) == ()
@@ -593,7 +600,7 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
         put_in(store, "l", reading())
         for machine in ("A", "B"):
             keep(store, machine, "k1", worn(tmp_path, machine))
-            store.put_part(machine, "p", pack(machine))
+            store.put("parts", {"p": pack(machine)}, machine)
         with closing(sqlite3.connect(tmp_path / "store.sqlite")) as file, file:
             for kind in ("identified", "assessed", "parts", "reports"):
                 other = f"SELECT content FROM {VALUES} WHERE kind = ? ORDER BY rowid"
@@ -605,7 +612,6 @@ def test_an_intact_record_of_another_key_counts_as_absent(file_url: str, tmp_pat
         assert recall(store, "B", "k1") is None
         assert store.part("A", "p") is not None
         assert store.part("B", "p") is None
-        assert store.parts("B") == {}
         assert store.previous_summary("A", "k2") is not None
         assert store.previous_summary("B", "k2") is None
 
@@ -632,21 +638,22 @@ def test_a_store_that_another_run_makes_at_the_same_moment_is_opened(tmp_path: P
 @pytest.mark.slow
 def test_two_that_write_the_same_at_once_leave_one_row(url: str, tmp_path: Path) -> None:
     """Of many threads that write and publish the same, none fails and nothing is doubled."""
-    made = pack_assessment(worn(tmp_path))
+    one = worn(tmp_path)
+    made, summary = pack_assessment(one), summarise(one, one.service())
 
     def write(_: int) -> None:
         with closing(Store(url)) as store:
             for number in range(5):
                 put_in(store, f"k{number}", reading())
             store.put_assessment("A", "k1", made)
-            store.publish("A", ["k1"], store.put_refused(()))
+            store.publish("A", ["k1"], summary, store.put_refused(()))
 
     with ThreadPoolExecutor(6) as threads:
         list(threads.map(write, range(12)))
     with closing(Store(url)) as store:
         assert len(store.published()) == 1
         assert recall(store, "A", "k1") is not None
-        assert len(dict(store.identified(f"k{number}" for number in range(9)))) == 5
+        assert len(dict(store.of_keys("identified", (f"k{number}" for number in range(9))))) == 5
         assert store.previous_summary("A", "k1") is None
 
 

@@ -27,6 +27,7 @@ from lmshealth.batch.assess import pack_assessment
 from lmshealth.batch.store import Store, default_url
 from lmshealth.cli.main import main
 from lmshealth.io.reading import read_log
+from lmshealth.machine.summary import summarise
 from lmshealth.stage.description import load_stage
 from models.dynamics.stages import STAGES
 from models.recordings.velocities import Experiment, drive_velocities
@@ -967,8 +968,9 @@ def test_an_unreadable_machine_is_reported_and_the_others_are_written(tmp_path: 
     """One line counts what is damaged, one names the machine, with status 3."""
     store = Store(default_url(tmp_path))
     for name in ("M7-Y", "M8-Y"):
-        store.put_assessment(name, "k1", pack_assessment(nothing(worn(tmp_path, name))))
-        store.publish(name, ["k1"], "")
+        made = nothing(worn(tmp_path, name))
+        store.put_assessment(name, "k1", pack_assessment(made))
+        store.publish(name, ["k1"], summarise(made, made.service()), "")
     store.close()
     with closing(sqlite3.connect(tmp_path / "lmshealth.sqlite")) as file, file:
         file.execute(

@@ -64,7 +64,6 @@ def test_the_step_follows_from_verdict_service_and_age(
 ) -> None:
     """The first case that applies decides: alarms before services, young machines before plans."""
     assert step_of(verdict, service, age, day) == expected
-    assert NextStep("none", case=(verdict, service, age)).on(day).kind == expected
 
 
 def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:

@@ -102,8 +102,8 @@ def test_a_draw_past_the_horizon_may_fail_there(rng: np.random.Generator) -> Non
         day = decide(prognosis, Decision(max_risk=risk)).by
         assert day is not None
         reached = probability_before(prognosis, day)
-        assert reached.at_least[-1] <= reached.at_most[-1] <= risk
-        assert probability_before(prognosis, day + timedelta(days=30)).at_most[-1] > risk
+        assert reached[0, -1] <= reached[1, -1] <= risk
+        assert probability_before(prognosis, day + timedelta(days=30))[1, -1] > risk
 
 
 # a ratio of costs
@@ -219,7 +219,7 @@ def test_costs_choose_a_day_at_the_median_usage() -> None:
     assert service.risk == pytest.approx(expected, abs=2e-4)
     assert (service.max_risk, service.cost_ratio, service.kept_risk) == (None, 10.0, service.risk)
     low, high = service.planned_risk
-    assert low == high == probability_before(prognosis, date(2026, 3, 21)).at_most[-1]
+    assert low == high == probability_before(prognosis, date(2026, 3, 21))[1, -1]
 
 
 # a given day
@@ -238,8 +238,8 @@ def test_the_probability_before_a_day_is_the_share_of_draws() -> None:
         curve_quantiles=np.ones((5, 3, 2)),
     )
     reached = probability_before(both, (START + timedelta(days=5)).date())  # 4.75 days
-    np.testing.assert_allclose(reached.at_least, [0.4, 0.2, 0.6])
-    np.testing.assert_array_equal(reached.at_least, reached.at_most)
+    np.testing.assert_allclose(reached[0], [0.4, 0.2, 0.6])
+    np.testing.assert_array_equal(*reached)
 
 
 def test_a_day_behind_the_horizon_has_bounds() -> None:
@@ -248,7 +248,7 @@ def test_a_day_behind_the_horizon_has_bounds() -> None:
     prognosis = make_prognosis(remaining, np.full(100, 1e4), horizon=1e7)
     for days, low, high in ((400, 0.0, 0.0), (900, 0.3, 0.3), (1200, 0.3, 1.0)):
         reached = probability_before(prognosis, (START + timedelta(days=days)).date())
-        assert (reached.at_least[-1], reached.at_most[-1]) == (low, high)
+        assert (*reached[:, -1],) == (low, high)
     assert np.isinf(remaining_days(prognosis)[30:]).all()
 
 
@@ -256,9 +256,7 @@ def test_a_day_that_is_past_has_what_is_reached_already() -> None:
     """The probability before the last log is that of having passed the limit."""
     prognosis = make_prognosis(np.r_[-1e5, -1.0, 1e6, 2e6], np.full(4, 1e4))
     for day in (START.date(), date(2020, 1, 1)):
-        assert (
-            probability_before(prognosis, day).at_least[-1] == prognosis.already_past()[-1] == 0.5
-        )
+        assert probability_before(prognosis, day)[0, -1] == prognosis.already_past()[-1] == 0.5
 
 
 def test_without_a_prognosis_the_service_is_unknown() -> None:

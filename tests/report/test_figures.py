@@ -161,12 +161,6 @@ def test_posterior_of_one_parameter_is_a_density(ax: Axes, health: Health) -> No
     assert np.trapezoid(y, x) == pytest.approx(1, abs=0.01)
 
 
-def test_posterior_of_three_parameters_is_refused(ax: Axes, health: Health) -> None:
-    """Three parameters cannot be drawn in one picture."""
-    with pytest.raises(ValueError, match="3 parameters"):
-        plots.plot_posterior(ax, health, ("a", "b", "c"))
-
-
 def test_health_marks_limit_and_baseline(ax: Axes, health: Health) -> None:
     """Limit and baseline are marked."""
     plots.plot_health(ax, health, "guide_preload", 0.6)

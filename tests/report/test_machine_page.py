@@ -89,7 +89,7 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
     for weeks, risk in zip(("1 week", "8 weeks"), late, strict=True):
         day = (by + timedelta(7 * int(weeks[0]))).isoformat()
         shown = float(re.search(rf"{day} {weeks} (\d+) %", plain(first))[1])  # type: ignore[index]
-        assert shown == pytest.approx(100 * float(risk.at_most[-1]), abs=1.5)
+        assert shown == pytest.approx(100 * float(risk[1, -1]), abs=1.5)
     assert (
         first.index("Loss of")
         < first.index("Health at the last log")

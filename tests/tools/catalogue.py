@@ -19,7 +19,7 @@ from babel.messages.mofile import write_mo
 from babel.messages.pofile import read_po, write_po
 from jinja2.ext import babel_extract
 
-from lmshealth._private.tables import FLAGS, REFUSALS, TABLES
+from lmshealth._private.tables import FLAGS, NOTICES, REFUSALS, STEPS, TABLES
 from lmshealth.report.language import DOMAIN, FACT, LANGUAGES
 from lmshealth.report.text import view_columns
 
@@ -102,7 +102,9 @@ def messages() -> Iterator[tuple[Any, str, str | None]]:
     for table in TABLES.values():
         if "page" in table.shown:
             yield from ((head, place, None) for head in view_columns(table.shown["page"]))
-    yield from ((meaning, place, FACT) for meaning in FLAGS.values())
+    notices = (sentence for _, *own in NOTICES.values() for sentence in own if sentence)
+    yield from ((sentence, place, FACT) for sentence in (*FLAGS.values(), *notices))
+    yield from ((sentence, place, None) for sentence in STEPS.values() if sentence)
     for code, refusal in REFUSALS.items():
         yield code, place, None
         yield from ((template, place, FACT) for template in refusal.details)

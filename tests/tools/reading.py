@@ -58,7 +58,7 @@ def assessment_in(result: Path) -> Assessment:
     """Return the assessment of the only machine in a folder of results."""
     with closing(Store(default_url(result), create=False)) as store:
         (machine,) = store.published()
-        content = store.assessment(machine.machine, machine.key)
+        content = store.get("assessed", machine.key, machine.machine)
         assert content is not None
         found: Assessment = unpack(content, Assessment)
     return found

@@ -78,11 +78,11 @@ class Nights:
         """Compare some lives by the prior of the fleet with those fitted from nothing under it."""
         rows: list[Row] = []
         for one in self.store.published():
-            own = unpack_or_none(self.store.assessment(one.machine, one.key), Assessment)
+            own = unpack_or_none(self.store.get("assessed", one.key, one.machine), Assessment)
             if own.fleet is None or len(rows) == n:
                 continue
             key = self.machine(one.machine, counts[one.machine]).key
-            alone = unpack_or_none(self.store.assessment(one.machine, key), Assessment)
+            alone = unpack_or_none(self.store.get("assessed", key, one.machine), Assessment)
             history = accepted_estimates(own.history, own.track)
             stage = own.fleet.apply_to(own.stage)
             fresh = prognose(history, stage, seed_of(own.seed + 1, history.stage, stage.digest))

@@ -44,7 +44,8 @@ def machine_of(
     """Return a machine with these logs, of which so many are in the store already; add the rest."""
     keys = [(log.log, fingerprint("key", log.digest)) for log in logs]
     new = zip(keys[stored:], logs[stored:], strict=True)
-    store.put_identified({key: pack(Identified(log, stage.digest, name)) for (_, key), log in new})
+    packed = {key: pack(Identified(log, stage.digest, name)) for (_, key), log in new}
+    store.put("identified", packed)
     return Machine(name, tuple(keys), stage, NO_MAINTENANCE, epochs, SEED)
 
 
@@ -59,8 +60,8 @@ def assess_and_report(
     with processes(workers) as pool:
         resources = Resources(store, pool, progress)
         assert not assess_all(machines, resources)
-        result, *_ = running._report(machines, (), resources, out, running._judging(store))
-    assert not result.failed
+        _, failed, _ = running._report(machines, (), resources, out, running._judging(store))
+    assert not failed
 
 
 def run_with(
@@ -69,7 +70,7 @@ def run_with(
     """Assess the machine with some of its logs, and write its page."""
     machine = machine_of(NAME, logs, stored, stage, store)
     assess_and_report([machine], store, out)
-    found = unpack_or_none(store.assessment(NAME, machine.key), Assessment)
+    found = unpack_or_none(store.get("assessed", machine.key, NAME), Assessment)
     assert found is not None and found.prognosis is not None
     return found
 
