@@ -94,8 +94,8 @@ def covariate_notices(covariates: Mapping[str, FloatArray], stage: Stage) -> lis
             continue
         if (values := covariates.get(covariate.name)) is None:
             what = fact(
-                "No log states {name}, which may move the modes by {effect:.2g} % per unit: what it "
-                "does over the months is taken for a change of the machine.",
+                "No log states {name}, which may move the modes by {effect:.2g} % per unit: what "
+                "it does over the months is taken for a change of the machine.",
                 name=covariate.name,
                 effect=100 * covariate.prior_std,
             )
