@@ -83,17 +83,29 @@ def _daily(covariate: Covariate, recorded_at: Sequence[datetime]) -> list[Regres
 
 
 def covariate_notices(covariates: Mapping[str, FloatArray], stage: Stage) -> list[Notice]:
-    """Return notices about covariates whose last values are far from those of all logs before.
+    """Return notices about measured covariates that no log states, or whose last value is far off.
 
-    Their effect on ln f is extrapolated, and may exceed `constants.EXTRAPOLATED`: a stuck sensor.
+    The effect on ln f of a value far from all before is extrapolated, and may exceed
+    `constants.EXTRAPOLATED`: a stuck sensor.
     """
     notices = []
     for covariate in stage.description.covariate:
-        values = covariates.get(covariate.name, np.full(1, np.nan))
+        if covariate.name in _SET:
+            continue
+        if (values := covariates.get(covariate.name)) is None:
+            what = fact(
+                "No log states {name}, which may move the modes by {effect:.2g} % per unit: what "
+                "it does over the months is taken for a change of the machine.",
+                name=covariate.name,
+                effect=100 * covariate.prior_std,
+            )
+            to_do = fact("Enter it in manifest.csv, one value in all rows where it is controlled.")
+            notices.append(Notice("covariate-missing", "caution", covariate.name, what, to_do))
+            continue
         known = values[np.isfinite(values)]
         # Of the logs before; the middle of the first ones, as one of these may be wrong.
         first = stage.description.baseline.logs
-        if not np.isfinite(values[-1]) or known.size <= first or covariate.name in _SET:
+        if not np.isfinite(values[-1]) or known.size <= first:
             continue
         low, high = np.quantile(known[:first], (0.25, 0.75)).tolist()
         for value in known[first:].tolist():

@@ -185,6 +185,22 @@ def test_a_covariate_far_from_all_before_is_noticed(
     assert not noticed or f"{value:g} in the last log, far outside of" in found[0].what
 
 
+@pytest.mark.parametrize("stated", [True, False])
+def test_a_temperature_that_no_log_states_is_noticed(stated: bool) -> None:
+    """Its seasons would read as wear; one constant value states that it is controlled."""
+    covariates = {"temperature_c": 21.0} if stated else {}
+    logs = [
+        replace(log, metadata=replace(log.metadata, covariates=covariates))
+        for log in few_logs(3, 0.0, 1)
+    ]
+    found = notices(assess(logs, load_stage("lms-y")))
+    missing = [one for one in found if one.code == "covariate-missing"]
+    assert [(one.where, one.severity) for one in missing] == (not stated) * [
+        ("temperature_c", "caution")
+    ]
+    assert stated or "by 0.1 % per unit" in missing[0].what
+
+
 def test_scatter_is_no_large_drift(tmp_path: Path) -> None:
     """Errors twice as large as reported give none in 60 machines of two to four logs."""
     stage = make_stage(tmp_path, parameters=(), tail="")
