@@ -357,6 +357,7 @@ def unwrapped(values: Samples, missing: IntArray, rough: Roughness) -> tuple[Sam
     bits = 0 if step is None else int(np.ceil(np.log2(span / step)))
     whole = 0.0 if step is None or bits not in constants.WRAP_BITS else step * 2.0**bits
     if model is None or 0 < whole < 2 * constants.WRAP_SIGMAS * model.variance**0.5:
+        _refuse_full(values, rough, whole - span, bits)
         return values, ""
     if whole > span:
         undone, n = _without_turns(values, model, whole)
@@ -427,6 +428,19 @@ def _without_turns(values: Samples, model: Prediction, whole: float) -> tuple[Sa
     if n and squares < constants.WRAPS_SPREAD**2 * n * model.variance:
         return spool.samples(), n
     return values, 0
+
+
+def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> None:
+    """Refuse (``wrapped``) a channel that holds all levels of a counter but for a few."""
+    # Unlike vibration it has as many samples at both ends of its range as elsewhere.
+    near = (rough.high - rough.low) / 100
+    x = _sample(values, constants.SHAPE_SAMPLES)
+    if x.size < constants.FEWEST_FOR_SHAPE or not 0 < left < near:
+        return
+    if min(np.mean(x < rough.low + near), np.mean(x > rough.high - near)) > constants.WRAP_ENDS:
+        found = f"its levels are all of {bits} bits, and as frequent at both ends as inside"
+        needed = "the counter overflows; record it with more bits, or faster"
+        raise Unusable("wrapped", f"{found}: {needed}")
 
 
 def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:

@@ -47,6 +47,9 @@ WRAP_SIGMAS, WRAPS_SPREAD = 5.0, 4.0
 WRAP_BEND = 0.3
 # Fewest jumps that refuse a channel as a counter of unknown step, and share of one size.
 FEWEST_WRAPS, WRAPS_UNDONE = 2, 0.95
+# Least share of the samples in each outermost hundredth of the range of a counter that overflows
+# all the time: of normal noise there are 10⁻⁵.
+WRAP_ENDS = 1e-3
 # Turns of a counter between two samples that are undone; more are those of a prediction that
 # follows its own corrections.
 MOST_TURNS = 16

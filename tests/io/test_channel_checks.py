@@ -2,9 +2,17 @@
 
 import numpy as np
 import pytest
+from scipy.signal import lfilter
 
 from lmshealth.io.buffers import BLOCK
-from lmshealth.io.channel_checks import check_signal, independent, missing_ranges
+from lmshealth.io.channel_checks import (
+    NO_RANGES,
+    check_signal,
+    independent,
+    missing_ranges,
+    roughness,
+    unwrapped,
+)
 from lmshealth.io.refusal import Unusable
 
 N = 40_000
@@ -104,3 +112,15 @@ def test_long_signals_are_judged_as_a_whole():
     check_signal(cut)
     with pytest.raises(Unusable, match="maximum"):
         check_signal(np.minimum(values, 1.0))
+
+
+@pytest.mark.parametrize("bits", [8, 12, 16])
+def test_a_counter_that_overflows_most_of_the_time_is_refused(bits):
+    """Vibration larger than its range fills all levels alike; a smaller one does not."""
+    motion = lfilter([1.0], [1.0, -0.9], np.random.default_rng(1).standard_normal(100_000))
+    counts = np.round(0.3 * 2**bits / motion.std() * motion)
+    wrapped = (counts + 2 ** (bits - 1)) % 2**bits - 2 ** (bits - 1)
+    with pytest.raises(Unusable, match="overflows"):
+        unwrapped(wrapped, NO_RANGES, roughness(wrapped))
+    small = np.round(counts / 4)
+    assert unwrapped(small, NO_RANGES, roughness(small))[1] == ""
