@@ -443,15 +443,22 @@ def _refuse_full(values: Samples, rough: Roughness, left: float, bits: int) -> N
         raise Unusable("wrapped", f"{found}: {needed}")
 
 
-def spikes(values: Samples, missing: IntArray, rough: Roughness) -> IntArray:
+def spikes(
+    values: Samples, missing: IntArray, rough: Roughness, breaks: IntArray = NO_RANGES[:, 0]
+) -> IntArray:
     """Find single samples, or two in a row, that are no part of the signal.
 
     The signal itself is as its linear prediction expects it after and before them; a blow instead
     goes on in it. ``missing`` are ascending half-open ranges, and so is the result, ``(n, 2)``.
+    Near samples before which time is interrupted, ascending ``breaks``, there is nothing to expect.
     """
     if rough.bend <= constants.SUSPECT * rough.usual:
         return NO_RANGES
     suspects = _beyond(values, 2, constants.SUSPECT * rough.usual)
+    reach = 2 * _ORDER
+    suspects = suspects[
+        np.searchsorted(breaks, suspects - reach) == np.searchsorted(breaks, suspects + reach + 1)
+    ]
     if not suspects.size or suspects.size > 3 * constants.MOST_SPIKES * values.size:
         return NO_RANGES
     bad = np.concatenate([missing, np.stack([suspects - 1, suspects + 2], axis=1)])

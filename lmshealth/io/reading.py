@@ -281,7 +281,7 @@ def _measured(
             rough = checks.roughness(values) if notes["unwrapped"] else rough
             checks.check_sign(values, rough)
             notes["levels"] = checks.coarse_levels(values)
-            if (bad := checks.spikes(values, gone, rough)).size:
+            if (bad := checks.spikes(values, gone, rough, axis.breaks)).size:
                 found = f"{count(bad)} samples are no part of the signal"
                 notes["spikes"] = f"{found}, and count as missing"
             gone = np.concatenate([gone, bad])

@@ -91,6 +91,15 @@ def test_a_bad_sample_near_a_missing_one_is_found():
     assert found.tolist() == [[500, 501]]
 
 
+def test_a_jump_where_time_is_interrupted_is_no_bad_sample():
+    """Samples after a gap of the clock go on from others; one further away is found."""
+    x = np.concatenate([vibration()[:5000], -vibration(1)[5000:]])
+    x[4997:5003] = [0.0, 0.0, 8.0, -8.0, 0.0, 0.0]
+    x[7000] += 12.0
+    found = spikes(x, NONE, roughness(x), np.array([5000]))
+    assert found.tolist() == [[7000, 7001]]
+
+
 @pytest.mark.parametrize("name", ["normal", "tails", "blows", "shocks", "encoder", "steps"])
 @pytest.mark.parametrize("seed", range(3))
 def test_signals_have_no_bad_samples(name, seed):

@@ -58,6 +58,8 @@ _TRAILER = 1 << 12
 # Between the parts of a number, of which the last is its decimals or its exponent.
 _PARTS = re.compile(r"[.,:eE]")
 _WORD = re.compile(r"[^\W\d_]{3}")
+# Control characters that no text has, in its first lines; all of a file is searched for the first.
+_CONTROL = re.compile(rb"[\x00-\x08\x0e-\x19]")
 
 
 def encoding_of(head: bytes) -> str:
@@ -91,13 +93,16 @@ class Text:
     def read(self, size: int = 0) -> bytes:
         """Read so many bytes, and on to the end of a line; empty at the end of the file.
 
-        `Unusable` (``corrupt``) for a NUL byte and for a line without end.
+        `Unusable` (``corrupt``) for a NUL byte, other control characters in single lines, and a
+        line without end.
         """
         block: bytes = self._stream.read(size) if size else b""
         block += self._stream.readline(constants.LONGEST_LINE + 1)
-        if b"\0" in block:
-            at = self.position + block.index(0)
-            raise Unusable("corrupt", f"NUL byte at offset {at}; needed text")
+        odd = None if size and b"\0" not in block else _CONTROL.search(block)
+        if odd:
+            what = "NUL byte" if odd[0] == b"\0" else f"control character 0x{odd[0].hex()}"
+            at = self.position + odd.start()
+            raise Unusable("corrupt", f"{what} at offset {at}; needed text")
         last = block.rfind(b"\n", 0, -1) + 1
         if len(block) - last > constants.LONGEST_LINE:
             found = f"the line at offset {self.position + last} is longer than"

@@ -160,6 +160,13 @@ def test_late_damage(monkeypatch, rows, word):
     assert caught.value.reason == "corrupt" and word in caught.value.detail
 
 
+def test_control_characters_before_the_rows():
+    """What was overwritten at its beginning is no table without names."""
+    with pytest.raises(Unusable, match="control character 0x13 at offset 4; needed text") as caught:
+        parse("M\u00fcl\x13,b\n" + "1,2\n" * 30)
+    assert caught.value.reason == "corrupt"
+
+
 def test_header_without_end():
     """A file that is one long line is not held whole to name its columns."""
     with pytest.raises(Unusable, match="longer than 1048576 bytes"):
