@@ -601,7 +601,9 @@ def _fit_group(
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     noise = found.noise((near[0].frequency * near[-1].frequency) ** 0.5)
     around = found.around(near, low, high)
-    fit = fit_modes(around, near, (low, high), noise, found.model.static, turned=found.model.turned)
+    fit = fit_modes(
+        around, near, (low, high), noise, found.model.static, out_of_phase=found.model.out_of_phase
+    )
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

@@ -559,10 +559,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         noise: np.ndarray,
         static: float,
         *,
-        turned: bool,
+        out_of_phase: bool,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, targets, band, noise, static, turned=turned)
+        return fit_modes(view, targets, band, noise, static, out_of_phase=out_of_phase)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen

@@ -134,7 +134,7 @@ def search(
         first = _informative(spectra, low, high)
     if model.quadrature_sigmas() > constants.QUADRATURE_SIGMAS[0]:
         # More modes are no explanation of those that move out of phase.
-        again = _explain(searched, low, high, suspected, hints, turned=True)
+        again = _explain(searched, low, high, suspected, hints, out_of_phase=True)
         if again[0].f.size <= model.f.size and again[0].misfit < model.misfit:
             model, harmonics, after, poles = again
     if len(first) < len(spectra.channels):
@@ -238,7 +238,7 @@ def _explain(
     suspected: Sequence[float],
     hints: tuple[Target, ...],
     *,
-    turned: bool = False,
+    out_of_phase: bool = False,
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -249,7 +249,7 @@ def _explain(
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
-        start = _start(_bin(spectra, candidates, low, high), candidates, turned)
+        start = _start(_bin(spectra, candidates, low, high), candidates, out_of_phase)
         # Floors and strengths of a start are those of c = 0: refined models are compared.
         refined = [replace(start, static=c).refined(6) for c in _STATICS]
         best = min(refined, key=lambda one: one.misfit)
@@ -363,7 +363,9 @@ def _grow(
     for gain, f, zeta, phi in _excesses(model)[:2]:
         if gain < (constants.LEAST_HINTED if any(is_near(hint, f) for hint in hints) else least):
             break
-        more = model.with_mode(f, zeta, phi if model.turned else phi.real.astype(np.complex128))
+        more = model.with_mode(
+            f, zeta, phi if model.out_of_phase else phi.real.astype(np.complex128)
+        )
         more = more.refined(3, more.nearest(f))
         enough = _evidence(more, model) >= constants.EVIDENCE_MARGIN
         if enough and more.zeta[-1] < constants.MOST_DAMPING:
@@ -465,11 +467,11 @@ def neighbourhood(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tup
     return targets[first:last]
 
 
-def _start(data: BandData, candidates: list[Candidate], turned: bool) -> JointModel:
+def _start(data: BandData, candidates: list[Candidate], out_of_phase: bool) -> JointModel:
     """Add candidates one by one, by their gain with all else fixed.
 
     Poles and shapes stay fixed, the covariance S of the forces and the floors are updated. A model
-    that is ``turned`` has parts in quadrature.
+    that is ``out_of_phase`` has parts in quadrature.
     """
     f = np.array([c.frequency for c in candidates])
     zeta = np.array([c.damping_ratio for c in candidates])
@@ -498,8 +500,8 @@ def _start(data: BandData, candidates: list[Candidate], turned: bool) -> JointMo
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
     shapes = (phi[chosen] * turn[:, None]).T * (root / peak[chosen])
     poles = f[chosen], zeta[chosen]
-    model = JointModel(data, floor, *poles, shapes, np.zeros_like(shapes), r, turned)
-    return model if turned else model.in_phase()
+    model = JointModel(data, floor, *poles, shapes, np.zeros_like(shapes), r, out_of_phase)
+    return model if out_of_phase else model.in_phase()
 
 
 def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:
