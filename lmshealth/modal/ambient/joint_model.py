@@ -72,9 +72,9 @@ class JointModel:
     E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Shapes φ and correlations R are real
     unless the model is ``out_of_phase``: channels that do not move in phase make φ complex, a force
     that reaches modes with a delay R. Parts in quadrature have priors, and count as no unknowns.
-    Modes are refined one after the other by Fisher's scoring with the others fixed, so that the cost of a
-    sweep is linear in their number. It selects modes; published estimates come from the likelihood
-    of `whittle`.
+    Modes are refined one after the other by Fisher's scoring with the others fixed, so that the
+    cost of a sweep is linear in their number. It selects modes; published estimates come from the
+    likelihood of `whittle`.
     """
 
     data: BandData
