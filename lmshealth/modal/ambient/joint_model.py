@@ -23,6 +23,8 @@ _LEAST_GAIN, _HALVINGS = 0.3, 5
 _MEDIAN_SQUARE = 0.455
 # Mean of the residual over the floor below which a channel has less noise than any floor.
 _LITTLE = 0.5
+# Ordinates of a mean that count in its scatter, at most.
+_MOST_COUNTED = 200.0
 # In units of the median density of a channel. Channels of hardly any noise would else be judged by
 # the errors of the model, and the selection of modes by the rounding of the processor.
 LEAST_FLOOR = 1e-4
@@ -226,7 +228,8 @@ class JointModel:
         g = self._inverse
         precision = np.einsum("kaa->ka", g).real
         ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / precision
-        squares = self.data.count[:, None] * (ratio - 1) ** 2
+        # Of more ordinates the errors of the bins, of 1 %, would count.
+        squares = np.minimum(self.data.count, _MOST_COUNTED)[:, None] * (ratio - 1) ** 2
         scatter = np.median(squares, axis=0) / _MEDIAN_SQUARE
         level = self.data.count @ ratio / self.data.count.sum()
         return np.asarray(np.where(level < _LITTLE, np.minimum(scatter, 1.0), scatter))

@@ -45,8 +45,6 @@ _MOST_HARMONICS = 10
 _FIRST, _MORE = 8, 8
 # Of these, whose modes are not all refined, a residual shows a further mode from a larger gain on.
 _CLEARLY = 3.0
-# A pole at a line that is narrower than so many of its widths is what masking left of it.
-_FOOT = 5.0
 # A mode is tried without if its loss, the others fixed, is below the first, or another one is
 # within so many half-power bandwidths.
 _DOUBTFUL, _NEAR, _MOST_TRIED = 150.0, 3.0, 6
@@ -143,10 +141,10 @@ def search(
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
-    light = [hint for hint in hints if 2 * hint.damping_ratio < _FOOT * LINE_WIDTH]
+    light = [hint for hint in hints if hint.is_light]
     narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
     wide = (width > LINE_WIDTH) & ~(
-        near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH)
+        near_lines(model.f, model.zeta, lines) & (width < constants.LIGHT * LINE_WIDTH)
     )
     wide = (wide | narrow) & (width * model.f * spectra.duration > 1)
     wide &= model.zeta < constants.MOST_DAMPING
@@ -278,14 +276,14 @@ def _with_likelier_static(model: JointModel) -> JointModel:
 def _without_splits(model: JointModel, most: int) -> JointModel:
     """Drop the weaker pole of pairs that no fit separates, while there are more than ``most``.
 
-    One described mode whose channels move out of phase is explained better by several poles of real
-    shapes, of which none is the mode.
+    One mode that is not as the model is explained better by several poles, of which none is the
+    mode. Pairs of unlike shapes that a fit may separate are left to it.
     """
     while model.f.size > most:
         width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
         alike = np.abs(model.phi.conj().T @ model.phi) ** 2
         alike = alike > constants.ALIKE_MAC * np.outer(power, power)
-        limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
+        limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION / 2)
         apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
         np.fill_diagonal(apart, np.inf)
         i, j = np.unravel_index(int(apart.argmin()), apart.shape)
