@@ -187,7 +187,7 @@ def test_a_decay_beside_a_drift_is_found() -> None:
     log = log_of(3, [Ring(85.0, 0.01)], n_stops=4)
     (channel,) = log.channels
     drift = 200 * np.tile(np.arange(round(RATE)) / RATE, 4)
-    modes = of_pieces(make_log({"acc_0": channel.values + drift}, RATE, pieces=log.pieces))
+    modes = of_pieces(make_log({"acc_0": channel.values[:] + drift}, RATE, pieces=log.pieces))
     assert modes.names == ("mode_1",)
     assert np.abs(deviations(modes, "mode_1", 85.0, 0.01)).max() < 4
 
