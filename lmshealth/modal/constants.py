@@ -87,6 +87,12 @@ MOST_DAMPING = 0.1
 # assurance criterion above the third) and otherwise: strength and damping of closer modes cannot be
 # estimated separately, and their likelihood is not normal.
 SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
+# Standard deviations within which modes that different channels show are one, and the ratio of
+# dampings up to which those of different clusters are.
+SAME_SIGMAS, DUPLICATE_DAMPING = 3.0, 4.0
+# A mode that is narrower than so many widths of a line may look like one, or be what is left beside
+# a masked one: where it is described, the fit decides.
+LIGHT = 5.0
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors;
 # the level of few of many directions is known from the others: 0.03 would be too sure.

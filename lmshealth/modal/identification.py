@@ -41,7 +41,7 @@ from lmshealth.modal.ambient.wandering import near_lines
 from lmshealth.modal.deterministic.free_decays import identify_decays
 from lmshealth.modal.deterministic.frequency_response import read_frf
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
-from lmshealth.modal.naming import name_resonances
+from lmshealth.modal.naming import is_near, name_resonances
 from lmshealth.modal.targets import (
     Target,
     check_band,
@@ -86,8 +86,6 @@ _TOP = 0.49
 # Channels of a current whose names begin so hold an excitation: any other is that of the servo,
 # which responds to the modes itself.
 _EXCITATIONS = ("current_force", "current_excitation")
-# Standard deviations within which modes that two channels show are one.
-_SAME_SIGMAS = 3.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -178,11 +176,16 @@ def read_modes(
     those of ambient excitation. `BadLog` and `BadStage` as `identify`.
     """
     chosen: Any = {"channels": channels, "band": band}
-    for source in log.channels:
-        if source.kind != "current" or not source.name.startswith(_EXCITATIONS):
-            continue
+    forces = [c for c in log.channels if c.kind == "current" and c.name.startswith(_EXCITATIONS)]
+    for k, source in enumerate(forces):
+        detail = f"the response to {source.name} is identified; excite by one at a time"
+        others = [
+            Refusal(log.name, "surplus", detail, channel=other.name, source="frf")
+            for other in forces[k + 1 :]
+        ]
         try:
-            return _read_response(log, source, stage, **chosen)
+            alone = replace(log, refused=(*log.refused, *others))
+            return _read_response(alone, source, stage, **chosen)
         except BadLog as why:
             if why.reason != "coherence":  # of an excitation that was at rest nothing is to be read
                 place: Any = {"channel": source.name, "source": "frf"}
@@ -260,20 +263,24 @@ def _read_response(
         band = spans[0][0], spans[-1][1]
     found: list[Modes] = []
     lost: list[BadLog] = []
+    unread: list[Refusal] = []
     for channel in used:
         try:
             found.append(read_frf(log, source.name, channel.name, band=band).modes)
         except BadLog as why:
             lost.append(why)
+            unread.append(Refusal(log.name, why.reason, why.detail, channel.name, source="frf"))
     if not found:
         raise lost[0]
-    rows = dict.fromkeys(chain(log.refused, *(modes.refused for modes in found)))
+    rows = dict.fromkeys(chain(log.refused, unread, *(modes.refused for modes in found)))
     refused = [row for row in rows if row.frequency is None]
     lines = dict.fromkeys(chain.from_iterable(modes.lines for modes in found))
     both = numbered(merge(_clearest(found), [*lines], refused))
     poles = {f"pole_{k}": row for k, row in enumerate(rows) if row.frequency is not None}
     modes = both
-    if stage is not None:
+    if stage is None and not both.names:
+        modes = replace(both, refused=tuple(rows))
+    elif stage is not None:
         low, high = band or (0.0, np.inf)
         near = tuple(t for t in choose_targets(stage) if low <= t.frequency <= high)
         named = name_resonances(both, near, log.name)
@@ -304,9 +311,12 @@ def _clearest(found: Sequence[Modes]) -> list[Modes]:
             for k in kept[other]
             if other != c
         ]
-        if min(others, default=np.inf) > max(_SAME_SIGMAS * std, found[c].damping_ratio[i]):
+        apart = max(constants.SAME_SIGMAS * std, found[c].damping_ratio[i] / 2)
+        if min(others, default=np.inf) > apart:
             kept[c].append(i)
-    return [modes.select(sorted(own)) for modes, own in zip(found, kept, strict=True)]
+    best = (modes.select(sorted(own)) for modes, own in zip(found, kept, strict=True))
+    # Each channel has numbered its own.
+    return [replace(modes, names=("",) * len(modes.names)) for modes in best]
 
 
 def read_ambient(
@@ -329,7 +339,11 @@ def read_ambient(
             hints, refusal = _without_narrowest(hints, error)
             short.append(refusal)
     spans = _spans(log, whole.duration, hints, band)
-    tested = _thomson_lines(log, stretches, spans)
+    tested = [
+        line
+        for line in _thomson_lines(log, stretches, spans)
+        if not any(is_near(hint, line[1]) for hint in hints if hint.is_light)
+    ]
     masked_at = [f for _, f, _ in tested]
     cut = whole.each(lambda spectrum: spectrum.without(masked_at))
     seek = partial(_search, cut, spans, hints, masked_at, progress)
@@ -601,7 +615,9 @@ def _fit_group(
     high = min(high, max(t.frequency + width for t, width in zip(near, reach, strict=True)))
     noise = found.noise((near[0].frequency * near[-1].frequency) ** 0.5)
     around = found.around(near, low, high)
-    fit = fit_modes(around, near, (low, high), noise, found.model.static, turned=found.model.turned)
+    fit = fit_modes(
+        around, near, (low, high), noise, found.model.static, out_of_phase=found.model.out_of_phase
+    )
     if fit.modes is None and len(near) > 1:
         parts = [group] if near != group else halves(group)
         return [fit for part in parts for fit in _fit_group(found, part, part, top)]

@@ -176,7 +176,6 @@ class Named:
     doubtful: frozenset[str]  # described modes whose resonance may be another one
     ambiguous: dict[str, Rejection]  # by described mode
     undescribed: frozenset[str]  # provisional names of resonances that are likely no described mode
-    targets: tuple[Target, ...]
     log: str
 
     def publish(
@@ -304,7 +303,6 @@ def name_resonances(both: Modes, targets: tuple[Target, ...], log: str) -> Named
         undescribed=frozenset(
             own for own, there in zip(both.names, likely, strict=True) if not there
         ),
-        targets=targets,
         log=log,
     )
 

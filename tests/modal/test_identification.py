@@ -559,10 +559,10 @@ def fitted(monkeypatch: pytest.MonkeyPatch) -> list[tuple[LogSpectra, tuple[Targ
         noise: np.ndarray,
         static: float,
         *,
-        turned: bool,
+        out_of_phase: bool,
     ) -> ClusterFit:
         seen.append((view, targets))
-        return fit_modes(view, targets, band, noise, static, turned=turned)
+        return fit_modes(view, targets, band, noise, static, out_of_phase=out_of_phase)
 
     monkeypatch.setattr(modal, "fit_modes", spy_found)
     return seen
@@ -732,6 +732,50 @@ def test_longer_records_are_surer() -> None:
     short, long = (identify(one_mode_log(seconds, 22), stage) for seconds in (40.0, 160.0))
     ratio = np.sqrt(np.diag(short.cov) / np.diag(long.cov))
     np.testing.assert_allclose(ratio, 2.0, rtol=0.33)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_two_close_modes_of_unlike_shapes_are_one_or_two_and_not_none(seed: int) -> None:
+    """A sixth of a half-power bandwidth apart: both, or one with the flag; right in either case."""
+    modes = [
+        Mode(126.0, 0.015, 1.0, (1.0, 0.4, 0.2, 0.6)),
+        Mode(126.63, 0.015, 1.0, (0.4, -1.0, 0.5, -0.3)),
+    ]
+    found = identify(acceleration_log(rng(seed), modes, 30, RATE, 0.1), band=(80.0, 180.0))
+    assert len(found.names) == 2 or found.flags == ("cluster",)
+    off = np.abs(found.frequency[:, None] - [126.0, 126.63]).min(axis=1)
+    assert (off < 4 * found.frequency_std).all()
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_described_mode_as_narrow_as_a_line_is_none(seed: int) -> None:
+    """Thomson's test takes a damping of 0.05 % for lines; a description states that it is none."""
+    log = acceleration_log(rng(seed), [Mode(100.0, 5e-4)], 200, RATE, 1.0)
+    modes = identify(log, make_stage([("m", 100.0, 5e-4)]))
+    assert modes.names == ("m",)
+    assert np.abs(deviations(modes, "m", 100.0, 5e-4)).max() < 4
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_a_narrow_mode_on_a_broad_one_is_another_mode(seed: int) -> None:
+    """Within its half-power bandwidth, as of a light part on a damped machine: both are named."""
+    modes = [Mode(100.0, 0.05, 1.0, (1.0, 0.3)), Mode(101.0, 0.003, 0.05, (0.3, 1.0))]
+    log = acceleration_log(rng(seed), modes, 60, RATE, 0.01)
+    found = identify(log, make_stage([("broad", 100.0, 0.05), ("narrow", 101.0, 0.003)]))
+    assert sorted(found.names) == ["broad", "narrow"]
+    for name, f, zeta in (("broad", 100.0, 0.05), ("narrow", 101.0, 0.003)):
+        assert np.abs(deviations(found, name, f, zeta)).max() < 4
+
+
+@pytest.mark.slow
+def test_no_channel_of_a_long_record_is_unlike_the_others() -> None:
+    """Of a quarter of an hour the errors of bins, not of channels, are significant."""
+    for seed in range(3):
+        own = rng(seed)
+        modes = [Mode(f, 0.015, 1.0, tuple(own.standard_normal(3))) for f in (126.0, 136.0, 155.0)]
+        found = identify(acceleration_log(own, modes, 900, RATE, 0.05), band=(80.0, 200.0))
+        assert len(found.names) == 3
+        assert "unlike-others" not in [row.reason for row in found.refused]
 
 
 # Real measurements
@@ -959,6 +1003,38 @@ def test_blows_are_read_from_the_response_of_the_channel_that_shows_a_mode_best(
         assert np.abs(deviations(modes, name, f, zeta)).max() < 4
     assert reading.spectra.channels == ("acc_0", "acc_1")
     assert identify(struck_log(), band=(30.0, 150.0)).names == ("mode_1", "mode_2")
+
+
+def answer_of(force: np.ndarray, f: float, zeta: float = 0.01) -> np.ndarray:
+    """Return the acceleration of a mode under a force, with a little noise."""
+    pole = np.exp(2 * np.pi * f / RATE * (-zeta + 1j * np.sqrt(1 - zeta**2)))
+    answer = lfilter([1, -2, 1], np.poly([pole, pole.conj()]).real, force)
+    return np.asarray(answer + 0.3 * rng(round(f)).standard_normal(force.size))
+
+
+@pytest.mark.parametrize("second", [130.0, 100.8])
+def test_modes_that_one_channel_each_shows_are_all_identified(second: float) -> None:
+    """Also where they are nearer than a half-power bandwidth; a silent channel is refused."""
+    force = rng().standard_normal(30_000)
+    signals = {"current_force": force, "acc_0": answer_of(force, 100.0)}
+    signals |= {"acc_1": answer_of(force, second), "acc_2": rng(3).standard_normal(force.size)}
+    modes = identify(make_log(signals, RATE), band=(70.0, 150.0))
+    assert (modes.names, modes.channels) == (("mode_1", "mode_2"), ("acc_0", "acc_1"))
+    for name, f in zip(modes.names, (100.0, second), strict=True):
+        assert np.abs(deviations(modes, name, f, 0.01)).max() < 4.5
+    assert [(row.channel, row.reason) for row in modes.refused] == [("acc_2", "coherence")]
+
+
+def test_of_two_excitations_the_second_is_refused() -> None:
+    """Only the response to the first is identified, and the log says so."""
+    first, second = rng().standard_normal((2, 30_000))
+    signals = {"current_excitation_x": first, "current_excitation_y": second}
+    signals["acc_0"] = answer_of(first, 100.0) + answer_of(second, 130.0)
+    modes = identify(make_log(signals, RATE), band=(70.0, 150.0))
+    assert modes.frequency == pytest.approx([100.0], rel=1e-3)
+    assert [(row.channel, row.reason) for row in modes.refused] == [
+        ("current_excitation_y", "surplus")
+    ]
 
 
 def test_a_mode_of_a_response_that_may_be_several_has_no_name() -> None:

@@ -34,7 +34,7 @@ from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, median_ordinate
 # So many channels are fitted as they are; of more, directions that leave so much of each mode.
 _FEW, _SEEN = 4, 0.9
 # Part of a shape in quadrature that adds a direction.
-_TURNED = 0.05
+_QUADRATURE = 0.05
 # Ordinates at which directions are compared, at most.
 _MOST_COMPARED = 200
 # Half-power bandwidth in Fourier frequencies below which a pole is a line.
@@ -70,7 +70,7 @@ class ClusterData:
     masks: tuple[BoolArray, ...]  # ordinates of each spectrum without lines
     index: tuple[int, ...]  # the channels among those of the log
     static: float = 0.0  # static response of modes that is expected
-    turned: bool = False  # whether shapes and forces may have parts in quadrature
+    out_of_phase: bool = False  # whether shapes and forces may have parts in quadrature
 
     @property
     def duration(self) -> float:
@@ -124,15 +124,15 @@ def fit_modes(
     noise: FloatArray,
     static: float = 0.0,
     *,
-    turned: bool = False,
+    out_of_phase: bool = False,
 ) -> ClusterFit:
     """Fit modes that a search found in a band in Hz: mask lines, drop modes without evidence.
 
     ``noise`` is its density in each channel without foreign modes, in (m/s²)²/Hz, ``static`` the
-    expected static response of the modes over their shapes, ``turned`` whether the search found
-    parts in quadrature.
+    expected static response of the modes over their shapes, ``out_of_phase`` whether the search
+    found parts in quadrature.
     """
-    data = replace(prepare(spectra, targets, band, noise), static=static, turned=turned)
+    data = replace(prepare(spectra, targets, band, noise), static=static, out_of_phase=out_of_phase)
     n, needed = sum(int(mask.sum()) for mask in data.masks), needed_ordinates(len(targets))
     if n < needed:
         detail = f"{n} Fourier frequencies in the band hold no line, needed {needed}: record longer"
@@ -300,14 +300,14 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
     shapes = _in_phase(moved)
     shapes = shapes / np.linalg.norm(shapes.real, axis=0)
     phi = shapes.real
-    turned = shapes.imag[:, np.linalg.norm(shapes.imag, axis=0) > _TURNED]
+    quadrature = shapes.imag[:, np.linalg.norm(shapes.imag, axis=0) > _QUADRATURE]
     foreign = [
         s.foreign[:: 1 + s.frequency.size // _MOST_COMPARED]
         for s in spectra.spectra
         if s.foreign is not None
     ]
     if not foreign:
-        return _with_directions(np.linalg.svd(phi, full_matrices=False)[0], turned)
+        return _with_directions(np.linalg.svd(phi, full_matrices=False)[0], quadrature)
     columns = [phi]
     for g in foreign:
         best = phi - g @ _share(g, phi)
@@ -319,15 +319,15 @@ def _directions(moved: ComplexArray, spectra: LogSpectra) -> FloatArray:
     for n in range(phi.shape[1], u.shape[1]):
         shares = [_seen(u[:, :n], phi, g) / all_ for g, all_ in zip(foreign, whole, strict=True)]
         if np.concatenate(shares).mean(axis=0).min() > _SEEN:
-            return _with_directions(u[:, :n], turned)
-    return _with_directions(u, turned)
+            return _with_directions(u[:, :n], quadrature)
+    return _with_directions(u, quadrature)
 
 
 def _with_directions(basis: FloatArray, columns: FloatArray) -> FloatArray:
     """Return an orthonormal basis with what columns, ``(n, n_columns)``, clearly have beside it."""
     rest = columns - basis @ (basis.T @ columns)
     u, s, _ = np.linalg.svd(rest, full_matrices=False)
-    return np.column_stack([basis, u[:, s > _TURNED]])
+    return np.column_stack([basis, u[:, s > _QUADRATURE]])
 
 
 def _share(g: ComplexArray, phi: FloatArray) -> ComplexArray:
@@ -472,7 +472,7 @@ def _solve(
         narrowest=_COLLAPSED / data.duration,
     )
     p = likelihood.minimise(start)
-    if data.turned and not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
+    if data.out_of_phase and not likelihood.collapsed(p) and _is_out_of_phase(likelihood, p):
         likelihood = likelihood.with_quadrature()
         lay = likelihood.layout
         begin = lay.shapes.start + lay.shape_in_phase

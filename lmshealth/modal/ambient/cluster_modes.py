@@ -175,7 +175,8 @@ def _common(found: ClusterModes, i: int, j: int) -> ClusterModes:
 def drop_duplicates(fits: Sequence[ClusterFit]) -> list[ClusterFit]:
     """Drop modes within half a half-power bandwidth of a clearer one of another cluster.
 
-    Two modes of one cluster are those that its fit separates.
+    Two modes of one cluster are those that its fit separates; a narrow mode on a broad one is
+    another mode.
     """
     rows = [
         (float(clarity), float(ln_f), float(zeta), k, name)
@@ -189,7 +190,9 @@ def drop_duplicates(fits: Sequence[ClusterFit]) -> list[ClusterFit]:
     dropped: set[str] = set()
     for row in sorted(rows, reverse=True):
         if all(
-            row[3] == other[3] or abs(row[1] - other[1]) > 0.5 * (row[2] + other[2])
+            row[3] == other[3]
+            or abs(row[1] - other[1]) > 0.5 * (row[2] + other[2])
+            or abs(np.log(row[2] / other[2])) > np.log(constants.DUPLICATE_DAMPING)
             for other in kept
         ):
             kept.append(row)

@@ -23,6 +23,8 @@ _LEAST_GAIN, _HALVINGS = 0.3, 5
 _MEDIAN_SQUARE = 0.455
 # Mean of the residual over the floor below which a channel has less noise than any floor.
 _LITTLE = 0.5
+# Ordinates of a mean that count in its scatter, at most.
+_MOST_COUNTED = 200.0
 # In units of the median density of a channel. Channels of hardly any noise would else be judged by
 # the errors of the model, and the selection of modes by the rounding of the processor.
 LEAST_FLOOR = 1e-4
@@ -70,11 +72,11 @@ class JointModel:
     """Modes with correlated forces, and independent floors.
 
     E = Σ R_ij b_i b_j* + floors, b_i = φ_i (h_i + c) + ρ_i. Shapes φ and correlations R are real
-    unless the model is ``turned``: channels that do not move in phase make φ complex, a force that
-    reaches modes with a delay R. Parts in quadrature have priors, and count as no unknowns. Modes
-    are refined one after the other by Fisher's scoring with the others fixed, so that the cost of a
-    sweep is linear in their number. It selects modes; published estimates come from the likelihood
-    of `whittle`.
+    unless the model is ``out_of_phase``: channels that do not move in phase make φ complex, a force
+    that reaches modes with a delay R. Parts in quadrature have priors, and count as no unknowns.
+    Modes are refined one after the other by Fisher's scoring with the others fixed, so that the
+    cost of a sweep is linear in their number. It selects modes; published estimates come from the
+    likelihood of `whittle`.
     """
 
     data: BandData
@@ -84,7 +86,7 @@ class JointModel:
     phi: ComplexArray  # root of the PSD of the modal force in each channel, (n_channels, n_modes)
     rho: ComplexArray  # static response beside that of all modes, as phi
     r: ComplexArray  # correlations of the forces, (n_modes, n_modes)
-    turned: bool = False  # whether shapes and correlations have parts in quadrature
+    out_of_phase: bool = False  # whether shapes and correlations have parts in quadrature
     static: float = 0.0  # c: -1 where the base moves and absolute acceleration is measured
 
     def subset(self, kept: BoolArray) -> JointModel:
@@ -152,7 +154,7 @@ class JointModel:
             seen = seen - data.foreign[:, n:, :n]
         normal = np.einsum("kia,kja->ij", weighted, unit.conj())
         right = np.einsum("kia,kca->ic", weighted, seen.conj())
-        if not self.turned:
+        if not self.out_of_phase:
             normal, right = (np.asarray(one.real, np.complex128) for one in (normal, right))
         phi = np.linalg.solve(normal + 1e-9 * np.diag(np.diag(normal) + 1e-300), right).conj().T
         floor = np.full((more, self.floor.shape[1]), 0.5)
@@ -226,7 +228,8 @@ class JointModel:
         g = self._inverse
         precision = np.einsum("kaa->ka", g).real
         ratio = np.einsum("kaa->ka", g @ self.data.matrix @ g).real / precision
-        squares = self.data.count[:, None] * (ratio - 1) ** 2
+        # Of more ordinates the errors of the bins, of 1 %, would count.
+        squares = np.minimum(self.data.count, _MOST_COUNTED)[:, None] * (ratio - 1) ** 2
         scatter = np.median(squares, axis=0) / _MEDIAN_SQUARE
         level = self.data.count @ ratio / self.data.count.sum()
         return np.asarray(np.where(level < _LITTLE, np.minimum(scatter, 1.0), scatter))
@@ -323,7 +326,7 @@ class JointModel:
         )
         prior = np.concatenate([np.zeros(2 + n), self._weak])
         pull = np.concatenate([np.zeros(2 + n), self._weak * self.rho[:, i].real])
-        if self.turned:
+        if self.out_of_phase:
             u = np.concatenate([u, 1j * u[:, :, 2 : 2 + n]], axis=2)
             prior = np.append(prior, np.full(n, self._quadrature[i]))
             pull = np.append(pull, self._quadrature[i] * self.phi[:, i].imag)
@@ -347,11 +350,11 @@ class JointModel:
         """Improve the correlations of the force of a mode."""
         others = np.arange(self.f.size) != i
         now = self.r[i, others]
-        unit = np.array([1.0, 1j] if self.turned else [1.0])
+        unit = np.array([1.0, 1j] if self.out_of_phase else [1.0])
         # E changes with r_ij as b_i b_j* = v u*: the unit of u is conjugated.
         u = np.concatenate([one.conj() * self._b[:, :, others] for one in unit], axis=2)
         gradient, fisher = self._score(self._b[:, :, i], u)
-        parts = np.concatenate([now.real, now.imag] if self.turned else [now.real])
+        parts = np.concatenate([now.real, now.imag] if self.out_of_phase else [now.real])
 
         def moved(step: FloatArray) -> JointModel:
             r = self.r.copy()

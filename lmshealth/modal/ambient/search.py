@@ -45,8 +45,6 @@ _MOST_HARMONICS = 10
 _FIRST, _MORE = 8, 8
 # Of these, whose modes are not all refined, a residual shows a further mode from a larger gain on.
 _CLEARLY = 3.0
-# A pole at a line that is narrower than so many of its widths is what masking left of it.
-_FOOT = 5.0
 # A mode is tried without if its loss, the others fixed, is below the first, or another one is
 # within so many half-power bandwidths.
 _DOUBTFUL, _NEAR, _MOST_TRIED = 150.0, 3.0, 6
@@ -58,6 +56,8 @@ _WINDOWS = (0.003, 0.006, 0.012, 0.024)
 _STATICS = 0.0, -1.0
 # Sweeps of the model whose modes are chosen: fits see its other modes as foreign.
 _SWEEPS = 20
+# Ratio of bandwidths up to which two poles of unlike shapes are two modes.
+_SIMILAR = 2.0
 # Modes closer than this, in half-power bandwidths, are neighbours; of these, those that overlap.
 _NEIGHBOUR, _OVERLAP = 12.0, 4.0
 
@@ -134,7 +134,7 @@ def search(
         first = _informative(spectra, low, high)
     if model.quadrature_sigmas() > constants.QUADRATURE_SIGMAS[0]:
         # More modes are no explanation of those that move out of phase.
-        again = _explain(searched, low, high, suspected, hints, turned=True)
+        again = _explain(searched, low, high, suspected, hints, out_of_phase=True)
         if again[0].f.size <= model.f.size and again[0].misfit < model.misfit:
             model, harmonics, after, poles = again
     if len(first) < len(spectra.channels):
@@ -143,10 +143,10 @@ def search(
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
-    light = [hint for hint in hints if 2 * hint.damping_ratio < _FOOT * LINE_WIDTH]
+    light = [hint for hint in hints if hint.is_light]
     narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
     wide = (width > LINE_WIDTH) & ~(
-        near_lines(model.f, model.zeta, lines) & (width < _FOOT * LINE_WIDTH)
+        near_lines(model.f, model.zeta, lines) & (width < constants.LIGHT * LINE_WIDTH)
     )
     wide = (wide | narrow) & (width * model.f * spectra.duration > 1)
     wide &= model.zeta < constants.MOST_DAMPING
@@ -238,7 +238,7 @@ def _explain(
     suspected: Sequence[float],
     hints: tuple[Target, ...],
     *,
-    turned: bool = False,
+    out_of_phase: bool = False,
 ) -> tuple[JointModel, tuple[Harmonic, ...], LogSpectra, Poles]:
     """Select modes and harmonics; return the spectra without these, and the poles found there."""
     harmonics: list[Harmonic] = []
@@ -249,7 +249,7 @@ def _explain(
             c for c in stable if 2 * c.damping_ratio * c.frequency * spectra.duration > 1.0
         ]
         # Before the selection the direction of a harmonic is too uncertain to leave it out.
-        start = _start(_bin(spectra, candidates, low, high), candidates, turned)
+        start = _start(_bin(spectra, candidates, low, high), candidates, out_of_phase)
         # Floors and strengths of a start are those of c = 0: refined models are compared.
         refined = [replace(start, static=c).refined(6) for c in _STATICS]
         best = min(refined, key=lambda one: one.misfit)
@@ -278,8 +278,8 @@ def _with_likelier_static(model: JointModel) -> JointModel:
 def _without_splits(model: JointModel, most: int) -> JointModel:
     """Drop the weaker pole of pairs that no fit separates, while there are more than ``most``.
 
-    One described mode whose channels move out of phase is explained better by several poles of real
-    shapes, of which none is the mode.
+    One mode that is not as the model is explained better by several poles of unlike bandwidths, of
+    which none is the mode. Two of unlike shapes and similar bandwidths are modes, left to the fit.
     """
     while model.f.size > most:
         width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
@@ -287,6 +287,7 @@ def _without_splits(model: JointModel, most: int) -> JointModel:
         alike = alike > constants.ALIKE_MAC * np.outer(power, power)
         limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
         apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
+        apart[~alike & (np.abs(np.log(width[:, None] / width)) < np.log(_SIMILAR))] = np.inf
         np.fill_diagonal(apart, np.inf)
         i, j = np.unravel_index(int(apart.argmin()), apart.shape)
         if apart[i, j] > 1:
@@ -363,7 +364,9 @@ def _grow(
     for gain, f, zeta, phi in _excesses(model)[:2]:
         if gain < (constants.LEAST_HINTED if any(is_near(hint, f) for hint in hints) else least):
             break
-        more = model.with_mode(f, zeta, phi if model.turned else phi.real.astype(np.complex128))
+        more = model.with_mode(
+            f, zeta, phi if model.out_of_phase else phi.real.astype(np.complex128)
+        )
         more = more.refined(3, more.nearest(f))
         enough = _evidence(more, model) >= constants.EVIDENCE_MARGIN
         if enough and more.zeta[-1] < constants.MOST_DAMPING:
@@ -465,11 +468,11 @@ def neighbourhood(group: tuple[Target, ...], targets: tuple[Target, ...]) -> tup
     return targets[first:last]
 
 
-def _start(data: BandData, candidates: list[Candidate], turned: bool) -> JointModel:
+def _start(data: BandData, candidates: list[Candidate], out_of_phase: bool) -> JointModel:
     """Add candidates one by one, by their gain with all else fixed.
 
     Poles and shapes stay fixed, the covariance S of the forces and the floors are updated. A model
-    that is ``turned`` has parts in quadrature.
+    that is ``out_of_phase`` has parts in quadrature.
     """
     f = np.array([c.frequency for c in candidates])
     zeta = np.array([c.damping_ratio for c in candidates])
@@ -498,8 +501,8 @@ def _start(data: BandData, candidates: list[Candidate], turned: bool) -> JointMo
     r = 0.95 * r + 0.05 * np.eye(len(r))  # not singular
     shapes = (phi[chosen] * turn[:, None]).T * (root / peak[chosen])
     poles = f[chosen], zeta[chosen]
-    model = JointModel(data, floor, *poles, shapes, np.zeros_like(shapes), r, turned)
-    return model if turned else model.in_phase()
+    model = JointModel(data, floor, *poles, shapes, np.zeros_like(shapes), r, out_of_phase)
+    return model if out_of_phase else model.in_phase()
 
 
 def _inseparable(one: Candidate, other: Candidate, scale: FloatArray) -> bool:

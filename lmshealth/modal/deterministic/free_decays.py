@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.special import gammainccinv, gammaincinv
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, stack
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
@@ -26,7 +26,7 @@ from lmshealth.modal.deterministic.decay_fit import (
 from lmshealth.modal.deterministic.likelihood import transform_decays
 from lmshealth.modal.deterministic.poles import PoleFit
 from lmshealth.modal.modes import Modes, Rejection, estimates_only, merge, numbered
-from lmshealth.modal.naming import Named, assign, is_near, pairing_probability
+from lmshealth.modal.naming import Named, assign, assurance, is_near, pairing_probability
 from lmshealth.modal.targets import (
     Target,
     check_band,
@@ -158,17 +158,21 @@ def _named(modes: Modes, targets: tuple[Target, ...], log: str) -> Named:
     f, zeta = modes.frequency.tolist(), modes.damping_ratio.tolist()
     names, ambiguous = assign(f, targets, pairing_probability(f, targets, damping=zeta))
     own = {given: name for given, name in zip(modes.names, names, strict=True) if name}
-    return Named(own, frozenset(), ambiguous, frozenset(), targets, log)
+    return Named(own, frozenset(), ambiguous, frozenset(), log)
 
 
 def _distinct(bands: Sequence[_BandModes]) -> list[Modes]:
     """Return the modes of all bands; of Δe only those that accelerometers do not show."""
     found = [band.modes for band in bands]
-    seen = np.concatenate([np.empty(0), *(m.frequency for m in found if "acc" in m.sources)])
+    shown = merge([modes for modes in found if "acc" in modes.sources], (), ())
+    seen, std = shown.frequency, shown.frequency_std
     return [
         modes if "acc" in modes.sources else modes.select([
-            i for i, (f, zeta) in enumerate(zip(modes.frequency, modes.damping_ratio, strict=True))
-            if (np.abs(f / seen - 1) >= 2 * zeta).all()
+            i for i, f in enumerate(modes.frequency)
+            if (np.abs(f - seen) > np.maximum(
+                constants.SAME_SIGMAS * np.hypot(std, modes.frequency_std[i]),
+                modes.damping_ratio[i] * f,
+            )).all()
         ])
         for modes in found
     ]  # fmt: skip
@@ -270,8 +274,8 @@ def _fit_band(
 ) -> list[_BandModes]:
     """Start the decays later until they are sums of separate modes in stationary noise.
 
-    Right after a stop the machine still moves and is nonlinear: two poles within a Fourier
-    frequency, or a strong uncertain one, show it.
+    Right after a stop the machine still moves and is nonlinear: two poles of like shapes within a
+    Fourier frequency, or a strong uncertain one, show it.
     """
     nonstationary: PoleFit | None = None
     stationary: PoleFit | None = None
@@ -284,12 +288,20 @@ def _fit_band(
             nonstationary = nonstationary or fit
             continue
         stationary = stationary or fit
-        if (np.diff(np.sort(fit.frequency)) > 1 / blocks[0].duration).all():
+        if not _is_split(fit, 1 / blocks[0].duration):
             band = _accept(fit, channels, limits)
             if band.strongest_rejection not in _TOO_EARLY:
                 return [band]
     best = stationary or nonstationary
     return [_accept(best, channels, limits, linear=best is stationary)] if best else []
+
+
+def _is_split(fit: PoleFit, within: float) -> bool:
+    """Return whether poles of like shapes are nearer than so many Hz, as of a changing mode."""
+    f, shapes = fit.frequency, fit.likelihood.shapes
+    alike = ~(assurance(shapes, shapes) <= constants.ALIKE_MAC)  # unknown of one channel
+    near = np.abs(f[:, None] - f) <= within
+    return bool((alike & near).sum() > f.size)
 
 
 def _reach(duration: float, f: float) -> float:
@@ -301,7 +313,11 @@ def _peaks(samples: FloatArray, sample_rate: float, limits: Range) -> list[float
     n_segments, n_samples, n = samples.shape
     reach = (_AROUND + 2) * sample_rate / n_samples
     block = transform_decays(samples, sample_rate, limits[0] - reach, limits[1] + reach)
-    power = np.mean(np.abs(block.ordinates) ** 2, axis=0)
+    # Without leakage of a drift, which no mode causes and the likelihood has, too.
+    basis = np.linalg.qr(block.base)[0]
+    rows = stack(np.moveaxis(block.ordinates, 0, -1)).reshape(len(basis), -1)
+    squares = (rows - basis @ (basis.T @ rows)) ** 2
+    power = squares.reshape(2, -1, n, n_segments).sum(axis=0).mean(axis=2)
     middle = gammaincinv(n_segments, 0.5) / n_segments
     level = ndimage.median_filter(power, (2 * _AROUND + 1, 1), mode="nearest") / middle
     excess = np.sum(power / np.maximum(level, 1e-300), axis=1) * n_segments

@@ -226,7 +226,10 @@ def _excited_band(
     amplitude = np.abs(fft.rfft(values - values.mean()))
     frequency = np.arange(amplitude.size) * sample_rate / values.size
     amplitude[(frequency < band[0]) | (frequency > band[1])] = 0.0
-    excited = frequency[amplitude >= max(constants.EXCITED * amplitude.max(), np.finfo(float).tiny)]
+    # Fewer lines than a fit needs, as of mains in a record of noise, do not set the level.
+    few = 0 if period is not None else min(constants.FRF_LINES, amplitude.size - 1)
+    level = float(np.partition(amplitude, -1 - few)[-1 - few])
+    excited = frequency[amplitude >= max(constants.EXCITED * level, np.finfo(float).tiny)]
     # Half a line more at either end, so that rounding does not lose the last one.
     line = 0.5 * sample_rate / values.size
     return (excited[0] - line, excited[-1] + line) if excited.size else band

@@ -171,6 +171,39 @@ def test_a_softening_machine_gets_wide_intervals_or_none() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("seed", [0, 1])
+def test_two_modes_nearer_than_a_fourier_frequency_are_two(seed: int) -> None:
+    """Where channels show them unlike; a later start of the decays would merge them."""
+    rings = [Ring(85.0, 0.01, (1.0, 0.4)), Ring(86.7, 0.01, (0.4, -1.0))]
+    log = stop_log(np.random.default_rng(seed), rings, 0.5, RATE, 0.1, 6)
+    modes = of_pieces(log)
+    assert modes.names == ("mode_1", "mode_2")
+    for name, f in zip(modes.names, (85.0, 86.7), strict=True):
+        assert np.abs(deviations(modes, name, f, 0.01)).max() < 4
+
+
+def test_a_decay_beside_a_drift_is_found() -> None:
+    """A stage that creeps after its stops by a hundred times the vibration still shows its mode."""
+    log = log_of(3, [Ring(85.0, 0.01)], n_stops=4)
+    (channel,) = log.channels
+    drift = 200 * np.tile(np.arange(round(RATE)) / RATE, 4)
+    modes = of_pieces(make_log({"acc_0": channel.values[:] + drift}, RATE, pieces=log.pieces))
+    assert modes.names == ("mode_1",)
+    assert np.abs(deviations(modes, "mode_1", 85.0, 0.01)).max() < 4
+
+
+def test_a_following_error_adds_the_modes_that_accelerometers_do_not_show() -> None:
+    """Also one that is little more than a half-power bandwidth from one of these."""
+    rng = np.random.default_rng(4)
+    first = stop_log(rng, [Ring(85.0, 0.01)], 1.0, RATE, 0.02, 4)
+    second = stop_log(rng, [Ring(86.2, 0.01)], 1.0, RATE, 0.02, 4)
+    error = 1e-6 * second.channels[0].values
+    signals = {"acc_0": first.channels[0].values, "delta_e": error}
+    modes = of_pieces(make_log(signals, RATE, pieces=first.pieces))
+    assert modes.channels == ("acc_0", "delta_e")
+    assert modes.frequency == pytest.approx([85.0, 86.2], rel=1e-3)
+
+
 def test_a_mode_on_the_flank_of_a_louder_one_is_found() -> None:
     """Where short decays leave no peak of its own, the fit of the louder mode's band finds it."""
     rings = [Ring(136.0, 0.015), Ring(155.0, 0.0175, (0.07,))]

@@ -78,6 +78,18 @@ def test_modes_are_found_with_their_uncertainty(random: bool, displacement: bool
     assert np.isnan(reading.frf.period) == random
 
 
+def test_hum_in_a_random_force_does_not_narrow_the_band() -> None:
+    """A line of half the force's standard deviation: where the force excites is still known."""
+    log = driven(random=True)
+    force = next(c.values[:] for c in log.channels if c.name == "current")
+    hum = 0.5 * force.std() * np.sin(2 * np.pi * 50 * np.arange(force.size) / RATE)
+    channels = tuple(
+        replace(c, values=force + hum) if c.name == "current" else c for c in log.channels
+    )
+    frf = read_frf(replace(log, channels=channels), "current", "acc_x", band=BAND).frf
+    assert frf.frequency[-1] - frf.frequency[0] > 0.8 * (BAND[1] - BAND[0])
+
+
 def driven_name(machine: Machine) -> str:
     """Name the sensor's channel."""
     return "delta_e" if machine.displacement else "acc_x"
