@@ -197,8 +197,8 @@ def test_a_following_error_adds_the_modes_that_accelerometers_do_not_show() -> N
     rng = np.random.default_rng(4)
     first = stop_log(rng, [Ring(85.0, 0.01)], 1.0, RATE, 0.02, 4)
     second = stop_log(rng, [Ring(86.2, 0.01)], 1.0, RATE, 0.02, 4)
-    error = 1e-6 * second.channels[0].values
-    signals = {"acc_0": first.channels[0].values, "delta_e": error}
+    error = 1e-6 * second.channels[0].values[:]
+    signals = {"acc_0": first.channels[0].values[:], "delta_e": error}
     modes = of_pieces(make_log(signals, RATE, pieces=first.pieces))
     assert modes.channels == ("acc_0", "delta_e")
     assert modes.frequency == pytest.approx([85.0, 86.2], rel=1e-3)
