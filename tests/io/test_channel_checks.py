@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from lmshealth.io.buffers import BLOCK
+from lmshealth.io.buffers import BLOCK, NO_RANGES
 from lmshealth.io.channel_checks import (
-    NO_RANGES,
     check_signal,
     independent,
     missing_ranges,
