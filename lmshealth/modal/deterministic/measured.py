@@ -252,6 +252,7 @@ def from_measured(
     """
     use = (response.frequency >= band[0]) & (response.frequency <= band[1])
     f, h, coherence = response.frequency[use], response.values[use], response.coherence[use]
+    averages = None if averages == 1 else averages  # of one the coherence is 1, whatever the noise
     known = averages is not None and bool(np.isfinite(coherence).all())
     fewest = constants.FRF_LINES if known else constants.FRF_LINES_OF_UNKNOWN_NOISE
     if not fewest <= f.size <= constants.FRF_MOST_LINES:
