@@ -396,8 +396,7 @@ KINDS: tuple[Kind, ...] = (
     Kind("blocks never written", "corrupt", (".h5",), _hdf5(_never_written)),
     Kind("NUL bytes in a row", "corrupt", _TEXT, _line(None, b"\0\0\0,1,1,1")),
     Kind("a row too long", "corrupt", _TEXT, _line(None, b"1,1,1,1,1,1")),
-    Kind("another encoding instead of the moment", "metadata", _TEXT,
-         _line(1, b"# machine: M\xfcller")),
+    Kind("another encoding, no moment", "metadata", _TEXT, _line(1, b"# machine: M\xfcller")),
     Kind("an open quote", "corrupt", _TEXT, _line(None, b'"1,1,1')),
     # Columns
     Kind("header and no rows", "empty", _TEXT,
