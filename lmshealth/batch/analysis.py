@@ -50,7 +50,7 @@ def analyse(
     Raises
     ------
     NotEnoughData
-        If no log can be used.
+        If no log can be used, or they are of several machines.
 
     Examples
     --------
@@ -72,6 +72,7 @@ def analyse(
         manifests = dict.fromkeys(listed.logs, manifest)
     else:
         given = [one if isinstance(one, Log) else Path(one) for one in logs]
+    seen: dict[str, str] = {}
     for one in given:
         try:
             log = one
@@ -79,6 +80,8 @@ def analyse(
                 manifest = manifests[log] if log in manifests else read_manifest_beside(log)
                 overrides = manifest.overrides(log)
                 log = read_log(log, columns=used, overrides=overrides, latest=latest)
+            if (other := seen.setdefault(log.digest, log.name)) != log.name:
+                raise BadLog(log.name, "duplicate", f"same content as {other}")
             modes = identify(log, stage)
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))

@@ -186,7 +186,7 @@ def assess(
     stage : Stage
         Its description.
     work : Maintenance
-        Maintenance done to it.
+        Maintenance done to it; that of other machines is left out.
     today : date, optional
         Day of its status (`make_status`); that of the last log by default.
     epochs : int
@@ -198,6 +198,11 @@ def assess(
     -------
     Assessment
         Results that the data do not support are None, with the reason among the notices.
+
+    Raises
+    ------
+    NotEnoughData
+        If the logs are of several machines.
 
     Examples
     --------
@@ -212,7 +217,12 @@ def assess(
     >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
-    found, _ = assess_from(logs, stage, work, epochs=epochs, seed=seed)
+    machines = sorted({one.metadata.stage or "" for one in logs})
+    if len(machines) > 1:
+        named = ", ".join(machines)
+        raise NotEnoughData(f"logs are of {len(machines)} machines: {named}; needed is one")
+    own = work.of(machines[0]) if machines else work
+    found, _ = assess_from(logs, stage, own, epochs=epochs, seed=seed)
     return replace(found, today=today)
 
 
@@ -310,7 +320,7 @@ def _with_results(
     """
     stage, every = made.stage, constants.EMCEE_EVERY
     seed = seed_of(made.seed, history.stage, stage.digest)
-    past = fingerprint(history.logs[: history.baseline], made.digests[: history.baseline])
+    past = _past(made)
     if before is not None and before.past != past:  # draws of another life are no start of this
         before = None
     ended = fleet_prior.ended_lives(history, stage, seed) if before is None else before.ended
@@ -324,6 +334,15 @@ def _with_results(
     found = replace(found, ended=ended, evidence=fleet_prior.machine_evidence(stage, life))
     n_logs, verdict = len(history.logs), found.judgement.verdict
     return found, LifeState(life.start, n_logs, verdict, past, ended)
+
+
+def _past(made: Assessment) -> str:
+    """Return the fingerprint of all that is known of the logs before the baseline."""
+    own, n = made.history, made.history.baseline
+    stated = {name: values[:n] for name, values in own.covariates.items()}
+    rows = own.recorded_at[:n], own.travel[:n], own.ln_frequency[:n], own.cov[:n]
+    steps = [(step.kind, step.first, step.source) for step in own.steps if step.first < n]
+    return fingerprint(own.logs[:n], made.digests[:n], rows, stated, own.baselines, steps)
 
 
 def _with_life(made: Assessment, life: LifePosterior, history: History, epochs: int) -> Assessment:

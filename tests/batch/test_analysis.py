@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,17 @@ def test_a_folder_files_and_logs_give_the_same(logs: Path) -> None:
     assert {len(one.refused) for one in found} == {6}  # three modes of two logs
     refused = {(Path(row.log).name, row.mode) for one in found for row in one.refused}
     assert len(refused) == 6
+
+
+def test_a_copy_of_a_log_is_refused(logs: Path, tmp_path: Path) -> None:
+    """It would count as another log."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    shutil.copy(folder / "0.csv", folder / "copy.csv")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    assert [Path(log).name for log in found.history.logs] == ["0.csv", "1.csv"]
+    (row,) = (one for one in found.refused if one.reason == "duplicate")
+    assert (Path(row.log).name, row.detail[:15]) == ("copy.csv", "same content as")
 
 
 def test_a_map_is_a_mapping_or_a_file(logs: Path, tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ import pytest
 
 from lmshealth._private.serialize import pack, unpack
 from lmshealth.calibration.lives import make_history
+from lmshealth.errors import NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.machine import assessment as assessing
@@ -18,7 +19,7 @@ from lmshealth.machine.assessment import Assessment, LifeState
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.history import Series
-from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, Action, Maintenance
 from lmshealth.tracking.track import track
 from tests.lives import FADING, FREQUENCY, LAWS_ALONE, make_reading, make_stage, true_drift
 
@@ -97,6 +98,34 @@ def test_a_new_life_is_not_updated_from_the_old_one(
     fits.clear()
     assess_from(logs[:18], stage, before)
     assert fits == [(True, False)]
+
+
+@pytest.mark.parametrize("log", [3, 12])
+def test_what_a_table_corrects_of_ended_lives_begins_anew(
+    stage: Stage, fits: list[tuple[bool, bool]], log: int
+) -> None:
+    """The odometer of a log before the baseline is another; that of a later log is an update."""
+    logs = readings(17)
+    logs[10] = replace(logs[10], metadata=replace(logs[10].metadata, baseline=True))
+    _, before = assess_from(logs, stage, None)
+    fits.clear()
+    moved = replace(logs[log].metadata, travel=1e5 * log + 5e4)
+    logs[log] = replace(logs[log], metadata=moved)
+    assess_from(logs, stage, before)
+    assert fits == [(log < 10, log > 10)]
+
+
+def test_logs_and_work_of_other_machines_are_not_assessed(stage: Stage) -> None:
+    """Work on another machine is left out; its logs are an error."""
+    logs = readings(4)
+    machine, moment = logs[0].metadata.stage, logs[2].metadata.recorded_at
+    assert machine is not None and moment is not None
+    elsewhere = Maintenance((Action("another", moment, "guide-replaced"),))
+    found = assessing.assess(logs, stage, work=elsewhere, epochs=1)
+    assert found.history.logs == tuple(one.log for one in logs) and not found.history.baseline
+    other = replace(logs[3], metadata=replace(logs[3].metadata, stage="another"))
+    with pytest.raises(NotEnoughData, match=f"2 machines: .*{machine}.*; needed is one"):
+        assessing.assess([*logs[:3], other], stage)
 
 
 def test_a_drift_is_that_of_a_source_with_an_estimate(stage: Stage) -> None:
