@@ -211,8 +211,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     probability: float | None
     why: str
     alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
-    # Modes whose alarm, and conditions whose begin was a change since the baseline; ``silent`` since
-    # the last log, on whichever day.
+    # Modes whose alarm, and conditions whose begin was a change since the baseline;
+    # ``silent`` since the last log.
     announced: tuple[str, ...] = ()
     works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed
