@@ -335,7 +335,7 @@ def report(
     )
 
 
-def _judging(settings: Settings) -> Judging:
+def _judging(settings: Settings = Settings()) -> Judging:
     """Return on which day pages and statuses are judged, by default today (UTC)."""
     today = settings.today or datetime.now(UTC).date()
     return Judging(today, settings.alerts.silent_days, settings.language)
