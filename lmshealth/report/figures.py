@@ -719,8 +719,10 @@ def _logs(
 
 
 def title(lives: History | Track, k: int) -> str:
-    """Return name, time and odometer of a log, for hints."""
-    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}, {text.whole_km(lives.travel[k])}"
+    """Return name, time and, where it is known, odometer of a log, for hints."""
+    travel = lives.travel[k]
+    place = f", {text.whole_km(travel)}" if np.isfinite(travel) else ""
+    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}{place}"
 
 
 def _filtered(ax: Axes, x: FloatArray, level: FloatArray, std: FloatArray, unit: float) -> None:

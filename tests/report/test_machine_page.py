@@ -468,6 +468,7 @@ def test_a_life_by_the_time_has_no_odometer(make: Maker, tmp_path: Path) -> None
     found = one(tmp_path / "bare", bare).source
     assert "odometer" not in found.casefold()
     assert "days since the first log" in found and "travel in km" in found
+    assert f"nan{GAP}km" not in found
 
 
 @pytest.mark.usefixtures("blank")
