@@ -194,7 +194,7 @@ def test_results_are_plotted_by_name() -> None:
         (two_modes(), "", "natural frequency in Hz"),
         (lives, "roll", "odometer in km"),
         (track(lives), "roll", "odometer in km"),
-        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), "guide_preload", "odometer in km"),
+        (make_health(rng.lognormal(-0.2, 0.02, (40, 2))), "guide_preload", "travel in km"),
         (make_prognosis(np.linspace(1e5, 1e6, 11), np.full(11, 1e4)), "any", "travel from now"),
     )
     for result, what, label in results:

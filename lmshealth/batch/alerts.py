@@ -10,7 +10,7 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import date
 from pathlib import Path, PurePath
 from tempfile import TemporaryFile
 from threading import Thread
@@ -62,7 +62,7 @@ def last_number(store: Store) -> int:
 
 
 def announce(
-    store: Store, made: Mapping[str, Status], moment: datetime, alerts: Alerts, scope: Scope
+    store: Store, made: Mapping[str, Status], today: date, alerts: Alerts, scope: Scope
 ) -> tuple[tuple[Status, ...], list[Change], list[str]]:
     """Compare all machines of a folder of logs with what was announced, and queue their changes.
 
@@ -97,7 +97,7 @@ def announce(
     announced, changes, queued = [], list[Change](), list[Unsent]()
     for stage, status in sorted(present.items()):
         last = own.get(stage)
-        judged, found = compare(known.get(stage), status, moment, alerts.silent_days)
+        judged, found = compare(known.get(stage), status, today, alerts.silent_days)
         if last and last.number > scope.began and status.recorded_at < last.status.recorded_at:
             # Another run, of later logs, has ended since this one began.
             judged, found = last.status, []

@@ -10,8 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
-from datetime import UTC, datetime
-from datetime import time as day_time
+from datetime import UTC, date, datetime
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
@@ -41,7 +40,7 @@ from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import MISSPELT, NOT_LOGS
 from lmshealth.io.refusal import visible
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.status import Change, Status, judge_at, make_status, on_day
+from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
@@ -113,19 +112,20 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
 
 @dataclass(frozen=True, slots=True)
 class Judging:
-    """When statuses are judged, and beside which of the run before."""
+    """The day on which statuses are judged, and the days without a log that are a silence."""
 
-    moment: datetime
+    today: date
     silent_days: float | None
-    before: Mapping[str, Status]  # by machine
     language: Language = "en"  # of the pages
+    # Status of the last run, by machine: pages that are written without a run have its silences.
+    before: Mapping[str, Status] = field(default_factory=dict)
 
     def write(self, output: MachineOutput, path: Path) -> Summary:
         """Write the page of a machine as of the day; return its summary of that day."""
         before = self.before.get(output.status.stage)
-        today = self.moment.date()
-        status = judge_at(before, output.status, self.moment, self.silent_days)
-        summary = on_day(output.summary, status, today)
+        after = before.silent_after_days if before else self.silent_days
+        status = judge_on(output.status, self.today, after)
+        summary = on_day(output.summary, status, self.today)
         with in_language(self.language):
             write_text(path, date_page(output.page, summary, status))
         return summary
@@ -245,12 +245,12 @@ def run(
         ]
         failed = assess_all(machines, resources)
         usable = [machine for machine in machines if machine.name not in failed]
-        judging = _judging(store, settings)
+        judging = _judging(settings)
         rows, lacking, made = _report(usable, refused, resources, out, judging)
         present = {name: output.status for name, output in made.items()}
         tables = {name: output.tables for name, output in made.items()}
         with store.alone():  # a run that ends before its tables are written has announced nothing
-            found = announce(store, present, judging.moment, settings.alerts, scope)
+            found = announce(store, present, judging.today, settings.alerts, scope)
             statuses, changes, notes = found
             changed = [msgspec.to_builtins(change) for change in changes]
             of_run = {"refused": refused_rows(refused), "changes": changed}
@@ -258,7 +258,7 @@ def run(
             write_tables(out, [machine.name for machine in usable], tables)
         if machines:
             with in_language(settings.language):
-                write_index(out, rows, refused, today=judging.moment.date())
+                write_index(out, rows, refused, today=judging.today)
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
@@ -305,7 +305,8 @@ def report(
     files = file_names([one.machine for one in present])
     rows, failed = dict[str, Summary](), dict[str, str]()
     progress("reporting", 0, len(present))
-    judging = _judging(store, settings)
+    announced = {stage: one.status for stage, one in store.announced().items()}
+    judging = replace(_judging(settings), before=announced)
     refused = store.refused(one.refused for one in present)
     record = _records(store, refused, settings.language)
     # A process takes longer to start than a page to write.
@@ -325,7 +326,7 @@ def report(
     ranked = tuple(by_urgency(rows.values()))
     unread = "not readable for this version of lmshealth; run its logs again"
     with in_language(settings.language):
-        index = write_index(out, ranked, refused, today=judging.moment.date())
+        index = write_index(out, ranked, refused, today=judging.today)
     return RunResult(
         index=index,
         rows=ranked,
@@ -334,12 +335,10 @@ def report(
     )
 
 
-def _judging(store: Store, settings: Settings = Settings()) -> Judging:
-    """Return when pages and statuses are judged: at the end of a day, by default now (UTC)."""
-    today = settings.today
-    moment = datetime.now(UTC) if today is None else datetime.combine(today, day_time.max, UTC)
-    before = {stage: one.status for stage, one in store.announced().items()}
-    return Judging(moment, settings.alerts.silent_days, before, settings.language)
+def _judging(settings: Settings = Settings()) -> Judging:
+    """Return on which day pages and statuses are judged, by default today (UTC)."""
+    today = settings.today or datetime.now(UTC).date()
+    return Judging(today, settings.alerts.silent_days, settings.language)
 
 
 def _prepare(out: Path) -> None:

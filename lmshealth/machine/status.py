@@ -211,7 +211,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     probability: float | None
     why: str
     alarms: dict[str, datetime]  # modes with an undeclared alarm since the baseline, and its log
-    # Modes whose alarm, and conditions whose begin was a change since the baseline.
+    # Modes whose alarm, and conditions whose begin was a change since the baseline;
+    # ``silent`` since the last log.
     announced: tuple[str, ...] = ()
     works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed
@@ -236,7 +237,8 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
 
     Evidence of damage comes before missing logs, which must not hide it.
     """
-    verdict, by, inspect = _at_last_log(status), status.service_by, status.inspect_by
+    verdict, by = _at_last_log(status), status.service_by
+    late = status.inspect_by is not None and status.inspect_by < today
     judged = verdict not in NO_HEALTH
     serious = {code for code, severity in status.warnings.items() if severity == "serious"}
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
@@ -253,8 +255,8 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
         ("CHECK_FUNCTION", "unconfirmed-jump", _UNCONFIRMED & status.warnings.keys()),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
-        ("CHECK_FUNCTION", "inspection-overdue", inspect is not None and inspect < today),
-        ("CHECK_FUNCTION", "silent", status.silent or today > _last_day(status)),
+        ("CHECK_FUNCTION", "inspection-overdue", late and status.service != "now"),
+        ("CHECK_FUNCTION", "silent", today > _last_day(status)),
     ]
     return {code: state for state, code, applies in found if applies}
 
@@ -361,22 +363,15 @@ def _judged(status: Status, today: date) -> Status:
     )
 
 
-def judge_at(
-    before: Status | None, now: Status, moment: datetime, silent_days: float | None
-) -> Status:
-    """Judge a status at a moment, beside that of the run before; None if the machine is new.
+def judge_on(status: Status, today: date, silent_days: float | None) -> Status:
+    """Judge a status on a day.
 
-    A silence lasts until the next log, also where the clock is set back. Without ``silent_days`` it
-    begins by the intervals of the machine's own logs.
+    Without ``silent_days`` a silence begins by the intervals of the machine's own logs.
     """
-    silent = before is not None and before.silent and before.recorded_at == now.recorded_at
-    after = silent_days or now.silent_after_days
-    silent = silent or bool(after and moment - now.recorded_at > timedelta(days=after))
+    after = silent_days or status.silent_after_days
     # A status of an earlier schema is written again in this one.
-    now = msgspec.structs.replace(
-        now, schema=constants.JSON_SCHEMA, silent=silent, silent_after_days=after
-    )
-    return _judged(now, moment.date())
+    status = msgspec.structs.replace(status, schema=constants.JSON_SCHEMA, silent_after_days=after)
+    return _judged(status, today)
 
 
 def on_day(summary: Summary, status: Status, today: date) -> Summary:
@@ -396,19 +391,24 @@ def on_day(summary: Summary, status: Status, today: date) -> Summary:
 
 
 def compare(
-    before: Status | None, now: Status, moment: datetime, silent_days: float | None
+    before: Status | None, now: Status, today: date, silent_days: float | None
 ) -> tuple[Status, list[Change]]:
-    """Judge a status at a moment, and list its changes since the run before; None if it is new.
+    """Judge a status on a day, and list its changes since the run before; None if it is new.
 
-    An alarm of a mode, and a condition that moves with each log, is a change once per baseline.
+    An alarm of a mode, and a condition that moves with each log, is a change once per baseline. A
+    silence is one until the next log, also where the clock is set back.
     """
-    now = judge_at(before, now, moment, silent_days)
+    now = judge_on(now, today, silent_days)
     known = before.announced if before and before.baseline_at == now.baseline_at else ()
     once = [code for code in now.conditions if code in _ONCE]
     if _is_worked_on(before, now):  # what it has ended may begin again
         known = tuple(code for code in known if code in (*once, *now.alarms))
-    now = msgspec.structs.replace(now, announced=tuple(dict.fromkeys((*known, *now.alarms, *once))))
-    changes = [("alarm", "", mode) for mode in now.announced if mode not in (*known, *once)]
+    known = tuple(code for code in known if code != "silent")
+    lasts = before is not None and _was_silent(before) and now.recorded_at <= before.recorded_at
+    silence = ("silent",) if now.silent or lasts else ()
+    announced = dict.fromkeys((*known, *now.alarms, *once, *silence))
+    now = msgspec.structs.replace(now, announced=tuple(announced))
+    changes = [("alarm", "", mode) for mode in now.alarms if mode not in known]
     changes += [(code, "", _detail(code, now)) for code in once if code not in known]
     changes += _transitions(before, now)
     severities = dict(CHANGES)
@@ -435,9 +435,9 @@ def _transitions(before: Status | None, now: Status) -> Iterator[tuple[str, str,
         yield "recovered" if recovered else "verdict", was, verdict
     elif before and before.alarms and not now.alarms:
         yield "recovered", f"alarm {' '.join(before.alarms)}", "no alarm"
-    if now.silent and not (before and before.silent):
+    if now.silent and not _was_silent(before):
         yield "silent", f"last log of {last}", f"no log for {now.days_without_log} days"
-    elif before and before.silent and not now.silent:
+    elif _was_silent(before) and "silent" not in now.announced:
         yield "recovered", f"no log since {last}", f"log of {now.recorded_at.date().isoformat()}"
     earlier = before.conditions if before else {}
     for code in _ENDING:
@@ -453,11 +453,16 @@ def _ended(before: Status, now: Status) -> Iterator[tuple[str, str]]:
     if now.alarms or _is_loss(_at_last_log(now)):  # they are the jump that was not confirmed
         ended -= {"unconfirmed-jump"}
     # Not by another day or description.
-    if now.recorded_at > before.recorded_at and not before.silent:
+    if now.recorded_at > before.recorded_at and not _was_silent(before):
         why = f"log of {now.recorded_at.date().isoformat()}"
         yield from ((code, why) for code in _ENDING if code in ended)
     elif _is_worked_on(before, now):
         yield from ((code, "work was entered") for code in (*_ENDING, *_ONCE) if code in ended)
+
+
+def _was_silent(before: Status | None) -> bool:
+    """Return whether a silence was a change already; earlier versions do not list it as such."""
+    return before is not None and (before.silent or "silent" in before.announced)
 
 
 def _is_worked_on(before: Status | None, now: Status) -> bool:

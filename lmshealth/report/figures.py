@@ -213,7 +213,7 @@ def plot_posterior(ax: Axes, health: Health, parameters: tuple[str, ...]) -> Axe
 
 
 def plot_health(ax: Axes, health: Health, parameter: str, limit: float | None) -> Axes:
-    """Plot the bands of a health parameter against the odometer; the limit is a fraction."""
+    """Plot the bands of a health parameter over travel; the limit is a fraction."""
     column = health.parameters.index(parameter)
     bands = 100 * health.quantile(_LEVELS)[:, :, column]
     informed = bool(health.publishable_parameters()[column])
@@ -263,7 +263,7 @@ def plot_life(ax: Axes, prognosis: Prognosis, parameter: str, *, baseline: float
     ax.set_ylabel(tr("% of baseline"))
     odometer(ax)
     if not shown:
-        label = tr("odometer in km (horizon at {distance}, not shown)")
+        label = tr("travel in km (horizon at {distance}, not shown)")
         ax.set_xlabel(label.format(distance=text.whole_km(_KM * end)))
     return ax
 
@@ -493,10 +493,18 @@ def along(lives: History | Track) -> FloatArray:
 
 
 def odometer(ax: Axes, lives: History | Track | None = None, *, room: int = ROOM) -> Axes:
-    """Label the axis of the odometer, or of the days of ``lives`` without one; add the legend."""
+    """Label the axis of the odometer, or of the days of ``lives`` without one; add the legend.
+
+    Without ``lives`` it is that of the travel of a life, which may be counted by the time.
+    """
     grouped(ax)
-    days = lives is not None and not np.isfinite(lives.travel).all()
-    ax.set_xlabel(tr("days since the first log") if days else tr("odometer in km"))
+    if lives is None:
+        label = tr("travel in km")
+    elif np.isfinite(lives.travel).all():
+        label = tr("odometer in km")
+    else:
+        label = tr("days since the first log")
+    ax.set_xlabel(label)
     return legend(ax, room=room)
 
 
@@ -658,7 +666,7 @@ def plot_waterfall(
         for k in range(len(track.modes)):
             _on_image(ax, track, k, 0.0 if moved is None else moved[:, k])
     ax.set_ylabel(tr("frequency in Hz"))
-    return odometer(ax, room=36)  # next to the colour bar
+    return odometer(ax, history, room=36)  # next to the colour bar
 
 
 def plot_influence(ax: Axes, influence: CovariateEffect, history: History) -> Axes:
@@ -711,8 +719,10 @@ def _logs(
 
 
 def title(lives: History | Track, k: int) -> str:
-    """Return name, time and odometer of a log, for hints."""
-    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}, {text.whole_km(lives.travel[k])}"
+    """Return name, time and, where it is known, odometer of a log, for hints."""
+    travel = lives.travel[k]
+    place = f", {text.whole_km(travel)}" if np.isfinite(travel) else ""
+    return f"{lives.logs[k]}\n{text.moment(lives.recorded_at[k])}{place}"
 
 
 def _filtered(ax: Axes, x: FloatArray, level: FloatArray, std: FloatArray, unit: float) -> None:

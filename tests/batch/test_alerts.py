@@ -128,8 +128,8 @@ def test_ten_nights_are_reported_once_each(nights: Nights) -> None:
         assert len(rows_of(nights.out / "changes.csv")) == len(changes[-1])
     expected = {
         3: ["B: unconfirmed-jump"],
-        4: ["C: unconfirmed-jump", "D: silent last log of 2026-03-10 → no log for 3 days"],
-        5: ["B: alarm roll"],
+        4: ["C: unconfirmed-jump"],
+        5: ["B: alarm roll", "D: silent last log of 2026-03-10 → no log for 4 days"],
         6: ["C: alarm roll"],
         8: ["C: recovered alarm roll → no alarm"],
     }
@@ -416,9 +416,11 @@ def test_a_run_whose_tables_cannot_be_written_has_announced_nothing(
 
 
 def test_a_clock_that_is_set_back_changes_nothing(nights: Nights) -> None:
-    """A machine that was silent is silent until its next log, and is reported once."""
+    """Silence is that of the day, and is reported once until the next log."""
     nights.run(N_BEFORE + 3)
-    assert nights.run(N_BEFORE - 1).changes == nights.run(N_BEFORE + 4).changes == ()
+    early, late = nights.run(N_BEFORE - 1), nights.run(N_BEFORE + 4)
+    assert early.changes == late.changes == ()
+    assert not any(one.silent for one in early.statuses) and all(o.silent for o in late.statuses)
     assert len(nights.delivered()) == 1
 
 

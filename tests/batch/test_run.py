@@ -1087,6 +1087,11 @@ def test_a_run_as_on_a_day_repeats(tmp_path: Path, modes_only: Stage) -> None:
     assert status == other != later
     # Pages have the day since a machine without logs for long is unknown there.
     assert pages(tmp_path / "a") == pages(tmp_path / "b") != pages(tmp_path / "c")
+    # Those of `report` too, which has the limit of the run: two logs of a day have no other.
+    for name, today in days.items():
+        with closing(Store(default_url(tmp_path / name), create=False)) as store:
+            report(store, tmp_path / f"{name}-report", Settings(today=today))
+        assert pages(tmp_path / f"{name}-report") == pages(tmp_path / name)
     late = pages(tmp_path / "c")
     for page in (late["index.html"].decode(), late["test-A.html"].decode()):
         assert "Written on 2024-02-01, last log 2024-01-11" in page and "no log for 21 days" in page

@@ -16,10 +16,12 @@ from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import (
     CHANGES,
+    UNKNOWN,
     Status,
     coming_states,
     compare,
     conditions,
+    judge_on,
     make_status,
 )
 from lmshealth.machine.summary import summarise
@@ -50,6 +52,7 @@ SOUND: dict[str, Any] = {
     "inspect_by": date(2026, 12, 24),
 }
 ALARM = {"roll": LAST}
+OVERDUE = {"inspect_by": TODAY - timedelta(days=1)}
 OPEN = {"verdict": "not-enough-data", "service_by": None, "inspect_by": None}
 
 
@@ -77,9 +80,18 @@ def status(**given: Any) -> Status:
         ({"service_by": TODAY + timedelta(days=30)}, "MAINTENANCE_REQUIRED", "service-due"),
         ({"service_by": TODAY - timedelta(days=3)}, "MAINTENANCE_REQUIRED", "service-due"),
         ({"inspect_by": TODAY}, "NORMAL", ""),
-        ({"inspect_by": TODAY - timedelta(days=1)}, "CHECK_FUNCTION", "inspection-overdue"),
-        ({"silent": True}, "CHECK_FUNCTION", "silent"),
-        ({"silent": True, "verdict": "mount"}, "MAINTENANCE_REQUIRED", "loss silent"),
+        (OVERDUE, "CHECK_FUNCTION", "inspection-overdue"),
+        # Who does the work now needs no log before it.
+        (OVERDUE | {"service": "now"}, "NORMAL", ""),
+        ({"silent_after_days": 5.0}, "NORMAL", ""),
+        ({"silent_after_days": 4.0}, "CHECK_FUNCTION", "silent"),
+        # Of a status of another day.
+        ({"silent": True, "silent_after_days": 5.0}, "NORMAL", ""),
+        (
+            {"silent_after_days": 4.0, "verdict": "mount"},
+            "MAINTENANCE_REQUIRED",
+            "loss silent",
+        ),
         ({"warnings": {"laws-do-not-fit": "serious"}}, "OFF_SPEC", "unreliable"),
         ({"warnings": {"mode-off-map": "caution"}}, "NORMAL", ""),
         (OPEN | {"warnings": {"no-result": "serious"}}, "CHECK_FUNCTION", "no-verdict"),
@@ -113,8 +125,11 @@ def test_states_to_come_are_those_of_their_days() -> None:
     worn = status(verdict="preload", service_by=date(2026, 1, 1))
     assert [*coming_states(worn, LAST.date())] == [LAST.date()]
     later = LAST.date() + timedelta(days=9)
-    quiet = coming_states(status(silent_after_days=5.0), LAST.date())
-    assert quiet[LAST.date() + timedelta(days=6)] == {"silent": "CHECK_FUNCTION"}
+    quiet = status(silent_after_days=5.0)
+    coming = coming_states(quiet, LAST.date())
+    assert coming[LAST.date() + timedelta(days=6)] == {"silent": "CHECK_FUNCTION"}
+    assert all(judge_on(quiet, day, None).conditions == found for day, found in coming.items())
+    assert not judge_on(quiet, LAST.date() + timedelta(days=5), None).silent
     assert [*coming_states(status(silent_after_days=5.0), later)] == [later, lead]
 
 
@@ -156,7 +171,7 @@ def test_changes_since_the_last_run(
 ) -> None:
     """New alarms, changed verdicts, recoveries; of a new machine only what is bad."""
     was = None if before is None else status(**before)
-    _, found = compare(was, status(**now), LAST + timedelta(days=5), 7.0)
+    _, found = compare(was, status(**now), TODAY, 7.0)
     assert [(one.what, one.before, one.now) for one in found] == expected
     assert all((one.stage, one.recorded_at) == ("M7-Y", LAST) for one in found)
 
@@ -180,11 +195,10 @@ def test_changes_since_the_last_run(
 )
 def test_each_change_of_state_is_announced_once(code: str, now: dict[str, Any], text: str) -> None:
     """It is a change with its severity, of a known machine and of a new one, and never again."""
-    moment = LAST + timedelta(days=5)
     bad = status(**now)
-    first, _ = compare(None, status(**(OPEN if code == "large-drift" else {})), moment, None)
+    first, _ = compare(None, status(**(OPEN if code == "large-drift" else {})), TODAY, None)
     for before in (first, None):
-        found, changes = compare(before, bad, moment, None)
+        found, changes = compare(before, bad, TODAY, None)
         if before is None and code == "verdict":
             text = "verdict preload"
         own = [one for one in changes if one.what == code]
@@ -192,52 +206,50 @@ def test_each_change_of_state_is_announced_once(code: str, now: dict[str, Any], 
             (CHANGES[code], True)
         ]
         assert changes == own
-        again, changes = compare(found, bad, moment, None)
+        again, changes = compare(found, bad, TODAY, None)
         assert changes == [] and again == found
 
 
 def test_what_moves_with_each_log_is_announced_once_per_baseline() -> None:
     """A service date that comes and goes is one change; a log that is late again is another one."""
-    moment = LAST + timedelta(days=5)
     due, sound = status(service_by=TODAY), status()
-    found, changes = compare(sound, due, moment, None)
+    found, changes = compare(sound, due, TODAY, None)
     assert [one.what for one in changes] == ["service-due"]
-    found, changes = compare(found, sound, moment, None)
+    found, changes = compare(found, sound, TODAY, None)
     assert changes == []
-    assert compare(found, due, moment, None)[1] == []
+    assert compare(found, due, TODAY, None)[1] == []
     served = msgspec.structs.replace(due, baseline_at=LAST)
-    assert [one.what for one in compare(found, served, moment, None)[1]] == ["service-due"]
+    assert [one.what for one in compare(found, served, TODAY, None)[1]] == ["service-due"]
     late = status(inspect_by=TODAY - timedelta(days=1))
-    found = compare(sound, late, moment, None)[0]
+    found = compare(sound, late, TODAY, None)[0]
     # Another description, or another day, is no log that has come.
-    assert compare(found, sound, moment, None)[1] == []
+    assert compare(found, sound, TODAY, None)[1] == []
     newer = status(recorded_at=LAST + timedelta(days=1))
-    found, changes = compare(found, newer, moment, None)
+    found, changes = compare(found, newer, TODAY, None)
     assert [str(one) for one in changes] == [
         "M7-Y: recovered inspection-overdue → log of 2026-11-21"
     ]
-    assert [one.what for one in compare(found, late, moment, None)[1]] == ["inspection-overdue"]
+    assert [one.what for one in compare(found, late, TODAY, None)[1]] == ["inspection-overdue"]
 
 
 @pytest.mark.parametrize("code", ["unconfirmed-jump", "inspection-overdue", "limit-reached"])
 def test_what_work_ends_without_a_new_log_is_announced(code: str) -> None:
     """Of statuses that know of work; it may begin again, and ends once. Control: another day."""
-    moment = LAST + timedelta(days=5)
     jump: dict[str, Any] = {"warnings": {"last-logs-left-out": "caution"}}
     late: dict[str, Any] = {"inspect_by": TODAY - timedelta(days=1)}
     given = {"unconfirmed-jump": jump, "inspection-overdue": late}
     bad = status(works=1, **given.get(code, {"probability_limit_reached": 0.7}))
-    found, changes = compare(status(works=1), bad, moment, None)
+    found, changes = compare(status(works=1), bad, TODAY, None)
     assert [one.what for one in changes] == [code]
-    assert compare(found, status(works=1), moment, None)[1] == []
+    assert compare(found, status(works=1), TODAY, None)[1] == []
     assert (
-        compare(msgspec.structs.replace(found, works=None), status(works=2), moment, None)[1] == []
+        compare(msgspec.structs.replace(found, works=None), status(works=2), TODAY, None)[1] == []
     )
-    served, changes = compare(found, status(works=2), moment, None)
+    served, changes = compare(found, status(works=2), TODAY, None)
     assert [str(one) for one in changes] == [f"M7-Y: recovered {code} → work was entered"]
-    assert compare(served, status(works=2), moment, None)[1] == []
+    assert compare(served, status(works=2), TODAY, None)[1] == []
     again = msgspec.structs.replace(bad, works=2)
-    assert [one.what for one in compare(served, again, moment, None)[1]] == [code]
+    assert [one.what for one in compare(served, again, TODAY, None)[1]] == [code]
 
 
 def test_the_table_of_changes_is_that_of_the_readme(root: Path) -> None:
@@ -250,10 +262,9 @@ def test_the_table_of_changes_is_that_of_the_readme(root: Path) -> None:
 
 def test_severities_of_verdicts_are_those_of_what_they_are_now() -> None:
     """A loss is serious, what is no loss any more a note; every kind has a severity."""
-    moment = LAST + timedelta(days=5)
     lost, sound, none = status(verdict="preload"), status(), status(**OPEN)
     pairs = ((sound, lost), (lost, none), (lost, sound), (sound, none))
-    severities = [compare(*pair, moment, None)[1][0].severity for pair in pairs]
+    severities = [compare(*pair, TODAY, None)[1][0].severity for pair in pairs]
     assert severities == ["serious", "note", "note", "note"]
 
 
@@ -279,25 +290,53 @@ def test_a_status_of_an_earlier_schema_is_read_and_written_in_this_one() -> None
         "Prognoses": [{"Activity": "Service", "PredictedTime": "2027-06-01T00:00:00Z"}],
     }
     before = msgspec.json.decode(msgspec.json.encode(earlier), type=Status)
-    found, changes = compare(before, before, LAST + timedelta(days=5), None)
+    found, changes = compare(before, before, TODAY, None)
     assert before.schema == 1 and changes == []
     assert found.schema == constants.JSON_SCHEMA == 2
     assert "Prognoses" not in msgspec.to_builtins(found)
 
 
-def test_a_silence_is_reported_once_and_lasts_until_the_next_log() -> None:
-    """Also through a run that does not ask for silences; the limit itself is none yet."""
-    found, changes = compare(status(), status(), LAST + timedelta(days=7), 7.0)
+def test_a_silence_is_that_of_the_day_and_reported_once_until_the_next_log() -> None:
+    """Neither an earlier day nor another limit leaves a machine silent, or announces it again."""
+    last = LAST.date()
+    found, changes = compare(status(), status(), last + timedelta(days=7), 7.0)
     assert (found.silent, changes) == (False, [])
-    found, changes = compare(found, status(), LAST + timedelta(days=7, hours=1), 7.0)
+    found, changes = compare(found, status(), last + timedelta(days=8), 7.0)
     assert [str(one) for one in changes] == [
-        "M7-Y: silent last log of 2026-11-20 → no log for 7 days"
+        "M7-Y: silent last log of 2026-11-20 → no log for 8 days"
     ]
-    for days in (7.0, None, 7.0):
-        found, changes = compare(found, status(), LAST + timedelta(days=9), days)
-        assert (found.silent, changes) == (True, [])
-    later = status(recorded_at=LAST + timedelta(days=9))
-    assert not compare(found, later, LAST + timedelta(days=9), None)[0].silent
+    # Statuses of earlier versions do not list the silence among what was announced.
+    for known in (found, msgspec.structs.replace(found, announced=())):
+        before = known
+        for days, limit in ((9, 7.0), (1, 7.0), (9, 7.0), (9, 400.0), (9, None), (9, 7.0)):
+            before, changes = compare(before, status(), last + timedelta(days=days), limit)
+            silent = days == 9 and limit == 7.0
+            verdict = UNKNOWN if silent else "healthy"
+            assert (before.silent, before.verdict, changes) == (silent, verdict, [])
+        early = compare(before, status(), last, 7.0)[0]
+        later = status(recorded_at=LAST + timedelta(days=9))
+        for one in (before, early):
+            after, changes = compare(one, later, last + timedelta(days=9), 7.0)
+            assert [str(one) for one in changes] == [
+                "M7-Y: recovered no log since 2026-11-20 → log of 2026-11-29"
+            ]
+        (again,) = compare(after, later, last + timedelta(days=17), 7.0)[1]
+        assert again.what == "silent"
+
+
+def test_a_service_that_is_due_now_announces_no_late_log() -> None:
+    """Each log has `inspect_by` on its own day then, and would be late and recovered for ever."""
+    before: Status | None = None
+    for days in range(4):
+        moment = LAST + timedelta(days=days)
+        today = moment.date()
+        due = status(
+            verdict="preload", recorded_at=moment, service="now", service_by=today, inspect_by=today
+        )
+        for day in (today, today + timedelta(days=1)):
+            before, changes = compare(before, due, day, None)
+            assert not {"inspection-overdue", "recovered"} & {one.what for one in changes}
+            assert "inspection-overdue" not in before.conditions
 
 
 def document(assessment: Assessment) -> dict[str, Any]:

@@ -14,7 +14,7 @@ import pytest
 
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import Service, day_after
-from lmshealth.machine.status import judge_at, make_status, on_day
+from lmshealth.machine.status import judge_on, make_status, on_day
 from lmshealth.machine.summary import summarise
 from lmshealth.report import figures as plots
 from lmshealth.report.pages import date_page, make_page, write_index
@@ -159,8 +159,8 @@ def test_a_machine_without_logs_for_long_is_unknown_everywhere(make: Maker, tmp_
     assert make_status(early, summary).verdict == "healthy"
     assert "Healthy" in pages_of(early, early.service(), tmp_path)[2]
     # A limit of one's own replaces that by the intervals of the logs.
-    moment = made.judgement.recorded_at + timedelta(days=176)
-    assert judge_at(None, make_status(made, summary), moment, 200.0).verdict == "healthy"
+    status = judge_on(make_status(made, summary), last + timedelta(days=176), 200.0)
+    assert status.verdict == "healthy"
 
 
 def test_the_page_of_a_loss_keeps_its_headline(make: Maker, tmp_path: Path) -> None:

@@ -457,13 +457,27 @@ def test_a_page_is_self_contained_and_well_formed(make: Maker, tmp_path: Path) -
         assert all("scope=" in tag for tag in re.findall("<th[ >][^>]*", page.source))
 
 
+def test_a_life_by_the_time_has_no_odometer(make: Maker, tmp_path: Path) -> None:
+    """No heading, axis or description of a picture names one. Control: a machine that has it."""
+    known = make()
+    unknown = np.full_like(known.history.travel, np.nan)
+    assert known.track is not None
+    history = replace(known.history, travel=unknown)
+    bare = replace(known, history=history, track=replace(known.track, travel=unknown))
+    assert "odometer in km" in one(tmp_path / "known", known).source
+    found = one(tmp_path / "bare", bare).source
+    assert "odometer" not in found.casefold()
+    assert "days since the first log" in found and "travel in km" in found
+    assert f"nan{GAP}km" not in found
+
+
 @pytest.mark.usefixtures("blank")
 def test_corrected_covariates_are_reported(make: Maker, tmp_path: Path) -> None:
     """The page contains range, reference, coefficient and scatter of a covariate."""
     assessment = make()
     found = find_covariate_effects(assessment.history, assessment.track, assessment.stage)  # type: ignore[arg-type]
     text = words(one(tmp_path, assessment))
-    part = text[text.index("Effects other than wear") : text.index("Health over the odometer")]
+    part = text[text.index("Effects other than wear") : text.index("Health over travel")]
     values = assessment.history.covariates["temperature_c"]
     low, high = values.min(), values.max()
     assert (

@@ -60,7 +60,7 @@ def assess_and_report(
     with processes(workers) as pool:
         resources = Resources(store, pool, progress)
         assert not assess_all(machines, resources)
-        _, failed, _ = running._report(machines, (), resources, out, running._judging(store))
+        _, failed, _ = running._report(machines, (), resources, out, running._judging())
     assert not failed
 
 
