@@ -478,9 +478,10 @@ def watch(
     """Yield the result of `run`, or its error, whenever it has something to do; never end.
 
     Logs whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
-    a later run; there is none while ``manifest.csv`` or ``maintenance.csv`` differ. The folder is polled, because network shares report no changes. There is a run on
-    every new day (UTC) too: services fall due, and machines fall silent, without a new log. A run
-    that fails is repeated at the next poll, unless no log was usable.
+    a later run; there is none while ``manifest.csv`` or ``maintenance.csv`` differ. The
+    folder is polled, because network shares report no changes. There is a run on every new day
+    (UTC) too: services fall due, and machines fall silent, without a new log. A run that fails is
+    repeated at the next poll, unless no log was usable.
     """
     before, done, day = _files(folder, out), _Files(), None
     while True:

@@ -342,7 +342,7 @@ def test_laws_that_are_those_of_no_statement_stay_as_stated(tmp_path: Path) -> N
 
 
 def test_a_wider_prior_allows_a_larger_change(tmp_path: Path) -> None:
-    """Where no law is stated; half of a prior below 0 is no reason for another standard deviation."""
+    """Where no law is stated; a part of the prior below 0 makes no step."""
 
     def std(prior: str) -> float:
         text = re.sub("prior = .*", f"prior = {{ {prior} }}", PRELOAD[: PRELOAD.index("law = ")])

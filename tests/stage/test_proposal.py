@@ -158,7 +158,7 @@ def test_any_name_is_quoted(tmp_path: Path) -> None:
 def test_a_name_that_no_description_has_is_refused(tmp_path: Path, stem: str) -> None:
     """Before a file is written that cannot be read."""
     path = tmp_path / f"{stem}.toml"
-    with pytest.raises(BadStage, match="not written.*name: "):
+    with pytest.raises(BadStage, match=r"not written.*name: "):
         write_skeleton(path, "", "A", [(ModeSpec("mode_1", 62.0, 0.02), "")])
     assert not path.exists()
 
