@@ -478,10 +478,10 @@ def watch(
     """Yield the result of `run`, or its error, whenever it has something to do; never end.
 
     Logs whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
-    a later run; there is none while ``manifest.csv`` or ``maintenance.csv`` differ. The
-    folder is polled, because network shares report no changes. There is a run on every new day
-    (UTC) too: services fall due, and machines fall silent, without a new log. A run that fails is
-    repeated at the next poll, unless no log was usable.
+    a later run; there is none while ``manifest.csv`` or ``maintenance.csv`` differ. The folder is
+    polled, because network shares report no changes. There is a run on every new day (UTC) too:
+    services fall due, and machines fall silent, without a new log. A run that fails is repeated at
+    the next poll, unless no log was usable.
     """
     before, done, day = _files(folder, out), _Files(), None
     while True:
@@ -490,10 +490,10 @@ def watch(
         settled = {path: seen for path, seen in now.items() if before.get(path) == seen}
         before = now
         new = settled.items() - done.items() or done.keys() - now.keys()
-        # A folder without files may be a share that is not mounted now: tables stay as they are.
         growing = frozenset(now.keys() - settled.keys())
         # Half a manifest would give other machines, and half a history of maintenance other lives.
         is_half = any(path.name in NOT_LOGS for path in growing)
+        # A folder without files may be a share that is not mounted now: tables stay as they are.
         if settled and not is_half and (new or today != day):
             result: RunResult | LmshealthError
             try:

@@ -128,7 +128,7 @@ class ParameterSpec(_Part, frozen=True):
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
         """Candidate laws, at least one."""
-        if self._stated:
+        if self.law is not None:
             return self._stated
         # Of the prior above 0, as parameters are.
         below = self.prior.probability(np.zeros(()))
