@@ -244,7 +244,7 @@ def epochs_to_publish(history: History, stage: Stage, most: int) -> tuple[int, .
 def _thinned(n: int, most: int) -> list[int]:
     """Choose at most so many of n epochs, as `epochs_to_publish` does."""
     if most < 1:
-        raise BadQuestion(f"{most} epochs: health is inferred at the last log at least, needed 1")
+        raise BadQuestion(f"epochs = {most}: needed at least 1")
     number = np.arange(n)
     power = np.where(number > 0, number & -number, 2 * n + 1)
     power[-1:] = 4 * n + 1

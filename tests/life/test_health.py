@@ -215,7 +215,7 @@ def test_epochs_are_spread_and_end_with_the_last(stage: Stage) -> None:
     assert epochs_to_publish(history, stage, 100) == tuple(range(4, 50))
     assert epochs_to_publish(history, stage, 1) == (49,)
     for most in (0, -1):
-        with pytest.raises(BadQuestion, match="needed 1"):
+        with pytest.raises(BadQuestion, match="needed at least 1"):
             epochs_to_publish(history, stage, most)
 
 
