@@ -432,7 +432,7 @@ def _outputs(
 
     def fetch(part: Sequence[Machine]) -> Iterator[tuple[Machine, MachineOutput]]:
         for machine in part:
-            content = store.part(machine.name, own[machine.name])
+            content = store.get("pages", own[machine.name], machine.name)
             if (found := unpack_or_none(content, MachineOutput)) is not None:
                 yield machine, found
 
@@ -444,7 +444,7 @@ def _outputs(
     for [(machine, drawn)], is_new in cached(output_or_reason, machines, resources, **how):
         name = machine.name
         if is_new and isinstance(drawn, MachineOutput):
-            store.put("parts", {own[name]: pack(drawn)}, name)
+            store.put_only("pages", {own[name]: pack(drawn)}, name)
         if drawn is not None:
             yield name, drawn
 
@@ -476,10 +476,11 @@ def watch(
 ) -> Iterator[RunResult | LmshealthError]:
     """Yield the result of `run`, or its error, whenever it has something to do; never end.
 
-    Files whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
-    a later run. The folder is polled, because network shares report no changes. There is a run on
-    every new day (UTC) too: services fall due, and machines fall silent, without a new log. A run
-    that fails is repeated at the next poll, unless no log was usable.
+    Logs whose size or time differ from the poll before, ``interval`` seconds earlier, are left to
+    a later run; there is none while ``manifest.csv`` or ``maintenance.csv`` differ. The folder is
+    polled, because network shares report no changes. There is a run on every new day (UTC) too:
+    services fall due, and machines fall silent, without a new log. A run that fails is repeated at
+    the next poll, unless no log was usable.
     """
     before, done, day = _files(folder, out), _Files(), None
     while True:
@@ -488,9 +489,11 @@ def watch(
         settled = {path: seen for path, seen in now.items() if before.get(path) == seen}
         before = now
         new = settled.items() - done.items() or done.keys() - now.keys()
+        growing = frozenset(now.keys() - settled.keys())
+        # Half a manifest would give other machines, and half a history of maintenance other lives.
+        is_half = any(path.name in NOT_LOGS for path in growing)
         # A folder without files may be a share that is not mounted now: tables stay as they are.
-        if settled and (new or today != day):
-            growing = frozenset(now.keys() - settled.keys())
+        if settled and not is_half and (new or today != day):
             result: RunResult | LmshealthError
             try:
                 result = run(folder, stages, out, replace(settings, growing=growing))

@@ -289,8 +289,7 @@ class Store:
             for kind, content in zip(_ASSESSMENT, (made.content, made.evidence), strict=True):
                 self.put(kind, {key: content}, machine)
             if made.parts is not None:
-                self._keep("parts", machine, made.parts)
-                self.put("parts", made.parts, machine)
+                self.put_only("parts", made.parts, machine)
 
     def part(self, machine: str, key: str, *, after: str = "") -> bytes | None:
         """Fetch a part of the last assessment of a machine; None where it is not stored.
@@ -311,23 +310,29 @@ class Store:
     def publish(self, machine: str, keys: Sequence[str], summary: Summary, refused: str) -> None:
         """Make an assessment the present one of a machine, and delete its other assessments.
 
-        The keys are that of the assessment, and those of others of the machine that stay;
+        Of its summaries the two newest under other keys stay, the second for where the first is
+        damaged. The keys are that of the assessment, and those of others of the machine that stay;
         ``refused`` is that of the list of logs that were refused as a whole.
         """
         key = keys[0]
-        reports = self._decoded("reports", _Report, machine)
+        reports = self._reports(machine)
         number = 1 + max((one.number for one in reports), default=0)
+        before = [one.key for one in reports if one.key != key][-2:]
         with self.transaction():
             present = Published(machine, key, refused, tuple(keys))
             self.put("present", {"": pack(present)}, machine)
             self.put("reports", {key: pack(_Report(key, number, summary))}, machine)
+            self._keep("reports", machine, [key, *before])
             for kind in _ASSESSMENT:
                 self._keep(kind, machine, keys)
 
     def previous_summary(self, machine: str, key: str) -> Summary | None:
         """Fetch the summary of the newest published assessment under another key; None if none."""
-        reports = [one for one in self._decoded("reports", _Report, machine) if one.key != key]
-        return max(reports, key=lambda one: one.number).summary if reports else None
+        others = [one.summary for one in self._reports(machine) if one.key != key]
+        return others[-1] if others else None
+
+    def _reports(self, machine: str) -> list[_Report]:
+        return sorted(self._decoded("reports", _Report, machine), key=lambda one: one.number)
 
     def published(self) -> tuple[Published, ...]:
         """List the published assessments of all machines by name; `StoreError` if none is."""
@@ -410,6 +415,12 @@ class Store:
         with self.transaction() as connection:
             statement = insert.on_conflict_do_update(index_elements=keys, set_=rest)
             connection.execute(statement, rows)
+
+    def put_only(self, kind: str, values: Mapping[str, bytes], machine: str) -> None:
+        """Write values of a machine in place of all others of the kind that it has."""
+        with self.transaction():
+            self._keep(kind, machine, values)
+            self.put(kind, values, machine)
 
     def _keep(self, kind: str, machine: str, keys: Iterable[str]) -> None:
         """Delete the values of a machine under other keys."""

@@ -14,13 +14,13 @@ from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
 from lmshealth._private.result import Result
 from lmshealth._private.serialize import stream
 from lmshealth._private.tables import TABLES
-from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.errors import BadQuestion, BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.posterior.data import clock_and_steps, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.likelihood import default_scatter
 from lmshealth.stage.constants import INFORMED
-from lmshealth.stage.description import ANY_CHANGE, Stage
+from lmshealth.stage.description import Stage
 from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.read_tables import Drifts
@@ -243,6 +243,8 @@ def epochs_to_publish(history: History, stage: Stage, most: int) -> tuple[int, .
 
 def _thinned(n: int, most: int) -> list[int]:
     """Choose at most so many of n epochs, as `epochs_to_publish` does."""
+    if most < 1:
+        raise BadQuestion(f"epochs = {most}: needed at least 1")
     number = np.arange(n)
     power = np.where(number > 0, number & -number, 2 * n + 1)
     power[-1:] = 4 * n + 1
@@ -339,7 +341,7 @@ def infer_drifts(
     has_odometer = bool(np.isfinite(drifts.travel).all())
     if not has_odometer:
         # The state of a law follows from its travel, which is not known without an odometer.
-        stage = stage.with_laws({one.name: ANY_CHANGE for one in stage.parameters})
+        stage = stage.with_laws({one.name: None for one in stage.parameters})
         drifts = replace(drifts, travel=np.arange(1.0, 1 + len(drifts.recorded_at)))
     # Their covariances are those of a filter, which has allowed for scatter already.
     scatter = default_scatter()

@@ -27,8 +27,6 @@ from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
 _SHIPPED = Path(__file__).parent / "descriptions"
-ANY_CHANGE: tuple[AnyLaw, ...] = (Unchanging(), Free())
-"""Laws of a parameter whose description states none."""
 _ONE_SIGMA = (0.1587, 0.8413)  # levels of a normal distribution one standard deviation about
 Value = Annotated[float, within(*constants.VALUE)]
 Frequency = Annotated[float, within(*constants.FREQUENCY_HZ)]
@@ -111,7 +109,7 @@ class ParameterSpec(_Part, frozen=True):
     baseline: Value = 1.0
     unit: Name = ""
     limit: Annotated[Limit | None, Meta(examples=[{"below": 0.6}])] = None
-    law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] = ANY_CHANGE
+    law: AnyLaw | Annotated[tuple[AnyLaw, ...], Meta(min_length=1)] | None = None
     verdict: Name = ""
 
     def __post_init__(self) -> None:
@@ -121,7 +119,7 @@ class ParameterSpec(_Part, frozen=True):
                 f"{self.word!r} cannot name a parameter in verdict.csv, nor can anything with "
                 f"{reserved}: choose another name, or set verdict"
             )
-        if twice := repeated(law.kind for law in self.laws):
+        if twice := repeated(law.kind for law in self._stated):
             raise ValueError(f"{self.name}: two laws of the kind {twice[0]!r}")
         if self.limit is not None and self.limit.below >= self.baseline:
             wrong = f"limit {self.limit.below:g} must lie below the baseline {self.baseline:g}"
@@ -130,11 +128,18 @@ class ParameterSpec(_Part, frozen=True):
     @property
     def laws(self) -> tuple[AnyLaw, ...]:
         """Candidate laws, at least one."""
-        if self.law != ANY_CHANGE:
-            return self.law if isinstance(self.law, tuple) else (self.law,)
-        low, high = self.prior.quantile(np.array(_ONE_SIGMA)).tolist()
-        std = float(np.log(high / low) / 2) if low > 0 else Free().std
-        return Unchanging(), Free(std=std)
+        if self.law is not None:
+            return self._stated
+        # Of the prior above 0, as parameters are.
+        below = self.prior.probability(np.zeros(()))
+        low, high = self.prior.quantile(below + (1 - below) * np.array(_ONE_SIGMA)).tolist()
+        return Unchanging(), Free(std=float(np.log(high / low) / 2))
+
+    @property
+    def _stated(self) -> tuple[AnyLaw, ...]:
+        if self.law is None:
+            return ()
+        return self.law if isinstance(self.law, tuple) else (self.law,)
 
     @property
     def word(self) -> str:
@@ -263,6 +268,8 @@ class Description(_Part, frozen=True):
                 raise ValueError(f"[[{kind}]] names must be unique, twice: {twice[0]!r}")
         if self.parameter and self.map is None:
             raise ValueError("[[parameter]] needs a [map] of its effect on the modes")
+        if self.map is not None and not self.parameter:
+            raise ValueError("[map] needs a [[parameter]] of which it states the effect")
         if self.life.clock == "days" and self.usage.km_per_day is None:
             raise ValueError(
                 'clock = "days" takes the time for travel and needs [usage] km_per_day; with 1 '
@@ -353,8 +360,11 @@ class Stage:
         pattern = self.description.match.stage
         return metadata.stage is not None and fnmatchcase(metadata.stage, pattern)
 
-    def with_laws(self, laws: Mapping[str, tuple[AnyLaw, ...]]) -> Self:
-        """Return the stage with other laws of some parameters, by name; its digest stays."""
+    def with_laws(self, laws: Mapping[str, tuple[AnyLaw, ...] | None]) -> Self:
+        """Return the stage with other laws of some parameters, by name; its digest stays.
+
+        With None the parameter has those of a description that states none.
+        """
         parameters = tuple(
             structs.replace(one, law=laws.get(one.name, one.law)) for one in self.parameters
         )
@@ -444,7 +454,7 @@ def load_stage(reference: str | Path, *, follow_links: bool = False) -> Stage:
         raise BadStage(f"{path}: {error}") from error
     digest = hashlib.sha256(content)
     modal_map = None
-    if description.map is not None and description.parameter:
+    if description.map is not None:
         map_path = path.parent / description.map.file
         names = tuple(parameter.name for parameter in description.parameter)
         if not follow_links and escapes(map_path, path.parent):

@@ -275,6 +275,9 @@ def plan(
             f"power {power:g} at false-alarm probability {false_alarm:g}: needed 0 < false alarm "
             "< power < 1, for example 0.95 at 0.01"
         )
+    for duration in durations:
+        if not 0 < duration < np.inf:
+            raise BadQuestion(f"a log of {duration:g} s: needed a finite duration above 0")
     information = identifiability_of(stage)
     j = _index(stage, parameter, loss)
     _expect_identifiable(stage, information, j)

@@ -17,7 +17,7 @@ import numpy as np
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_text
-from lmshealth._private.toml import quoted
+from lmshealth._private.toml import decode, quoted
 from lmshealth.errors import BadLog, BadStage
 from lmshealth.io import constants
 from lmshealth.io.buffers import MINUTE, Samples, Spool, blocks, in_unit
@@ -29,7 +29,7 @@ from lmshealth.io.log import Log, parse_metadata
 from lmshealth.io.reading import content_digest
 from lmshealth.io.refusal import Unusable, listed, shown, visible
 from lmshealth.io.time_axis import time_axis
-from lmshealth.stage.description import ModeSpec
+from lmshealth.stage.description import Description, ModeSpec
 
 # Words in the names of columns, in the languages of exporters, and units of times in names.
 _TIME = re.compile(
@@ -451,7 +451,8 @@ def write_skeleton(
 
     ``stage`` is the machine of the log, ``source`` a note on the origin of the modes. Without an
     odometer in the logs the clock is the time. A file that exists is replaced. `BadStage` if there
-    is no mode, `BadTable` if it cannot be written.
+    is no mode, or the name of the file, which the description has too, is too long or has
+    characters that cannot be seen; `BadTable` if it cannot be written.
     """
     if not modes:
         raise BadStage(f"{path} is not written: a description needs at least one mode; none found")
@@ -461,4 +462,9 @@ def write_skeleton(
     template = Template(layout, trim_blocks=True, keep_trailing_newline=True)
     machines = glob.escape(stage) if stage else "*"
     given = {"name": path.stem, "source": source, "stage": machines, "odometer": odometer}
-    write_text(path, template.render(given, modes=modes, quoted=quoted))
+    text = template.render(given, modes=modes, quoted=quoted)
+    try:
+        decode(text.encode(), Description)
+    except ValueError as error:
+        raise BadStage(f"{path} is not written, as it could not be read: {error}") from error
+    write_text(path, text)

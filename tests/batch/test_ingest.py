@@ -4,13 +4,17 @@ from collections.abc import Iterable, Iterator
 from contextlib import closing
 from hashlib import sha256
 from pathlib import Path
+from threading import Thread
+from time import process_time
 
 import numpy as np
+import pytest
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _copy_of, _identified, _Outcome, _Task, identify_log
+from lmshealth.batch.ingest import _copy_of, _identified, _Outcome, _Task, _within, identify_log
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
+from lmshealth.errors import BadLog
 from lmshealth.io.log import Refusal
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import load_stage
@@ -84,6 +88,24 @@ def test_a_log_is_refused_at_the_end_of_its_time(tmp_path: Path) -> None:
     assert "--seconds-per-log" in refusal.detail
     assert not short.lasting
     assert isinstance(identify_log(task, (stage,), {}, 60.0).outcome, LogEstimates)
+
+
+def test_the_time_of_a_log_is_its_own() -> None:
+    """What another thread of the same worker identifies meanwhile does not count."""
+
+    def work_for_a_while() -> None:
+        end = process_time() + 0.3
+        while process_time() < end:
+            pass
+
+    check = _within(0.2, "log.csv")
+    other = Thread(target=work_for_a_while)
+    other.start()
+    other.join()
+    check("fit", 1, 2)
+    work_for_a_while()
+    with pytest.raises(BadLog, match="too-slow"):
+        check("fit", 2, 2)
 
 
 def test_a_copy_that_its_row_contradicts_names_the_contradiction() -> None:

@@ -341,6 +341,11 @@ def test_the_page_of_an_unchanged_machine_is_not_drawn_again(
     (logs / "log-01.h5").unlink()
     run(logs, [modes_only], out)
     assert drawn == ["test-A.html"] * 2
+    run(logs, [modes_only], out, Settings(language="de"))
+    assert drawn == ["test-A.html"] * 3
+    with closing(sqlite3.connect(out / "lmshealth.sqlite")) as file:  # one page, in the end
+        count = f"SELECT count(*) FROM values_{constants.SCHEMA} WHERE kind = 'pages'"
+        assert file.execute(count).fetchall() == [(1,)]
 
 
 @pytest.mark.slow

@@ -349,6 +349,7 @@ def fill(store: Store, folder: Path) -> dict[str, Callable[[], bool]]:
     store.put("hashed", {"k": b"0" * 64})
     keep(store, "A", "k1", assessment)
     store.put("parts", {"p": b"part"}, "A")
+    store.put("pages", {"p": b"page"}, "A")
     store.put("announced", {"": pack(Announced(status, "/logs", (), 1))}, status.stage)
     unsent = Unsent(change, "--notify", 1)
     store.put("unsent", {unsent.key: pack(unsent)}, "A")
@@ -358,6 +359,7 @@ def fill(store: Store, folder: Path) -> dict[str, Callable[[], bool]]:
         "identified": lambda: got_from(store, "k", "a.h5") is not None,
         "assessed": lambda: store.has_assessment("A", "k1"),
         "parts": lambda: store.part("A", "p") is not None,
+        "pages": lambda: store.get("pages", "p", "A") is not None,
         "reports": lambda: store.previous_summary("A", "k2") is not None,
         "refused": lambda: bool(store.refused([key])),
         "announced": lambda: bool(store.announced()),
@@ -534,6 +536,14 @@ def test_the_earlier_report_is_the_newest_of_another_key(url: str, tmp_path: Pat
         assert [publish(key) for key in ("k1", "k1", "k2", "k2", "k1", "k3")] == [
             *(None, None, "healthy", "healthy", "preload", "healthy")
         ]
+        # As many as are of use, however often something is published.
+        assert [publish(key) for key in ("k2", "k1", "k2", "k3")] == [
+            *("mount", "preload", "healthy", "preload")
+        ]
+        words |= {f"k{n}": "both" for n in range(4, 9)}
+        assert {publish(key) for key in list(words)[3:]} == {"mount", "both"}
+        keys = _ask(store, f"SELECT key FROM {VALUES} WHERE kind = 'reports' ORDER BY key")
+        assert [key for (key,) in keys] == ["k6", "k7", "k8"]
         assert store.previous_summary("B", "k1") is None
 
 

@@ -92,6 +92,20 @@ def test_a_log_is_analysed_when_it_is_the_same_at_two_polls(
     assert runs([nothing, two.unlink, nothing]) == [(1, set()), (2, set())]
 
 
+@pytest.mark.parametrize("name", ["manifest.csv", "maintenance.csv"])
+def test_what_is_known_of_logs_is_not_read_while_it_is_written(
+    runs: Callable[[Sequence[Poll]], Seen], tmp_path: Path, name: str
+) -> None:
+    """Half of it would give other machines and lives; the run waits until it has ended."""
+    log, table = tmp_path / "logs" / "one.csv", tmp_path / "logs" / name
+    log.write_text("x")
+
+    def grow() -> None:
+        table.write_text(table.read_text() + "x" if table.exists() else "x")
+
+    assert runs([grow, grow, nothing, nothing, grow, nothing]) == [(3, set()), (6, set())]
+
+
 def test_output_and_hidden_files_are_no_reason_to_run(
     runs: Callable[[Sequence[Poll]], Seen], tmp_path: Path
 ) -> None:

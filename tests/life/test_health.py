@@ -13,7 +13,7 @@ from arviz_stats.base.array import array_stats
 from scipy import stats
 
 from lmshealth._private.arrays import FloatArray
-from lmshealth.errors import BadStage, NotEnoughData
+from lmshealth.errors import BadQuestion, BadStage, NotEnoughData
 from lmshealth.life import constants
 from lmshealth.life.health import Health, epochs_to_publish, health_of, infer, infer_drifts
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
@@ -214,6 +214,9 @@ def test_epochs_are_spread_and_end_with_the_last(stage: Stage) -> None:
     assert found[-1] == 49
     assert epochs_to_publish(history, stage, 100) == tuple(range(4, 50))
     assert epochs_to_publish(history, stage, 1) == (49,)
+    for most in (0, -1):
+        with pytest.raises(BadQuestion, match="needed at least 1"):
+            epochs_to_publish(history, stage, most)
 
 
 def test_epochs_are_nested_as_logs_are_added(stage: Stage) -> None:

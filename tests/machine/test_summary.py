@@ -64,7 +64,7 @@ def test_an_alarm_replaces_a_missing_verdict(make: Maker) -> None:
 def test_a_description_without_parameters_has_no_verdict(make: Maker) -> None:
     """Without a health parameter the headline does not ask for more data."""
     assessment = make()
-    description = structs.replace(assessment.stage.description, parameter=())
+    description = structs.replace(assessment.stage.description, parameter=(), map=None)
     stage = replace(assessment.stage, description=description)
     judgement = replace(assessment.judgement, verdict="no-alarm")
     found = summary(replace(assessment, stage=stage, health=None, judgement=judgement))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import re
 import tomllib
 from collections.abc import Iterable, Iterator
@@ -22,7 +23,7 @@ from lmshealth.errors import BadQuestion, BadStage, OutsideMap
 from lmshealth.io.log import Metadata
 from lmshealth.report.tables import stage_rows
 from lmshealth.stage.check import check_stage, diagnose
-from lmshealth.stage.degradation_laws import Unchanging
+from lmshealth.stage.degradation_laws import Free, Unchanging
 from lmshealth.stage.description import Stage, load_stage, shipped
 from lmshealth.stage.identifiability import plan
 from lmshealth.stage.modal_map import read_map
@@ -247,6 +248,12 @@ def test_a_stage_without_parameters_needs_no_map(tmp_path: Path) -> None:
         stage.drift(np.zeros((1, 1)), ("roll",))
 
 
+def test_a_map_of_no_parameter_is_refused(tmp_path: Path) -> None:
+    """Nothing would use it, nor notice that its file is missing."""
+    with pytest.raises(BadStage, match=r"\[map\] needs a \[\[parameter\]\]"):
+        load(tmp_path, stage_text(()) + '[map]\nfile = "gone.csv"\nmodel_std = 0.9\n')
+
+
 def test_modes_that_are_not_tracked_do_not_inform(tmp_path: Path) -> None:
     """Health is inferred from tracked modes on the map."""
     text = stage_text(n_modes=3).replace(
@@ -325,6 +332,31 @@ def test_a_parameter_has_one_law_or_several(tmp_path: Path) -> None:
     assert [law.weight for law in preload] == [1.0, 2.5, 1.0]
     assert preload[0] == make_stage(tmp_path / "alone").parameters[0].law
     assert [law.kind for law in mount] == ["loosening"]
+
+
+def test_laws_that_are_those_of_no_statement_stay_as_stated(tmp_path: Path) -> None:
+    """A change without a law has the stated standard deviation; of workers' copies too."""
+    stage = make_stage(tmp_path, (with_laws('{ kind = "none" }', '{ kind = "free" }'), MOUNT))
+    for one in (stage, pickle.loads(pickle.dumps(stage))):
+        assert one.parameters[0].laws == (Unchanging(), Free())
+
+
+def test_a_wider_prior_allows_a_larger_change(tmp_path: Path) -> None:
+    """Where no law is stated; a part of the prior below 0 makes no step."""
+
+    def std(prior: str) -> float:
+        text = re.sub("prior = .*", f"prior = {{ {prior} }}", PRELOAD[: PRELOAD.index("law = ")])
+        stage = make_stage(tmp_path, (text, MOUNT))
+        none, free = stage.parameters[0].laws
+        assert none == Unchanging() and isinstance(free, Free)
+        assert pickle.loads(pickle.dumps(stage)).parameters[0].laws == (none, free)
+        return free.std
+
+    found = [std(f'kind = "normal", mean = 1.0, std = {s}') for s in (0.3, 0.99, 1.01, 2.0, 10.0)]
+    assert found == sorted(found)
+    assert found[2] == pytest.approx(found[1], rel=0.02)
+    assert std('kind = "lognormal", median = 1.0, sigma = 0.3') == pytest.approx(0.3, rel=1e-3)
+    assert 0.5 < std('kind = "uniform", low = -1.0, high = 1.5') < 1
 
 
 @pytest.mark.parametrize(

@@ -183,6 +183,9 @@ def test_questions_without_an_answer_are_refused(one: Stage, tmp_path: Path) -> 
         plan(one, "guide_preload", 0.9)
     with pytest.raises(BadQuestion, match="false alarm < power"):
         plan(one, "guide_preload", 0.05, power=0.01, false_alarm=0.05)
+    for duration in (np.nan, np.inf, 0.0, -1.0):
+        with pytest.raises(BadQuestion, match="finite duration"):
+            plan(one, "guide_preload", 0.05, durations=(10.0, duration))
     bare = load_stage(str(write_archive_stage(tmp_path, health=False)))
     with pytest.raises(BadStage, match=r"no \[map\]"):
         plan(bare, "guide_preload", 0.05)

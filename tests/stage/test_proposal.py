@@ -12,7 +12,7 @@ import pytest
 import scipy.io
 
 from lmshealth._private.toml import decode
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.reading import read_log
 from lmshealth.stage.description import ModeSpec, load_stage
@@ -152,6 +152,15 @@ def test_any_name_is_quoted(tmp_path: Path) -> None:
     assert (stage.name, stage.modes) == ("my stage", (mode,))
     assert stage.description.source == 'in C:\\logs\\"a".csv\n\x7f'
     assert stage.description.match.stage == 'M[[]1][*]"'
+
+
+@pytest.mark.parametrize("stem", ["a" * 201, "tab\t"])
+def test_a_name_that_no_description_has_is_refused(tmp_path: Path, stem: str) -> None:
+    """Before a file is written that cannot be read."""
+    path = tmp_path / f"{stem}.toml"
+    with pytest.raises(BadStage, match=r"not written.*name: "):
+        write_skeleton(path, "", "A", [(ModeSpec("mode_1", 62.0, 0.02), "")])
+    assert not path.exists()
 
 
 START = 1_767_600_000.0  # 2026-01-05 08:00 UTC
