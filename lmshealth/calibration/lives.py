@@ -87,7 +87,7 @@ def _median_life(stage: Stage) -> float:
         ends = []
         for law, weight in laws:
             share = weight / sum(own for _, own in laws)
-            ends.append(lives_by_law(law, limit, rng, int(np.ceil(share * n)), KM))
+            ends.append(lives_by_law(law, limit, rng, int(np.ceil(share * n))))
         if ends:
             medians.append(float(np.median(np.concatenate(ends))))
     return min(medians)
@@ -118,7 +118,7 @@ class Part:
         if left > 0 and self.changes:
             if np.isfinite(left):
                 left *= rng.lognormal(0.0, rate_std(law) * np.sqrt(np.log2(1 + left / now)))
-            proven = now + early_life(law, limit, rng, now)
+            proven = now + early_life(law, limit, rng)
             hazard = rng.gamma(of_life.UNSEEN_ONSETS) / proven
             onset = rng.exponential() / hazard if hazard > 0 else np.inf
             growth = of_life.UNSEEN_GROWTH

@@ -16,7 +16,7 @@ from lmshealth.life import constants
 from lmshealth.life.posterior.data import KM, SECONDS_PER_DAY, with_clock
 from lmshealth.life.posterior.fit import LifePosterior, LoneMode, fit_life
 from lmshealth.life.posterior.scenarios import DegradationPath
-from lmshealth.stage.degradation_laws import Accelerating, AnyLaw, Law
+from lmshealth.stage.degradation_laws import Accelerating, AnyLaw, Free, Law
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.stage.identifiability import identifiability_of
 from lmshealth.tracking.history import History
@@ -255,7 +255,7 @@ def passages(
             by_law = path.health(theta[j], np.array([now]))[:, 0]
             half = path.passage(theta[j], np.sqrt(by_law * limit * np.exp(-off[:, j]))) - now
             if path.law.names:
-                proven = now + early_life(path.law, limit, rng, now)
+                proven = now + early_life(path.law, limit, rng)
                 left, half = _beyond_laws(rng, path.law, left, half, now=now, proven=proven)
             columns.append(left)
             halves.append(half)
@@ -280,21 +280,23 @@ def reach_of(law: Law, now: float, horizon: float) -> float:
     return horizon * float(np.exp(_REACH * spread))
 
 
-def early_life(law: AnyLaw, limit: float, rng: np.random.Generator, now: float) -> float:
-    """Return the travel in m before which few machines of the description reach a limit."""
-    lives = lives_by_law(law, limit, rng, _N_LIVES, now)
+def early_life(law: AnyLaw, limit: float, rng: np.random.Generator) -> float:
+    """Return the travel in m before which few machines of the description reach a limit.
+
+    It is 0 of a change without a law, whose prior states the change up to now, whenever now is: it
+    says nothing of how long machines last.
+    """
+    if isinstance(law, Free):
+        return 0.0
+    lives = lives_by_law(law, limit, rng, _N_LIVES)
     return float(np.quantile(lives, constants.EARLY_LIFE, method="inverted_cdf"))
 
 
-def lives_by_law(
-    law: AnyLaw, limit: float, rng: np.random.Generator, n: int, now: float
-) -> FloatArray:
-    """Draw the travel in m to a limit by the prior of a law, ``(n,)``.
-
-    The prior of a change without a law is that up to `now`, the travel in m of the last log.
-    """
+def lives_by_law(law: AnyLaw, limit: float, rng: np.random.Generator, n: int) -> FloatArray:
+    """Draw the travel in m to a limit by the prior of a law, ``(n,)``."""
     path = DegradationPath(law, 0.0, ())
-    return path.passage(path.natural(path.draw(rng, n, now), now), limit)
+    # A travel now is needed for the coordinates alone.
+    return path.passage(path.natural(path.draw(rng, n, KM), KM), limit)
 
 
 def _beyond_laws(

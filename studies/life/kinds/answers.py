@@ -7,6 +7,7 @@ names: an earlier revision as well as this one. It therefore imports nothing of 
 from __future__ import annotations
 
 import json
+import re
 import sys
 import tempfile
 import time
@@ -31,21 +32,21 @@ Answer = dict[str, Any]
 PUBLISHED, IMPORTANCE = "as published", "by importance sampling"
 WITHOUT_CHAINS, HEALTH_ALONE = "life without chains", "health alone"
 _LEVELS = (np.arange(101) + 0.5) / 101  # of the quantiles that stand for draws
-_SHIPPED = "lms-y.map.csv"
+_SHIPPED, _COMMON = "lms-y.map.csv", re.compile(r"^common_std.*\n", re.MULTILINE)
 _NEVER_KM = 1e6  # for a limit that is never reached
 _KM = 1000.0
 
 
 @cache
 def stage_of(map_table: str) -> Any:
-    """Load the shipped description, its laws and priors, with another modal map."""
+    """Load the shipped description with another map, whose modes have no errors in common."""
     shipped = resources.files("lmshealth") / "stage" / "descriptions" / "lms-y.toml"
     with tempfile.TemporaryDirectory() as folder:
         (Path(folder) / "plant.map.csv").write_text(map_table)
         path = Path(folder) / "plant.toml"
         text = shipped.read_text(encoding="utf-8")
         assert _SHIPPED in text
-        path.write_text(text.replace(_SHIPPED, "plant.map.csv"))
+        path.write_text(_COMMON.sub("", text.replace(_SHIPPED, "plant.map.csv")))
         return lmshealth.load_stage(str(path))
 
 

@@ -2,14 +2,15 @@
 
 Method
     `plant.py` has a rigid body on Hertzian contacts in series with a joint, of which a modal map is
-    tabulated; the description is otherwise the shipped one of lms-y. Relative errors of 5 % ("as
-    declared") of the effect of each parameter on each mode are drawn for each life, in two rows
-    10 %. A life has 30 logs up to 50, 70 or 90 % of its length (lognormal, 1,500 to 6,000 km), ln f
-    with standard deviations of 2 to 6e-4 (in two rows 1 to 1.6e-3), seasons, and a random walk of
-    3e-4. `worlds.py` draws what becomes of it: courses of the preload that the description has
-    (hertz) and has not, a mount that loosens, both, a mount that settles stiffer while the preload
-    wears ("opposite"), one mode that moves by another cause, steps, and machines that stay as they
-    are. `lmshealth.assess` answers, with the chains that it publishes.
+    tabulated; the description is otherwise the shipped one of lms-y, without errors common to all
+    modes. Relative errors of 5 % ("as declared") of the effect of each parameter on each mode are
+    drawn for each life, in two rows 10 %. A life has 30 logs up to 50, 70 or 90 % of its length
+    (lognormal, 1,500 to 6,000 km), ln f with standard deviations of 2 to 6e-4 (in two rows 1 to
+    1.6e-3), seasons, and a random walk of 3e-4. `worlds.py` draws what becomes of it: courses of
+    the preload that the description has (hertz) and has not, a mount that loosens, both, a mount
+    that settles stiffer while the preload wears ("opposite"), one mode that moves by another cause,
+    steps, and machines that stay as they are. `lmshealth.assess` answers, with the chains that it
+    publishes.
     Each kind is judged by itself: a share over lives that wear and lives that do not hides both.
     Places of the truth among draws, ties at random, give the shares of 90 and 50 % intervals that
     hold; widths are compared with those of a posterior that knows the shape of every course, all
