@@ -363,9 +363,8 @@ def _path(stage: Stage, clock: FloatArray, parts: Sequence[Part]) -> FloatArray:
 def map_errors(rng: np.random.Generator, stage: Stage, n_modes: int) -> FloatArray:
     """Draw the relative errors of a map, as declared or larger, ``(n_parameters, n_modes)``."""
     scales, weights = zip(*of_stage.MAP_ERRORS, strict=True)
-    own, common = stage.map_root(n_modes)
     unit = rng.standard_normal((len(stage.parameters), n_modes))
-    error = own * unit + common * unit.sum(axis=1, keepdims=True)
+    error = unit @ np.linalg.cholesky(stage.map_cov(n_modes)).T
     return np.asarray(rng.choice(scales, p=weights) * error)
 
 

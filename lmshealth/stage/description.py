@@ -27,6 +27,7 @@ from lmshealth.stage.modal_map import ModalMap, read_map
 from lmshealth.stage.priors import JointPrior, Prior
 
 _SHIPPED = Path(__file__).parent / "descriptions"
+_LEAST_MAP_ERROR = 1e-4  # far below what any estimate of a drift shows
 _ONE_SIGMA = (0.1587, 0.8413)  # levels of a normal distribution one standard deviation about
 Value = Annotated[float, within(*constants.VALUE)]
 Frequency = Annotated[float, within(*constants.FREQUENCY_HZ)]
@@ -343,15 +344,15 @@ class Stage:
         priors = tuple(parameter.prior for parameter in self.parameters)
         return JointPrior(names, priors, self.modal_map.low, self.modal_map.high)
 
-    def map_root(self, n_modes: int) -> tuple[float, float]:
-        """Return a and b of the root a I + b 1 1ᵀ of the covariance of the map's declared errors.
+    def map_cov(self, n_modes: int) -> FloatArray:
+        """Return the covariance of the map's declared errors, shape ``(n_modes, n_modes)``.
 
-        That covariance is model_std² I + common_std² 1 1ᵀ, of the relative errors of the
-        sensitivities of some modes to one parameter.
+        It is model_std² I + common_std² 1 1ᵀ, of the relative errors of the sensitivities of some
+        modes to one parameter; a map that is declared as exact is so to 1e-4.
         """
         assert self.description.map is not None  # whoever asks has a map
         own, common = self.description.map.model_std, self.description.map.common_std
-        return own, (float(np.hypot(own, np.sqrt(n_modes) * common)) - own) / n_modes
+        return np.asarray(max(own, _LEAST_MAP_ERROR) ** 2 * np.eye(n_modes) + common**2)
 
     def matches(self, metadata: Metadata) -> bool:
         """Return whether the description applies to a log."""

@@ -10,6 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import stats
+from threadpoolctl import threadpool_limits
 
 import lmshealth
 from lmshealth.calibration import check as checks
@@ -96,7 +97,7 @@ def test_quantiles_surround_the_truth_as_places_do(checked: CalibrationCheck) ->
 def test_results_repeat_and_depend_on_the_seed(small: Stage, checked: CalibrationCheck) -> None:
     """The same life has the same outcome alone; another seed draws another life."""
     first = checked.outcomes[0]
-    with four_settings():
+    with four_settings(), threadpool_limits(1):  # as in the processes of a check
         again = outcome_of(small, SCHEDULE, 2, (None, first.number))
         other = outcome_of(small, SCHEDULE, 3, (None, first.number))
     assert again == first != other

@@ -12,7 +12,7 @@ from itertools import product
 from typing import Self
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import block_diag, qr, solve_triangular
 from scipy.special import softmax
 
 from lmshealth._private.arrays import BoolArray, FloatArray, ReadOnly, Rows
@@ -34,7 +34,9 @@ _N_EXAMPLES, _RESIDUAL = 300, 1e-4
 _NEAR = 0.003
 _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed at a time
 _ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
-_CACHED = 2_000_000  # whitened drifts that are computed at a time
+# Whitened drifts that are computed at a time: larger arrays are returned to the system and fetched
+# anew by each operation, which takes as long as the operation.
+_CACHED = 1_000_000
 
 # Draws of steps given laws: iterations, step of the slopes in ln health, points of the grid, and
 # width in standard deviations.
@@ -280,19 +282,19 @@ class LifeLikelihood:
 
     def _quadratic(self, grid: Grid, x: FloatArray) -> tuple[FloatArray, FloatArray]:
         rows = self._residuals(grid, x)
-        # [V Vᵀ, V r; (V r)ᵀ, rᵀr] of declared map errors, ``(n_rows, n_rows, 1, n_points, n)``.
         gram = np.moveaxis(rows @ np.swapaxes(rows, 2, 3), (2, 3), (0, 1))[:, :, None]
-        scale = np.array([scale for scale, _ in of_stage.MAP_ERRORS])[:, None, None]
-        scaled = np.multiply(gram, scale**2, order="C")  # lives last, for `_pivots`
-        scaled[-1] = scaled[:, -1] = gram[-1] * scale
-        scaled[-1, -1] = gram[-1, -1]
-        for own in range(len(scaled)):
-            scaled[own, own] += 1.0
+        scales = np.array([scale for scale, _ in of_stage.MAP_ERRORS])
+        precision, log_det = _errors_of_map(self.data)
+        # [C⁻¹ + V Vᵀ, V r; (V r)ᵀ, rᵀr + 1] of each scale of C, lives last for `_pivots`.
+        prior = np.zeros((*gram.shape[:2], scales.size, 1, 1))
+        prior[:-1, :-1, :, 0, 0] = precision[:, :, None] / scales**2
+        prior[-1, -1] = 1.0
         # One decomposition has both: its last pivot is χ² plus 1.
-        pivots = _pivots(scaled)
+        pivots = _pivots(np.add(gram, prior, order="C"))
         if (pivots <= 0).any():
             raise np.linalg.LinAlgError("the covariance of the errors of a map is not positive")
-        return grid.rest[:, None] + pivots[-1] - 1, np.log(pivots[:-1]).sum(axis=0)
+        log_det += 2 * len(precision) * np.log(scales)[:, None, None]
+        return grid.rest[:, None] + pivots[-1] - 1, log_det + np.log(pivots[:-1]).sum(axis=0)
 
     def steps_given_laws(
         self, grid: Grid, scenario: Scenario, y: FloatArray, rng: np.random.Generator
@@ -314,6 +316,7 @@ class LifeLikelihood:
         moved = _SLOPE_STEP * np.concatenate([np.zeros_like(moves[:1]), moves])
         assert stage.modal_map is not None  # LifeData.select() has checked
         low, high = stage.modal_map.low, stage.modal_map.high - _SLOPE_STEP
+        prior = block_diag(np.eye(k) / constants.STEP_PRIOR.std**2, _errors_of_map(self.data)[0])
         points = np.linspace(0, grid.walk.size - 1, _START_POINTS).astype(int)
         for point, own in zip(points, np.array_split(np.arange(len(y)), points.size), strict=True):
             size = np.zeros((own.size, k))
@@ -325,10 +328,9 @@ class LifeLikelihood:
                 r, errors = rows[:, 0, -1], rows[:, 0, :-1]
                 slopes = (rows[:, 1:, -1] - r[:, None]) / _SLOPE_STEP
                 a = np.concatenate([slopes, errors], axis=1)
-                prior = np.repeat([constants.STEP_PRIOR.std**-2, 1.0], [k, errors.shape[1]])
-                cov = np.linalg.inv(a @ np.swapaxes(a, 1, 2) + np.diag(prior))
+                cov = np.linalg.inv(a @ np.swapaxes(a, 1, 2) + prior)
                 gradient = a @ r[:, :, None]
-                gradient[:, :k, 0] += prior[0] * size
+                gradient[:, :k, 0] += prior[0, 0] * size
                 size = size - (cov @ gradient)[:, :k, 0]
             unit = rng.standard_normal((*size.shape, 1))
             size += _START_WIDTH * (np.linalg.cholesky(cov[:, :k, :k]) @ unit)[..., 0]
@@ -354,12 +356,12 @@ class LifeLikelihood:
         b = a.T @ q
         of_group = a.T.reshape(cross.shape)
         known = of_group @ np.swapaxes(of_group, 1, 2)
-        parts = []
+        precision, parts = _errors_of_map(self.data)[0], []
         # A few lives at a time, for the memory.
         for one in np.array_split(x, x.shape[0] * b.size // _CACHED + 1):
             rows = self._residuals(point, one)[0]
-            r, v = rows[:, -1], map_scale * rows[:, :-1]
-            m = np.eye(v.shape[1]) + v @ np.swapaxes(v, 1, 2)
+            r, v = rows[:, -1], rows[:, :-1]
+            m = precision / map_scale**2 + v @ np.swapaxes(v, 1, 2)
             explained = np.linalg.solve(m, v @ r[:, :, None])
             fitted = point.target[0] - r + (np.swapaxes(v, 1, 2) @ explained)[:, :, 0]
             # B Vᵀ M⁻¹ V Bᵀ by a root of M: of the columns of each group alone.
@@ -401,9 +403,9 @@ class LifeLikelihood:
         return mean[:, 0, 0], np.maximum(variance - known[:, 0, 0, 0], 0.0)
 
     def _residuals(self, grid: Grid, x: FloatArray) -> FloatArray:
-        """Return the rows V of the declared map errors, and last the whitened residuals r.
+        """Return the rows V of relative errors of the map, and last the whitened residuals r.
 
-        Shape ``(n_points, n, n_errors + 1, n_rows)``, with an error per parameter and mode.
+        Shape ``(n_points, n, n_errors + 1, n_rows)``, with an error per mode and parameter.
         """
         drift = np.moveaxis(drifts(self.data, x), 1, 2)
         n_modes, n, n_paths, n_nodes = drift.shape
@@ -416,12 +418,6 @@ class LifeLikelihood:
             white = white.reshape(n_points, n, n_paths, -1)
             rows[:, :, k * p : (k + 1) * p, filled] = white[:, :, 1:]
             rows[:, :, -1, filled] -= white[:, :, 0]
-        own, common = self.data.stage.map_root(n_modes)
-        errors = rows[:, :, :-1]
-        shared = common * errors.reshape(n_points, n, n_modes, p, n_rows).sum(axis=2)
-        errors *= own
-        for k in range(n_modes if common else 0):
-            errors[:, :, k * p : (k + 1) * p] += shared
         return rows
 
 
@@ -448,6 +444,15 @@ def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     n, n_moments, n_parameters = x.shape
     drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
     return np.moveaxis(drift.reshape(1 + n_parameters, n, n_moments, len(data.modes)), 3, 0)
+
+
+def _errors_of_map(data: LifeData) -> tuple[FloatArray, float]:
+    """Return C⁻¹, ``(n_errors, n_errors)``, and ln |C| of the declared errors of the map.
+
+    Of each mode, and within it of each parameter.
+    """
+    cov, p = data.stage.map_cov(len(data.modes)), len(data.stage.parameters)
+    return np.kron(np.linalg.inv(cov), np.eye(p)), p * float(np.linalg.slogdet(cov)[1])
 
 
 def _pivots(matrices: FloatArray) -> FloatArray:
