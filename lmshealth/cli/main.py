@@ -7,6 +7,10 @@ import os
 # Matrices are small: threads of the linear algebra library only slow down the worker processes.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# In worker processes arrays of megabytes follow one another: glibc would return their memory to the
+# system each time, and wait for it to be cleared again.
+os.environ.setdefault("MALLOC_TRIM_THRESHOLD_", str(1 << 28))
+os.environ.setdefault("MALLOC_MMAP_THRESHOLD_", str(1 << 26))
 
 import signal
 import threading

@@ -291,9 +291,9 @@ def fit_life(
     guide_preload: 71%
     mount_stiffness: 89%
     """
-    likelihood = LifeLikelihood.of(history, stage, min_logs)
     # Arrays are small: threads inside linear algebra would only wait for one another.
     with threadpool_limits(1, user_api="blas"):
+        likelihood = LifeLikelihood.of(history, stage, min_logs)
         # Updates one after the other must not repeat their random numbers.
         steps = () if before is None else (len(history.logs),)
         *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)

@@ -36,7 +36,7 @@ _AT_A_TIME = 20_000  # moments of lives of the prior whose drifts are computed a
 _ROUNDING = 1e-14  # share of the largest eigenvalue below which one is rounding
 # Whitened drifts that are computed at a time: larger arrays are returned to the system and fetched
 # anew by each operation, which takes as long as the operation.
-_CACHED = 1_000_000
+_CACHED = 500_000
 
 # Draws of steps given laws: iterations, step of the slopes in ln health, points of the grid, and
 # width in standard deviations.
@@ -407,18 +407,19 @@ class LifeLikelihood:
 
         Shape ``(n_points, n, n_errors + 1, n_rows)``, with an error per mode and parameter.
         """
-        drift = np.moveaxis(drifts(self.data, x), 1, 2)
-        n_modes, n, n_paths, n_nodes = drift.shape
+        drift = drifts(self.data, x)
+        n_modes, n_paths, n, n_nodes = drift.shape
         (n_points, n_rows), p = grid.target.shape, n_paths - 1
-        rows = np.zeros((n_points, n, n_modes * p + 1, n_rows))
-        rows[:, :, -1] = grid.target[:, None]
+        rows = np.zeros((n_points, n_modes * p + 1, n, n_rows))
         for k in range(n_modes):
             filled = slice((k + 1) * n_nodes)  # R is upper triangular
-            white = drift[k].reshape(-1, n_nodes) @ grid.design[:, k, :, filled]
-            white = white.reshape(n_points, n, n_paths, -1)
-            rows[:, :, k * p : (k + 1) * p, filled] = white[:, :, 1:]
-            rows[:, :, -1, filled] -= white[:, :, 0]
-        return rows
+            of_mode = rows[:, k * p : (k + 1) * p].reshape(n_points, -1, n_rows)[..., filled]
+            alone = drift[k, 1:].reshape(-1, n_nodes)
+            np.matmul(alone, grid.design[:, k, :, filled], out=of_mode)
+        together = np.moveaxis(drift[:, 0], 0, 1).reshape(n, -1)
+        white = together @ grid.design.reshape(n_points, -1, n_rows)
+        np.subtract(grid.target[:, None], white, out=rows[:, -1])
+        return rows.swapaxes(1, 2)
 
 
 def ln_health(
