@@ -113,10 +113,9 @@ def _wear(stage: Stage) -> dict[str, FloatArray]:
     """Return the shifts of ln f of each mode on the map, over states that searches hold."""
     if stage.modal_map is None or not (names := stage.informative):
         return {}
-    from scipy.stats import qmc  # late: reading a result needs none of it
-
     low, high = stage.modal_map.low, stage.modal_map.high
-    points = low + (high - low) * qmc.Halton(low.size, scramble=False).random(constants.WEAR_STATES)
+    unit = np.random.default_rng(0).random((constants.WEAR_STATES, low.size))
+    points = low + (high - low) * unit
     search = {mode.name: mode.search for mode in stage.modes}
     drift = stage.drift(points, names)
     held = (np.abs(drift) <= np.log1p([search[name] for name in names])).all(axis=1)

@@ -180,13 +180,14 @@ def loop_error(log: Log) -> float | None:
 
 def _mean_square(values: FloatArray, sample_rate: float) -> float:
     """Return the mean square of a segment in the band of the loop."""
-    from scipy.signal import detrend, periodogram  # late: it imports scipy.stats, half a second
-
+    x = np.linspace(-1.0, 1.0, values.size)
+    residual = values - np.polynomial.Polynomial.fit(x, values, 1)(x)
     # The window prevents leakage of drift below the band and of lines above it.
-    frequency, density = periodogram(values, sample_rate, "hann", detrend=detrend)
+    window = np.hanning(values.size + 1)[:-1]
+    power = 2 * np.abs(np.fft.rfft(residual * window)) ** 2 / np.sum(window**2)
+    frequency = np.fft.rfftfreq(values.size, 1 / sample_rate)
     low, high = constants.LOOP_BAND
-    inside = (frequency >= low) & (frequency <= high)
-    return float(np.sum(density[inside]) * sample_rate / values.size)
+    return float(np.sum(power[(frequency >= low) & (frequency <= high)]) / values.size)
 
 
 def _statistics(channel: Channel, segments: Sequence[Segment]) -> tuple[float, float, float, float]:

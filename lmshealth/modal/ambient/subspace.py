@@ -15,6 +15,8 @@ from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
 
 # Orders of the subspace model, and most block rows of its Hankel matrix.
 _ORDERS, _MOST_ROWS = range(2, 31), 60
+# Ordinates whose correlations are summed at a time.
+_BLOCK = 4096
 # The band is widened by this share to either side, and tapered there.
 _MARGIN = 0.1
 # Distance at which poles are of different clusters: in half-power bandwidths, half the logarithm of
@@ -71,24 +73,25 @@ def find_candidates(spectra: LogSpectra, low: float, high: float) -> tuple[list[
 
 def _correlate(spectra: LogSpectra, low: float, high: float) -> ComplexArray:
     """Return the correlations of the channels at the rate of a band, (n_lags, n, n)."""
-    from scipy.signal import czt  # late: it imports scipy.stats, half a second
-    from scipy.signal.windows import tukey
-
     n, width = len(spectra.channels), high - low
     rows = int(min(_MOST_ROWS, width * spectra.duration / 10))
     lags = np.arange(2 * rows + 2)
     total = np.zeros((lags.size, n, n), dtype=complex)
     for spectrum in spectra.spectra:
         cut = spectrum.band(low, high)
-        if cut.frequency.size < _NEAR_LINE:
+        if (size := cut.frequency.size) < _NEAR_LINE:
             continue
-        taper = tukey(cut.frequency.size, 2 * _MARGIN)[:, None]
-        turn = np.exp(2j * np.pi / (cut.duration * width))
+        from_end = np.minimum(np.arange(size), np.arange(size)[::-1]) / (_MARGIN * (size - 1))
+        taper = np.sin(np.pi / 2 * np.minimum(from_end, 1.0)) ** 2
+        turn = 2j * np.pi / (cut.duration * width) * lags
+        phase = np.exp(turn[:, None] * np.arange(min(size, _BLOCK)))
         first = np.exp(2j * np.pi * (cut.frequency[0] - low) / width * lags)
         # Row by row: transforms of all at once would take several times the memory of the spectra.
         for i, row in enumerate(_whitened(cut)):
-            part = czt(row * taper, lags.size, turn, axis=0)
-            total[:, i] += spectrum.count * part * first[:, None]
+            for start in range(0, size, _BLOCK):
+                some = row[start : start + _BLOCK] * taper[start : start + _BLOCK, None]
+                before = spectrum.count * first * np.exp(turn * start)
+                total[:, i] += before[:, None] * (phase[:, : len(some)] @ some)
     return total
 
 
