@@ -34,6 +34,7 @@ from tests.bench.conftest import Race
 from tests.bench.identification import CASE, headline_log, parquet_log
 from tests.bench.lives import degrading_life, two_ways
 from tests.bench.meter import EVERY, Meter
+from tests.bench.processes import REVISION, SHORT, Programs, programs
 
 LOOP, FILTERPY = "emcee, plain loop over our surrogate", "a walker by a loop over filterpy"
 # What both take on the machine on which seconds were asked for: effective draws a second, and s.
@@ -220,3 +221,31 @@ def test_two_workers(race: Race) -> None:
             beside="the gain of two workers over one",
             at_most=2 / SPEEDUP,
         )
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
+    """Let this code and that before know the same machine."""
+    with programs(tmp_path_factory.mktemp("processes")) as found:
+        yield found
+
+
+@pytest.mark.parametrize(
+    ("name", "asked", "today"),
+    [
+        ("a refusal", 0.7, 1.5),
+        ("modes of a log of 4 s", 0.7, 1.5),
+        ("one new log on 39", 4.5, 9.2),
+        ("prognose after a step", 6.0, 60.0),
+    ],
+)
+def test_whole_processes(race: Race, both: Programs, name: str, asked: float, today: float) -> None:
+    """What people wait for takes the share of the time before that was asked for, in s."""
+    words = {
+        "a refusal": lambda _: ["modes", "nowhere.csv"],
+        "modes of a log of 4 s": lambda _: ["modes", SHORT],
+        "one new log on 39": both.run,
+        "prognose after a step": both.prognose,
+    }
+    ratios = both.ratios(words[name], new_log="new log" in name)
+    race.record(ratios, name=f"{name}, whole process", beside=REVISION, at_most=asked / today)
