@@ -7,7 +7,7 @@ were measured on one machine.
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -241,7 +241,7 @@ def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Programs]:
 )
 def test_whole_processes(race: Race, both: Programs, name: str, asked: float, today: float) -> None:
     """What people wait for takes the share of the time before that was asked for, in s."""
-    words = {
+    words: dict[str, Callable[[str], list[object]]] = {
         "a refusal": lambda _: ["modes", "nowhere.csv"],
         "modes of a log of 4 s": lambda _: ["modes", SHORT],
         "one new log on 39": both.run,

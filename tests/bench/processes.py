@@ -86,8 +86,9 @@ def shares(both: Programs) -> dict[str, float]:
     shutil.rmtree(out)
     shutil.copytree(both.folder / "now" / "known", out)
     words = [str(word) for word in (*both.run("now"), "--workers", 1)]
-    command = [sys.executable, "-m", "cProfile", "-o", profile, "-m", "lmshealth", *words]
-    subprocess.run(command, env=one_thread(), capture_output=True, cwd=ROOT, check=True)
+    profiled = ["-m", "cProfile", "-o", str(profile), "-m", "lmshealth", *words]
+    subprocess.run([sys.executable, *profiled], env=one_thread(), capture_output=True, cwd=ROOT,
+                   check=True)  # fmt: skip
     stats: Any = pstats.Stats(str(profile))
     spent = {name: row[3] for (_, _, name), row in stats.stats.items() if name in PARTS.values()}
     return {part: spent[name] / stats.total_tt for part, name in PARTS.items()}
