@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
+from itertools import takewhile
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -44,6 +45,8 @@ from lmshealth.tracking.history import (
 )
 from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
+
+_NAMELESS = ("ambiguous", "unconfirmed")  # reasons of estimates whose name is not certain
 
 
 @dataclass(frozen=True, slots=True, eq=False, repr=False)
@@ -124,15 +127,24 @@ class Assessment:
 
     @property
     def left_out(self) -> dict[str, int]:
-        """Modes whose last logs are outliers of the track, and how many of these."""
+        """Modes whose last logs are outliers of the track, and how many of these.
+
+        A log of which no estimate has a name that is certain deviates at all of them: a jump may
+        have moved modes to the places of others.
+        """
         history, outliers = self.history, set(self.track.outliers if self.track else ())
+        seen = np.isfinite(history.ln_frequency)
         left: dict[str, int] = {}
         for mode in {mode for _, mode in outliers}:
-            own = history.ln_frequency[:, list(history.columns(mode))]
-            seen = np.flatnonzero(np.isfinite(own).any(axis=1)).tolist()
-            last = (n for n, k in enumerate(seen[::-1]) if (k, mode) not in outliers)
-            if n := next(last, len(seen)):
+            own = np.flatnonzero(seen[:, list(history.columns(mode))].any(axis=1)).tolist()
+            last = (n for n, k in enumerate(own[::-1]) if (k, mode) not in outliers)
+            if n := next(last, len(own)):
                 left[mode] = n
+        refused = [(one.log, one.mode) for one in self.refused if one.reason in _NAMELESS]
+        nameless = {log for log, _ in refused}
+        empty = zip(history.logs[::-1], ~seen[::-1].any(axis=1), strict=True)
+        if n := len([*takewhile(lambda one: one[1] and one[0] in nameless, empty)]):
+            left |= {mode: n for log, mode in refused if log == history.logs[-1] and mode}
         return dict(sorted(left.items()))
 
     @property

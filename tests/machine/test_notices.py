@@ -243,6 +243,23 @@ def test_last_logs_that_are_left_out_are_counted(
     assert "before the last log, which deviates in roll (" in next(iter(changes(summary, summary)))
 
 
+@pytest.mark.parametrize(("reason", "told"), [("ambiguous", True), ("not-excited", False)])
+def test_a_last_log_without_a_certain_name_deviates(make: Maker, reason: str, told: bool) -> None:
+    """A jump of all modes to the places of others was a healthy machine without a notice."""
+    good = make()
+    ln_f = good.history.ln_frequency.copy()
+    ln_f[-1] = np.nan
+    last, modes = good.history.logs[-1], good.history.modes
+    of_last = tuple(Refusal(last, reason, "", mode=mode) for mode in modes)
+    bad = replace(good, history=replace(good.history, ln_frequency=ln_f), refused=of_last)
+    found = [one for one in notices(bad) if one.code == "last-logs-left-out"]
+    assert [one.severity for one in found] == told * ["caution"]
+    assert bad.left_out == (dict.fromkeys(sorted(modes), 1) if told else {})
+    # One of two logs at the end that has a name is no outlier.
+    with_name = replace(bad, history=good.history)
+    assert with_name.left_out == {}
+
+
 def test_a_flag_of_the_last_log_is_noticed_with_its_meaning(make: Maker) -> None:
     """For all modes that have it in one notice; its meaning is that of the table of flags."""
     latest = make_reading("last", 40, 1e6, {"roll": 4.8, "pitch": 4.9, "yaw": 5.0})
