@@ -71,6 +71,15 @@ UNSEEN_GROWTH = Lognormal(0.2, 1.0)
 """Travel from such an onset to the end over the travel at the onset: 4 % to 100 % (90 %), sudden
 breaks to wear that doubles its rate once."""
 
+# Usage, see README.md.
+USAGE_CHANGED = 0.3
+"""Prior probability that the travel per day has changed in the record, as by a second shift."""
+USAGE_SCATTER, USAGE_KNOWN = 0.2, 2.0
+"""Relative scatter of the travel between two logs that is expected, and the number of increments
+that this counts as. Rates of two phases differ by about the mean rate."""
+USAGE_ENDS = 0.5
+"""Ends of the present usage in the days that it has lasted, as `UNSEEN_ONSETS`."""
+
 # Fleet prior, see README.md.
 MIN_MACHINES = 3
 """Other machines that a fleet prior needs: with fewer, the variance between machines is mixed with

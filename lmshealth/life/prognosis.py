@@ -6,6 +6,7 @@ from datetime import datetime
 from typing import Any
 
 import numpy as np
+from scipy.special import softmax
 
 from lmshealth._private.arrays import FloatArray, freeze
 from lmshealth._private.result import Result
@@ -28,6 +29,7 @@ _LEVELS = (0.05, 0.25, 0.5, 0.75, 0.95)
 _NEAR, _FAR, _BEYOND = 24, 12, 1.5
 _REACH = 3.0  # standard deviations of ln of the travel left
 _N_LIVES = 2000  # of the prior of a law
+_LEAST_USAGE = 1e-3  # of a phase without travel, in rates of the whole record
 _RARE = 1e-9  # bounds of the mean and shape of the inverse Gaussian
 
 
@@ -410,13 +412,64 @@ def _usage(
                 stage=history.stage,
             )
         )
-    total, rate = days.sum(), steps.sum() / days.sum()
-    per_day = np.sum((steps - rate * days) ** 2 / days) / (days.size - 1)
-    # Over less than the time between two logs the usage was never observed.
-    ahead = np.maximum(np.minimum(remaining, horizon) / rate, days.mean())
-    scatter = rng.standard_t(days.size - 1, remaining.size) * np.sqrt(1 / total + 1 / ahead)
-    # Usage is positive: errors are those of its logarithm, with the tails of few logs cut at e^5.
-    return np.asarray(rate * np.exp(np.clip(np.sqrt(per_day) / rate * scatter, -5.0, 5.0)))
+    travel = np.clip(remaining, days.mean() * steps.sum() / days.sum(), horizon)
+    phase = rng.choice(days.size, remaining.size, p=_phases(days, steps))
+
+    rest = np.sum(_rests(days, steps), axis=0)
+
+    def rates(first: np.ndarray) -> FloatArray:
+        """Draw the rate of each draw by the increments from one on, ``(n_draws,)``."""
+        total, moved = (np.cumsum(own[::-1])[::-1][first] for own in (days, steps))
+        rate = np.maximum(moved / total, _LEAST_USAGE * steps.sum() / days.sum())
+        freedom = np.where(first > 0, max(days.size - 2, 1), days.size - 1)
+        # Over less than the time between two logs the usage was never observed.
+        ahead = np.maximum(travel / rate, days.mean())
+        scatter = rng.standard_t(freedom) * np.sqrt(rest[first] / freedom * (1 / total + 1 / ahead))
+        # Usage is positive: errors are those of its logarithm, with the tails of few logs cut.
+        return np.asarray(rate * np.exp(np.clip(scatter / rate, -5.0, 5.0)))
+
+    now = rates(phase)
+    later = np.where(phase > 0, rates(np.zeros_like(phase)), now)
+    # None has ended in the days that the phase has lasted.
+    age = np.cumsum(days[::-1])[::-1][phase]
+    left = age * (rng.uniform(1e-9, 1.0, remaining.size) ** (-1 / constants.USAGE_ENDS) - 1)
+    lasting = np.minimum(travel / now, left)
+    return np.asarray(travel / (lasting + (travel - lasting * now) / later))
+
+
+def _phases(days: FloatArray, steps: FloatArray) -> FloatArray:
+    """Return the probability of each increment to be the first of the present usage, ``(n,)``.
+
+    That of increment 0 is that the usage has not changed. README.md has the model.
+    """
+    n, rate, spread = days.size, steps.sum() / days.sum(), constants.USAGE_SCATTER
+    since, past = _rests(days, steps)
+    typical = (spread * rate) ** 2 * days.mean()
+    known, freedom = constants.USAGE_KNOWN * typical, n - 1 + constants.USAGE_KNOWN
+    total, moved = np.cumsum(days)[:-1], np.cumsum(steps)[:-1]
+    apart = moved / total - (steps.sum() - moved) / (days.sum() - total)
+    variance, wide = 1 / total + 1 / (days.sum() - total), rate**2 / typical
+    rest = since[1:] + past[1:] + apart**2 / (variance + wide)
+    chance = constants.USAGE_CHANGED
+    changed = np.log(chance / max(n - 1, 1)) - 0.5 * np.log1p(wide / variance)
+    log_weight = np.append(np.log1p(-chance), changed)
+    log_weight -= freedom / 2 * np.log(np.append(since[0], rest) + known)
+    return np.asarray(softmax(log_weight))
+
+
+def _rests(days: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return the sums of squares about one rate, of the increments from each one on, and before it.
+
+    ``(n,)`` each, per day; that before the first is 0.
+    """
+    square = steps**2 / days
+    forward = [np.cumsum(own) for own in (square, days, steps)]
+    whole = [own[-1] for own in forward]
+    before = [np.append(0.0, own[:-1]) for own in forward]
+    since = [total - own for total, own in zip(whole, before, strict=True)]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        rests = [np.maximum(a - c**2 / b, 0.0) for a, b, c in (since, before)]
+    return rests[0], np.nan_to_num(rests[1])
 
 
 def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:

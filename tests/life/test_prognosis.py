@@ -219,6 +219,13 @@ def moved(rng: np.random.Generator, n: int, spread: float) -> History:
     return make_history(ln_f, travel=np.r_[0, np.cumsum(steps)])
 
 
+@pytest.fixture
+def unchanging_usage(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exclude that the usage has changed."""
+    monkeypatch.setattr(constants, "USAGE_CHANGED", 1e-300)
+
+
+@pytest.mark.usefixtures("unchanging_usage")
 def test_usage_is_estimated_from_the_odometer(unstated: Stage) -> None:
     """Of three weeks' logs the mean of years to come has the relative error of Student's t."""
     history, n_draws = moved(np.random.default_rng(7), 3, 0.2), 10_000
@@ -230,6 +237,7 @@ def test_usage_is_estimated_from_the_odometer(unstated: Stage) -> None:
     assert stats.kstest(off * np.sqrt(3), stats.norm.cdf).pvalue < 1e-3
 
 
+@pytest.mark.usefixtures("unchanging_usage")
 def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
     """The uncertainty of the next week is the scatter of weeks and that of the mean of 40."""
     history, n_draws = moved(np.random.default_rng(7), 40, 0.2), 10_000
@@ -242,6 +250,7 @@ def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
     assert stats.kstest(off * np.sqrt(40), stats.norm.cdf).pvalue < 1e-3
 
 
+@pytest.mark.usefixtures("unchanging_usage")
 def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:
     """Lives that are over scatter most, those without end as at the horizon; none goes back."""
     history = moved(np.random.default_rng(11), 10, 0.3)
@@ -251,6 +260,35 @@ def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:
         assert (usage > 0).all()
         stds.append(np.std(np.log(usage)))
     assert stds[0] > stds[1] > stds[2] > 0
+
+
+def with_usage(factors: np.ndarray) -> History:
+    """Make a still life of weeks of 140 km, each by a factor, with a scatter of a tenth."""
+    rng = np.random.default_rng(3)
+    steps = 1.4e5 * factors * (1 + 0.1 * rng.standard_normal(factors.size))
+    ln_f = np.tile(np.log(FREQUENCY[:2]), (factors.size + 1, 1))
+    return make_history(ln_f, travel=np.r_[0, np.cumsum(steps)])
+
+
+@pytest.mark.parametrize(("since", "factor"), [(20, 1.0), (12, 2.0), (6, 5.0), (6, 0.3)])
+def test_usage_is_that_of_the_present_phase(unstated: Stage, since: int, factor: float) -> None:
+    """With the mean of the whole record, services of a machine with a new shift came too late."""
+    history = with_usage(np.where(np.arange(30) < 30 - since, 1.0, factor))
+    left = np.full(4000, 0.5 * since * factor * 1.4e5)  # half as long as the phase has lasted
+    usage = _usage(history, unstated, np.random.default_rng(1), left, 2e8) / 20_000
+    assert np.median(usage) == pytest.approx(factor, rel=0.15)
+    low, high = np.quantile(usage, (0.05, 0.95))
+    assert low < factor < high
+    # The phase may end before the life does.
+    assert factor == 1 or (low < 0.8 * factor if factor > 1 else high > 1.25 * factor)
+
+
+def test_a_holiday_is_no_usage_of_years_to_come(unstated: Stage) -> None:
+    """A phase of one log lasts about as long again: the mean of a long life is that before."""
+    history = with_usage(np.append(np.ones(29), 0.02))
+    usage = _usage(history, unstated, np.random.default_rng(1), np.full(4000, 7e6), 2e8)
+    assert np.median(usage) == pytest.approx(20_000, rel=0.15)
+    assert np.mean(usage < 10_000) < 0.25
 
 
 def test_an_odometer_without_usage_is_refused(unstated: Stage) -> None:
