@@ -84,11 +84,12 @@ name = "temperature_c"
 reference = 21.0
 prior_std = 0.001
 """
-# No change without a law, and no mode that moves alone.
+# No change without a law, no mode that moves alone, and no wander that all have in common.
 LAWS_ALONE = """
 [life]
 free = 0
 lone_mode = 0
+common_wander = 0
 """
 # Temperature with a curvature, and payload.
 TWO = """

@@ -482,7 +482,8 @@ class LifeBelief:
 class LifeSetting:
     """A point of the grid: walk, factor on standard deviations, deviation over the history.
 
-    And the index of a mode that moves alone, if one does.
+    And the index of a mode that moves alone, if one does, and the standard deviation of a wander
+    that all have in common.
     """
 
     walk: float
@@ -490,6 +491,7 @@ class LifeSetting:
     deviation: float
     prior: float = 1.0
     lone: int | None = None
+    common: float = 0.0
 
 
 def lone_drift(t: float, u: float, now: float, steps: Sequence[float] = ()) -> float:
@@ -539,6 +541,7 @@ def life_covariance(
     logs = range(first, len(history.logs))
     offset = [_offset(history, "temperature_c", belief.reference, k) for k in logs]
     known = Known((("temperature_c", belief.reference, belief.b_std, 0.0),))
+    number = {k: n for n, k in enumerate(sorted({k for k, _ in where}))}
     cov = np.zeros((len(where), len(where)))
     for a, (k, i) in enumerate(where):
         for c, (o, j) in enumerate(where):
@@ -547,6 +550,8 @@ def life_covariance(
                 cov[a, c] += slope[i] * slope[j] * setting.deviation**2 * shared / clock.max()
             for own in alone:
                 cov[a, c] += belief.common_std**2 * own[k, i] * own[o, j]
+            lasting = [np.exp(-abs(number[k] - number[o]) / n) for n in (2.0, 8.0)]
+            cov[a, c] += setting.common**2 * sum(lasting) / 2
             if k == o:
                 cov[a, c] += setting.scale**2 * history.cov[first + k][i, j]
             if k == o and i == j and unknown[k]:

@@ -15,7 +15,13 @@ from lmshealth.calibration import constants
 from lmshealth.errors import BadQuestion, BadStage
 from lmshealth.life import constants as of_life
 from lmshealth.life.posterior.data import KM
-from lmshealth.life.posterior.likelihood import NO_MODE, lone_kernel, scatter_prior
+from lmshealth.life.posterior.likelihood import (
+    COMMON,
+    NO_MODE,
+    common_kernel,
+    lone_kernel,
+    scatter_prior,
+)
 from lmshealth.life.posterior.scenarios import DegradationPath, Scenario, laws_of, list_scenarios
 from lmshealth.life.prognosis import (
     early_life,
@@ -153,7 +159,7 @@ class Life:
 
     history: History
     parts: tuple[Part, ...]  # one for each health parameter
-    lone: int  # index of the mode that moves alone, or `NO_MODE`
+    lone: int  # index of the mode that moves alone, `NO_MODE`, or as `COMMON`
     walk: float  # standard deviation of ln f at the last log by its random walk
     rate: float  # mean travel in m per day
     scatter: float  # standard deviation of the travel from log to log, as a share of its mean
@@ -166,7 +172,7 @@ class Life:
     @property
     def kind(self) -> Kind:
         """What happens in this life."""
-        if self.lone != NO_MODE:
+        if self.lone > NO_MODE:
             return "foreign change"
         return "wearing" if any(part.changes for part in self.parts) else "healthy"
 
@@ -179,7 +185,7 @@ class Life:
         n_lives = (len(self.history.logs) - 1) / LOGS_PER_LIFE
         most = max(walk for walk, _ in HEALTHY_WALKS) * np.sqrt(n_lives)
         constant = self.kind == "healthy" and all(part.rate == 0 for part in self.parts)
-        return bool(constant and self.walk <= most)
+        return bool(constant and self.walk <= most and self.lone == NO_MODE)
 
     @property
     def health(self) -> FloatArray:
@@ -378,13 +384,16 @@ def without_health(
 ) -> tuple[FloatArray, int, float]:
     """Draw intercepts, random walks, and the drift of a mode that moves alone, or jumps at a step.
 
-    Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, or `NO_MODE`; and the
-    standard deviation of the walks at the last log.
+    Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, `NO_MODE`, or, where all
+    modes wander together, as `COMMON`; and the standard deviation of the walks at the last log.
     """
-    which, alone = rng.random(), stage.description.life.lone_mode
+    prior = stage.description.life
+    which, alone, common = rng.random(), prior.lone_mode, prior.common_wander * (n_modes > 1)
     if kind is not None:
         alone = 1 / n_modes if kind == "foreign change" else 0.0
     lone = int(which / alone) if which < n_modes * alone else NO_MODE
+    if lone == NO_MODE and which < n_modes * alone + common:
+        lone = COMMON - int(rng.integers(len(of_life.COMMON_STDS)))
     if lone == NO_MODE:
         walk = rng.choice(of_life.WALK_STDS, p=shares(stage, "walk"))
     else:
@@ -392,7 +401,10 @@ def without_health(
         walk = rng.choice(stds, p=weights)
     stds_of_logs = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     drift = np.cumsum(stds_of_logs[:, None] * rng.standard_normal((clock.size, n_modes)), axis=0)
-    if lone != NO_MODE:
+    if lone <= COMMON:
+        cov = of_life.COMMON_STDS[COMMON - lone] ** 2 * common_kernel(np.arange(clock.size))
+        drift += rng.multivariate_normal(np.zeros(clock.size), cov, method="cholesky")[:, None]
+    elif lone != NO_MODE:
         cov = of_life.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]), steps)
         # It is 0 at the baseline: no Cholesky factor.
         drift[:, lone] += rng.multivariate_normal(np.zeros(clock.size), cov, method="eigh")

@@ -44,6 +44,10 @@ LONE_WALKS = ((5e-4, 0.6), (1.5e-3, 0.4))
 LONE_NAMED = 0.5
 """Probability from which such a mode is named beside another verdict."""
 
+# A wander that all modes have in common, see posterior/README.md.
+COMMON_STDS, COMMON_LOGS = (1e-3, 3e-3), (2.0, 8.0)
+"""Its standard deviations of ln f, equally probable, and the numbers of logs that it lasts."""
+
 # Posterior over scenarios, see posterior/README.md.
 MIN_PROBABILITY = 0.01
 """Scenarios with a lower probability are not published."""

@@ -232,12 +232,14 @@ class LifeSpec(_Part, frozen=True):
     """What the posterior of a life allows for beside the laws of the parameters, and its clock.
 
     ``free`` is the share of a parameter's laws that a change without a law has, ``lone_mode`` the
-    prior probability that a mode moves alone, by a cause that the map does not have. The clock
-    ``days`` takes the time for travel, at ``[usage] km_per_day``.
+    prior probability that a mode moves alone, by a cause that the map does not have, and
+    ``common_wander`` that all modes wander together. The clock ``days`` takes the time for travel,
+    at ``[usage] km_per_day``.
     """
 
     free: Annotated[float, within(0, 0.9)] = 0.05
     lone_mode: Annotated[float, within(0, 0.2)] = 0.03
+    common_wander: Annotated[float, within(0, 0.5)] = 0.1
     clock: Literal["odometer", "days"] = "odometer"
 
 
@@ -495,10 +497,11 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"{path}: map.file: the map has modes {list(modal_map.modes)}, but none of them is a "
             f"tracked [[mode]] ({described})"
         )
-    if (each := description.life.lone_mode) * len(known) > 1:
+    each, most = description.life.lone_mode, 1 - description.life.common_wander
+    if each * len(known) > most:
         raise BadStage(
-            f"{path}: life.lone_mode: {len(known)} modes with {each:g} each have a probability "
-            f"above 1 together; needed is at most {1 / len(known):.3g}"
+            f"{path}: life.lone_mode: {len(known)} modes with {each:g} each and the common wander "
+            f"have a probability above 1 together; needed is at most {most / len(known):.3g}"
         )
     at = np.exp(modal_map.ln_frequency(np.log([[p.baseline for p in description.parameter]]))[0])
     free = {

@@ -455,7 +455,7 @@ def test_health_goes_to_arviz_and_back(health: Health, tmp_path: Path) -> None:
 # A clock of days
 
 
-DAYS = '[life]\nfree = 0\nlone_mode = 0\nclock = "days"\n'
+DAYS = '[life]\nfree = 0\nlone_mode = 0\ncommon_wander = 0\nclock = "days"\n'
 
 
 def test_a_machine_without_an_odometer_has_a_life_by_days(tmp_path: Path, history: History) -> None:

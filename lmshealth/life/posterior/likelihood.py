@@ -47,6 +47,8 @@ _NEGLIGIBLE = 0.01
 
 NO_MODE = -1
 """Index in place of that of a mode that moves alone: none does."""
+COMMON = -2
+"""Largest such index of a wander that all modes have in common, of the first of `COMMON_STDS`."""
 
 Nuisances = tuple[np.ndarray, np.ndarray]
 """Indices of the map error and of the grid point of each draw, ``(n,)`` each."""
@@ -59,7 +61,8 @@ class LifeCovariance(ReadOnly):
     `fixed` has intercepts, covariates, biases and declared steps; `noise` the reported covariances
     of the estimates; `unknown` the variances for want of covariates; `walk` the random walk of ln f
     with variance 1 at the last log; `deviation` that of ln health, likewise; `lone` the drift of a
-    mode by a cause of its own, of all modes as if each had one.
+    mode by a cause of its own, of all modes as if each had one; `common` the wander that all modes
+    have in common, with variance 1.
     """
 
     fixed: FloatArray
@@ -68,6 +71,7 @@ class LifeCovariance(ReadOnly):
     walk: FloatArray
     deviation: FloatArray
     lone: FloatArray
+    common: FloatArray
     mode_of: np.ndarray  # index of the mode of each datum, ``(n_data,)``
 
     @classmethod
@@ -104,6 +108,7 @@ class LifeCovariance(ReadOnly):
             walk=same_mode * shared,
             deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
             lone=same_mode * lone_kernel(clock, clock, now, data.steps),
+            common=common_kernel(np.unique(log_of, return_inverse=True)[1]),
             mode_of=data.mode_of,
         )
 
@@ -112,10 +117,18 @@ class LifeCovariance(ReadOnly):
     ) -> FloatArray:
         """Return the Cholesky factor of Σ, shape ``(n_data, n_data)``."""
         total = self.fixed + self.unknown + noise_scale**2 * self.noise + walk**2 * self.walk
-        if lone != NO_MODE:
+        if lone <= COMMON:
+            total += constants.COMMON_STDS[COMMON - lone] ** 2 * self.common
+        elif lone != NO_MODE:
             own = (self.mode_of == lone).astype(float)
             total += constants.LONE_STD**2 * np.outer(own, own) * self.lone
         return np.asarray(np.linalg.cholesky(total + deviation**2 * self.deviation))
+
+
+def common_kernel(log: np.ndarray) -> FloatArray:
+    """Return the covariance of a wander of variance 1 between logs by their number, ``(n, n)``."""
+    apart = np.abs(np.subtract.outer(log, log))
+    return np.asarray(np.mean([np.exp(-apart / n) for n in constants.COMMON_LOGS], axis=0))
 
 
 def lone_kernel(
@@ -209,12 +222,17 @@ class Grid(Rows):
         n_modes, alone = len(data.modes), data.stage.description.life.lone_mode
         # A mode that moves alone needs others that do not.
         alone *= n_modes > 1
-        others = (1 - n_modes * alone) / np.sum(prior.walk)
+        common = data.stage.description.life.common_wander * (n_modes > 1)
+        others = (1 - common - n_modes * alone) / np.sum(prior.walk)
         walks = zip(constants.WALK_STDS, prior.walk, strict=True)
         ways = [(walk, p * others, NO_MODE) for walk, p in walks]
         if alone:
             lone = product(range(n_modes), constants.LONE_WALKS)
             ways += [(walk, alone * p, mode) for mode, (walk, p) in lone]
+        if common:
+            each = common / len(constants.COMMON_STDS)
+            together = product(enumerate(constants.COMMON_STDS), constants.LONE_WALKS)
+            ways += [(walk, each * p, COMMON - k) for (k, _), (walk, p) in together]
         for (walk, p, lone), (scale, q), (deviation, r) in product(
             ways,
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),

@@ -9,7 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 import xarray
-from scipy import stats
+from msgspec import structs
+from scipy import signal, stats
 from threadpoolctl import threadpool_limits
 
 from lmshealth._private.arrays import FloatArray
@@ -20,7 +21,7 @@ from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood
 from lmshealth.life.posterior.sampling import Sample, draw_to_ess, importance_sample
 from lmshealth.life.prognosis import prognose
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, load_stage
 from lmshealth.tracking.history import History, Step
 from tests.lives import (
     FADING,
@@ -529,7 +530,7 @@ def test_without_weight_of_a_free_change_the_laws_are_alone(
     """A weight of 0 leaves the scenarios, and the posterior, of a description's laws alone."""
     kinds = {}
     for free in (0, 0.05):
-        tail = f"[life]\nfree = {free}\nlone_mode = 0\n"
+        tail = f"[life]\nfree = {free}\nlone_mode = 0\ncommon_wander = 0\n"
         stage = make_stage(tmp_path / str(free), (PRELOAD, MOUNT), tail=tail)
         scenarios = LifeLikelihood.of(history, stage).data.scenarios
         kinds[free] = [tuple(path.law.kind for path in one.paths) for one in scenarios]
@@ -541,6 +542,25 @@ def test_without_weight_of_a_free_change_the_laws_are_alone(
     assert ("free", "free") in kinds[0.05]
 
 
+def test_a_wander_that_all_modes_have_in_common_is_no_health() -> None:
+    """Health of a machine that stays as it is holds; without it 13 of 28 intervals did."""
+    stage = load_stage("lms-y")
+    life = structs.replace(stage.description.life, common_wander=0.0)
+    without = replace(stage, description=structs.replace(stage.description, life=life))
+    held = {True: 0, False: 0}
+    for seed in range(4):
+        rng = np.random.default_rng(seed)
+        ln_f = np.log(FREQUENCY) + 5e-4 * rng.standard_normal((30, 3))
+        steps = 3e-3 * rng.standard_normal(30)
+        wander = signal.lfilter([np.sqrt(0.19)], [1, -0.9], steps, zi=[0.9 * steps[0]])[0]
+        history = make_history(ln_f + wander[:, None], travel=np.arange(30) * 1e5, std=5e-4)
+        for own in (stage, without):
+            health = fit_life(history, own, 1, chains=False).health
+            low, high = np.quantile(health, (0.05, 0.95), axis=(0, 1))
+            held[own is stage] += int(np.sum((low <= 1) & (high >= 1)))
+    assert held[True] == 8 > held[False]
+
+
 def test_a_gain_is_found_by_a_change_without_a_law(tmp_path: Path) -> None:
     """A mount that settles stiffer is found so; by laws that only lose it is not."""
     preload, mount = 1 - 0.25 * TRAVEL / TRAVEL[-1], 1 + 0.15 * np.sqrt(TRAVEL / TRAVEL[-1])
@@ -550,7 +570,7 @@ def test_a_gain_is_found_by_a_change_without_a_law(tmp_path: Path) -> None:
     history = make_history(ln_f, travel=TRAVEL, std=5e-4)
     medians = []
     for free in (0.05, 0):
-        tail = f"[life]\nfree = {free}\nlone_mode = 0\n"
+        tail = f"[life]\nfree = {free}\nlone_mode = 0\ncommon_wander = 0\n"
         stage = make_stage(tmp_path / str(free), (PRELOAD, MOUNT), n_modes=3, tail=tail)
         life = fit_life(history, stage, 1, chains=False)
         low, median, high = np.quantile(life.health[..., 1], (0.01, 0.5, 0.99))

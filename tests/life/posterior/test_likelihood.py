@@ -17,7 +17,7 @@ from lmshealth.life.posterior import likelihood
 from lmshealth.life.posterior.likelihood import NO_MODE, LifeDensity, LifeLikelihood, scatter_prior
 from lmshealth.life.posterior.scenarios import Scenario
 from lmshealth.stage.constants import MAP_ERRORS
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import LifeSpec, Stage
 from lmshealth.tracking.history import History
 from tests.lives import (
     FADING,
@@ -118,19 +118,23 @@ def believed(model_std: float, common_std: float = 0.0) -> LifeBelief:
     return LifeBelief(slopes, model_std, constants.INTERCEPT_STD, common_std)
 
 
-def settings(lone_mode: float) -> list[LifeSetting]:
-    """List the points of the grid, with modes that move alone, each of a probability."""
-    ways: list[tuple[float, float, int | None]] = [
-        (walk, p * (1 - 2 * lone_mode), None)
+def settings(life: LifeSpec) -> list[LifeSetting]:
+    """List the points of the grid, with modes that move alone, and a common wander."""
+    lone_mode, common = life.lone_mode, life.common_wander
+    ways: list[tuple[float, float, int | None, float]] = [
+        (walk, p * (1 - common - 2 * lone_mode), None, 0.0)
         for walk, p in zip(constants.WALK_STDS, constants.WALK_PRIOR, strict=True)
     ]
     if lone_mode:
-        ways += [(walk, lone_mode * p, i) for i in (0, 1) for walk, p in constants.LONE_WALKS]
+        ways += [(walk, lone_mode * p, i, 0.0) for i in (0, 1) for walk, p in constants.LONE_WALKS]
+    if common:
+        walks = product((1e-3, 3e-3), constants.LONE_WALKS)
+        ways += [(walk, common * p / 2, None, e) for e, (walk, p) in walks]
     scales = zip(constants.NOISE_SCALES, constants.NOISE_SCALE_PRIOR, strict=True)
     deviations = zip(constants.DEVIATION_STDS, constants.DEVIATION_PRIOR, strict=True)
     return [
-        LifeSetting(walk, scale, deviation, r * p * q, lone)
-        for (walk, r, lone), (scale, p), (deviation, q) in product(ways, scales, deviations)
+        LifeSetting(walk, scale, deviation, r * p * q, lone, e)
+        for (walk, r, lone, e), (scale, p), (deviation, q) in product(ways, scales, deviations)
     ]
 
 
@@ -148,7 +152,7 @@ def book_by_map_error(
 ) -> list[float]:
     """Log likelihood and prior of each error of the map, of one life, by the dense oracle."""
     drift, alone = drifts_of(density, y, history.clock()[history.baseline :])
-    grid = settings(density.likelihood.data.stage.description.life.lone_mode)
+    grid = settings(density.likelihood.data.stage.description.life)
     beliefs = [believed(*(scale * std for std in stds)) for scale, _ in MAP_ERRORS]
     constant = density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
     return [
@@ -602,7 +606,8 @@ def test_drifts_of_a_mode_that_moves_alone_are_those_of_a_dense_gaussian(
     tmp_path: Path, with_deviation: LifeSetting
 ) -> None:
     """Mean and variance of its drift now, and deviations beside it, given a life: to 1e-7."""
-    stage = make_stage(tmp_path, model_std=MODEL_STD)
+    tail = TEMPERATURE + "[life]\ncommon_wander = 0\n"
+    stage = make_stage(tmp_path, model_std=MODEL_STD, tail=tail)
     history = rough_history(np.random.default_rng(13), baseline=2)
     density = density_of(history, stage)
     y, grid = coordinates(density, 3), density.grid
