@@ -81,9 +81,9 @@ WORST_DECREMENT = 0.1
 # A resonance is a harmonic that wanders where the kurtosis of its envelope (2 for noise, 1 for a
 # sine) is below the second value and by so many standard deviations below that of noise.
 WANDERING_SIGMAS, WANDERING_KURTOSIS = 3.5, 1.7
-# What Thomson's test takes for a line is a light mode where the kurtosis is above that value and the
-# sum of the squares of the envelope, over that of their moduli (1 for a sine of any amplitude
-# modulation, towards 0 for noise), is below this one.
+# What Thomson's test takes for a line is a light mode where the kurtosis is above that value, and
+# the sum of the squares of the envelope over that of their moduli is below this one: it is 1 for a
+# sine of any amplitude modulation, and small for noise.
 STEADY_PHASE = 0.5
 # Damping ratio above which a resonance without a description is attributed to the noise.
 MOST_DAMPING = 0.1

@@ -35,8 +35,8 @@ _CLOSE, _ALIKE = 0.03, 0.5
 # Power over that of everything else from which on the signal stands out.
 _STANDS_OUT = 2.0
 _LEAST_ORDINATES = 8
-# Half width of the band in which a line is taken for a light mode, where it stands out by the second
-# value over the surroundings up to the third; and the window over which its power is averaged. All
+# Half width of the band in which a line may be a light mode, where it stands out by the second
+# value over its surroundings, up to the third; and the window over which its power is averaged. All
 # but the second are fractions of the frequency.
 _LIGHT_BAND, _LIGHT_STANDS_OUT, _SURROUNDINGS, _LIGHT_WINDOW = 0.003, 5.0, 0.015, 0.0005
 # Its tails reach beyond where it stands out, by this share of that band to either side.
