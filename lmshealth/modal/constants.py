@@ -95,10 +95,8 @@ SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # dampings up to which those of different clusters are.
 SAME_SIGMAS, DUPLICATE_DAMPING = 3.0, 4.0
 # A mode of a damping ratio below this, a bandwidth of five times that of a line, may look like one,
-# or be what is left beside a masked one: where it is described, or its response is random, the fit
-# decides. Of one below the other, a quarter of the width of a line, a description alone: so narrow
-# are the mains, whose amplitude may vary as well.
-LIGHT, LIGHTEST = 0.0025, 0.00025
+# or be what is left beside a masked one: where it is described, the fit decides.
+LIGHT = 0.0025
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors;
 # the level of few of many directions is known from the others: 0.03 would be too sure.

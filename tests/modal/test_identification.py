@@ -657,7 +657,7 @@ def test_a_very_light_damping_is_found_without_a_description() -> None:
     assert np.abs(deviations(found, "mode_1", 120.0, 0.002)).max() < 4
 
 
-@pytest.mark.parametrize("damping", [0.0007, 0.0004])
+@pytest.mark.parametrize("damping", [0.0007, 0.001])
 def test_a_light_mode_is_found_in_a_long_record(damping: float) -> None:
     """Thomson's test takes it for a line, but its amplitude and phase are random."""
     log = acceleration_log(rng(18), [Mode(100.0, damping)], 600.0, RATE, 1.0)

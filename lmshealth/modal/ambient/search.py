@@ -29,7 +29,7 @@ from lmshealth.modal.ambient.joint_model import (
     floor_ratio,
 )
 from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
-from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, is_random, near_lines
+from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, near_lines
 from lmshealth.modal.ambient.whittle import response
 from lmshealth.modal.naming import is_near
 from lmshealth.modal.targets import Target
@@ -144,15 +144,7 @@ def search(
     # foreign to modes.
     width = 2 * model.zeta
     light = [hint for hint in hints if hint.is_light]
-    least, most = constants.LIGHTEST, constants.LIGHT
-    narrow = np.array(
-        [
-            any(is_near(hint, f) for hint in light)
-            or (least < zeta < most and is_random(after.longest, f))
-            for f, zeta in zip(model.f.tolist(), model.zeta.tolist(), strict=True)
-        ],
-        bool,
-    )
+    narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
     wide = (width > LINE_WIDTH) & ~(
         near_lines(model.f, model.zeta, lines) & (model.zeta < constants.LIGHT)
     )

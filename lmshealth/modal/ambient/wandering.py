@@ -154,7 +154,9 @@ def is_random(recording: CrossSpectrum, frequency: float) -> bool:
         return False
     envelope = np.fft.ifft(z, 2 * z.size)
     steady = np.abs(np.fft.fft(envelope**2, 4 * z.size)).max() / np.sum(np.abs(envelope) ** 2)
-    kurtosis = _kurtosis(envelope[None])[0]
+    # Of a harmonic that wanders further the narrow band holds parts, which look random.
+    wide = np.fft.ifft(transforms[:, channel], 2 * len(transforms))
+    kurtosis = min(_kurtosis(one[None])[0] for one in (envelope, wide))
     return bool(kurtosis > constants.WANDERING_KURTOSIS and steady < constants.STEADY_PHASE)
 
 
