@@ -672,7 +672,7 @@ def test_a_line_whose_amplitude_varies_is_no_mode(
 ) -> None:
     """Its phase is steady, its amplitude as random as a mode's. Control: the amplitude alone."""
     n, mode = 300_000, Mode(105.0, 0.015)
-    pole = np.exp(-1 / (4.0 * RATE))
+    pole = np.exp(-1 / (2.0 * RATE))
     varies = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng(27).standard_normal(n))
     line = (1 + 0.7 * varies) * np.cos(2 * np.pi * 90.0 * np.arange(n) / RATE)
     values = accelerations(rng(23), [mode], n, RATE, 0.5)[0] + 10.0 * line
