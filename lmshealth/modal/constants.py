@@ -81,6 +81,10 @@ WORST_DECREMENT = 0.1
 # A resonance is a harmonic that wanders where the kurtosis of its envelope (2 for noise, 1 for a
 # sine) is below the second value and by so many standard deviations below that of noise.
 WANDERING_SIGMAS, WANDERING_KURTOSIS = 3.5, 1.7
+# What Thomson's test takes for a line is a light mode where the kurtosis is above that value, and
+# the sum of the squares of the envelope over that of their moduli is below this one: it is 1 for a
+# sine of any amplitude modulation, and small for noise.
+STEADY_PHASE = 0.5
 # Damping ratio above which a resonance without a description is attributed to the noise.
 MOST_DAMPING = 0.1
 # Least distance of two modes in half-power bandwidths, where channels see them alike (modal
@@ -90,9 +94,9 @@ SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # Standard deviations within which modes that different channels show are one, and the ratio of
 # dampings up to which those of different clusters are.
 SAME_SIGMAS, DUPLICATE_DAMPING = 3.0, 4.0
-# A mode that is narrower than so many widths of a line may look like one, or be what is left beside
-# a masked one: where it is described, the fit decides.
-LIGHT = 5.0
+# A mode of a damping ratio below this, a bandwidth of five times that of a line, may look like one,
+# or be what is left beside a masked one: where it is described, the fit decides.
+LIGHT = 0.0025
 # Standard deviations of the priors. Weak ones about the start, which bound directions that data do
 # not constrain: ln f, ln ζ, forces of modes, shapes, and level, slope and bend of ln noise floors;
 # the level of few of many directions is known from the others: 0.03 would be too sure.

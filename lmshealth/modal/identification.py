@@ -37,7 +37,7 @@ from lmshealth.modal.ambient.search import (
     similar,
     split_groups,
 )
-from lmshealth.modal.ambient.wandering import near_lines
+from lmshealth.modal.ambient.wandering import is_random, near_lines
 from lmshealth.modal.deterministic.free_decays import identify_decays
 from lmshealth.modal.deterministic.frequency_response import read_frf
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
@@ -57,6 +57,7 @@ from lmshealth.signal.segments import (
 )
 from lmshealth.signal.spectra import (
     ANY_RESONANCE,
+    CrossSpectrum,
     LogSpectra,
     ResonanceRange,
     cross_spectra,
@@ -339,11 +340,7 @@ def read_ambient(
             hints, refusal = _without_narrowest(hints, error)
             short.append(refusal)
     spans = _spans(log, whole.duration, hints, band)
-    tested = [
-        line
-        for line in _thomson_lines(log, stretches, spans)
-        if not any(is_near(hint, line[1]) for hint in hints if hint.is_light)
-    ]
+    tested = _thomson_lines(log, stretches, spans, hints, whole.longest)
     masked_at = [f for _, f, _ in tested]
     cut = whole.each(lambda spectrum: spectrum.without(masked_at))
     seek = partial(_search, cut, spans, hints, masked_at, progress)
@@ -510,15 +507,24 @@ def _spans(
 
 
 def _thomson_lines(
-    log: Log, stretches: Sequence[Segment], spans: Sequence[tuple[float, float]]
+    log: Log,
+    stretches: Sequence[Segment],
+    spans: Sequence[tuple[float, float]],
+    hints: Sequence[Target],
+    recording: CrossSpectrum,
 ) -> list[tuple[str, float, float]]:
-    """Return channel, frequency in Hz and amplitude of the lines of Thomson's test."""
+    """Return channel, frequency in Hz and amplitude of the lines of Thomson's test.
+
+    Those are omitted that may be a light mode, as one is described there or they are random.
+    """
     longest = max(stretches, key=lambda s: s.stop - s.start)
+    light = [hint for hint in hints if hint.is_light]
     return [
-        (channel.name, *line)
+        (channel.name, f, amplitude)
         for channel in log.channels
         for span in spans
-        for line in find_lines(channel, (longest,), log.sample_rate, span).tolist()
+        for f, amplitude in find_lines(channel, (longest,), log.sample_rate, span).tolist()
+        if not (any(is_near(hint, f) for hint in light) or is_random(recording, f))
     ]
 
 

@@ -10,7 +10,6 @@ from lmshealth.errors import BadLog, BadStage
 from lmshealth.io.channel_checks import independent
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
-from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.stage.description import Stage
 
 
@@ -39,7 +38,7 @@ class Target:
     @property
     def is_light(self) -> bool:
         """Whether the mode may look like a spectral line."""
-        return 2 * self.damping_ratio < constants.LIGHT * LINE_WIDTH
+        return self.damping_ratio < constants.LIGHT
 
     def band(self, widths: float) -> tuple[float, float]:
         """Return the band in Hz within so many damping ratios of the frequency."""

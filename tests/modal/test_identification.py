@@ -657,6 +657,31 @@ def test_a_very_light_damping_is_found_without_a_description() -> None:
     assert np.abs(deviations(found, "mode_1", 120.0, 0.002)).max() < 4
 
 
+@pytest.mark.parametrize("damping", [0.0007, 0.001])
+def test_a_light_mode_is_found_in_a_long_record(damping: float) -> None:
+    """Thomson's test takes it for a line, but its amplitude and phase are random."""
+    log = acceleration_log(rng(18), [Mode(100.0, damping)], 600.0, RATE, 1.0)
+    found = identify(log, band=(40.0, 300.0))
+    assert found.names == ("mode_1",)
+    assert np.abs(deviations(found, "mode_1", 100.0, damping)).max() < 4
+
+
+@pytest.mark.parametrize("phase_counts", [True, False])
+def test_a_line_whose_amplitude_varies_is_no_mode(
+    phase_counts: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its phase is steady, its amplitude as random as a mode's. Control: the amplitude alone."""
+    n, mode = 300_000, Mode(105.0, 0.015)
+    pole = np.exp(-1 / (2.0 * RATE))
+    varies = lfilter([np.sqrt(1 - pole**2)], [1.0, -pole], rng(27).standard_normal(n))
+    line = (1 + 0.7 * varies) * np.cos(2 * np.pi * 90.0 * np.arange(n) / RATE)
+    values = accelerations(rng(23), [mode], n, RATE, 0.5)[0] + 10.0 * line
+    if not phase_counts:
+        monkeypatch.setattr(constants, "STEADY_PHASE", 2.0)
+    found = identify(make_log({"acc_a": values}, RATE), band=(60.0, 200.0))
+    assert len(found.names) == (1 if phase_counts else 2)
+
+
 def test_mains_that_wander_are_no_mode_and_leave_the_others_alone() -> None:
     """Mains of 100 Hz that wander by 0.05 Hz are a line on the flank of a mode, and no mode."""
     n, mode = 60_000, Mode(105.0, 0.015)

@@ -146,7 +146,7 @@ def search(
     light = [hint for hint in hints if hint.is_light]
     narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
     wide = (width > LINE_WIDTH) & ~(
-        near_lines(model.f, model.zeta, lines) & (width < constants.LIGHT * LINE_WIDTH)
+        near_lines(model.f, model.zeta, lines) & (model.zeta < constants.LIGHT)
     )
     wide = (wide | narrow) & (width * model.f * spectra.duration > 1)
     wide &= model.zeta < constants.MOST_DAMPING

@@ -5,6 +5,9 @@ E|z|⁴ / (E|z|²)² is 2. The harmonic of a shaft whose speed wanders has nearl
 the ratio is 1, and 2 - s² where a share s of the power is its. Its spectrum alone may look like a
 mode's. Harmonics of one shaft wander together: the phase of the n-th is n times that of the first,
 by which the others are recognised, however weak they are.
+
+A line of fixed frequency whose amplitude varies has an envelope like noise, but a steady phase: the
+squares of its envelope add up, |Σ z²| = Σ |z|². Those of a mode have random phases.
 """
 
 from __future__ import annotations
@@ -15,6 +18,7 @@ from math import gcd
 
 import numpy as np
 from scipy.linalg import eigh
+from scipy.ndimage import uniform_filter1d
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray
 from lmshealth.modal import constants
@@ -31,6 +35,10 @@ _CLOSE, _ALIKE = 0.03, 0.5
 # Power over that of everything else from which on the signal stands out.
 _STANDS_OUT = 2.0
 _LEAST_ORDINATES = 8
+# Half width of the band in which a line may be a light mode, where it stands out by the second
+# value over its surroundings, up to the third; and the window over which its power is averaged. All
+# but the second are fractions of the frequency.
+_LIGHT_BAND, _LIGHT_STANDS_OUT, _SURROUNDINGS, _LIGHT_WINDOW = 0.003, 5.0, 0.015, 0.0005
 # Its tails reach beyond where it stands out, by this share of that band to either side.
 _WIDER = 0.3
 # Ratios of the orders of harmonics of one shaft; least mean of a signal that is turned back by the
@@ -120,6 +128,36 @@ def find_harmonic(
         if sigmas < -needed or any(harmonic.follows(h) for h in known):
             return harmonic
     return None
+
+
+def is_random(recording: CrossSpectrum, frequency: float) -> bool:
+    """Return whether what stands out at a frequency in Hz is narrow-band noise: a mode, not a line.
+
+    Neither its amplitude nor its phase is steady, in the channel that shows it best. A record that
+    holds few independent values of the envelope is no evidence.
+    """
+    off = recording.frequency / frequency - 1
+    reach = slice(*np.searchsorted(off, [-_SURROUNDINGS, _SURROUNDINGS]))
+    off, transforms = off[reach], recording.transforms[0, reach] * recording.free[reach, None]
+    power = np.abs(transforms) ** 2
+    around = np.abs(off) > _SURROUNDINGS / 3
+    if not around.any():
+        return False
+    width = max(3, int(_LIGHT_WINDOW * frequency * recording.duration)) | 1
+    level = uniform_filter1d(power, width, axis=0)
+    level /= np.median(power[around], axis=0).clip(1e-300) / np.log(2)
+    at = int(np.abs(off).argmin())
+    channel = int(level[at].argmax())
+    near = (level[:, channel] > _LIGHT_STANDS_OUT) & (np.abs(off) < _LIGHT_BAND)
+    z = transforms[_around(near, at), channel]
+    if not near[at] or z.size < _LEAST_ORDINATES:
+        return False
+    envelope = np.fft.ifft(z, 2 * z.size)
+    steady = np.abs(np.fft.fft(envelope**2, 4 * z.size)).max() / np.sum(np.abs(envelope) ** 2)
+    # Of a harmonic that wanders further the narrow band holds parts, which look random.
+    wide = np.fft.ifft(transforms[:, channel], 2 * len(transforms))
+    kurtosis = min(_kurtosis(one[None])[0] for one in (envelope, wide))
+    return bool(kurtosis > constants.WANDERING_KURTOSIS and steady < constants.STEADY_PHASE)
 
 
 def near_lines(f: FloatArray, zeta: FloatArray, lines: Sequence[float]) -> BoolArray:
