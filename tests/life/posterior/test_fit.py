@@ -553,7 +553,7 @@ def test_a_wander_that_all_modes_have_in_common_is_no_health() -> None:
         ln_f = np.log(FREQUENCY) + 5e-4 * rng.standard_normal((30, 3))
         steps = 3e-3 * rng.standard_normal(30)
         wander = signal.lfilter([np.sqrt(0.19)], [1, -0.9], steps, zi=[0.9 * steps[0]])[0]
-        history = make_history(ln_f + wander[:, None], travel=np.arange(30) * 1e5, std=5e-4)
+        history = make_history(ln_f + wander[:, None], travel=np.linspace(0.0, 2.9e6, 30), std=5e-4)
         for own in (stage, without):
             health = fit_life(history, own, 1, chains=False).health
             low, high = np.quantile(health, (0.05, 0.95), axis=(0, 1))
