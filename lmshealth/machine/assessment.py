@@ -142,9 +142,8 @@ class Assessment:
                 left[mode] = n
         refused = [(one.log, one.mode) for one in self.refused if one.reason in _NAMELESS]
         nameless = {log for log, _ in refused}
-        any_seen = seen.any(axis=1).tolist()
-        empty = zip(history.logs[::-1], (not one for one in any_seen[::-1]), strict=True)
-        if n := len([*takewhile(lambda one: one[1] and one[0] in nameless, empty)]):
+        n_seen = 1 + int(np.flatnonzero(seen.any(axis=1)).max(initial=-1))
+        if n := len([*takewhile(nameless.__contains__, reversed(history.logs[n_seen:]))]):
             left |= {mode: n for log, mode in refused if log == history.logs[-1] and mode}
         return dict(sorted(left.items()))
 
