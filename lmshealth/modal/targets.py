@@ -113,8 +113,10 @@ def _wear(stage: Stage) -> dict[str, FloatArray]:
     if stage.modal_map is None or not (names := stage.informative):
         return {}
     low, high = stage.modal_map.low, stage.modal_map.high
-    unit = np.random.default_rng(0).random((constants.WEAR_STATES, low.size))
-    points = low + (high - low) * unit
+    # States that fill the map evenly: multiples of powers of the root of x^(d + 1) = x + 1.
+    d = low.size
+    powers = np.roots([1, *[0] * (d - 1), -1, -1]).real.max() ** -np.arange(1.0, d + 1)
+    points = low + (high - low) * ((0.5 + np.outer(np.arange(constants.WEAR_STATES), powers)) % 1)
     search = {mode.name: mode.search for mode in stage.modes}
     drift = stage.drift(points, names)
     held = (np.abs(drift) <= np.log1p([search[name] for name in names])).all(axis=1)
