@@ -6,8 +6,8 @@ LEAST_LOGS = 12
 LIFE_SEEN = 0.4
 """Share of the median life by the laws that has passed at the last log, where no usage is stated:
 so late that parts are lost, and so early that most machines are still in service."""
-USAGE_SCATTER, LEAST_PACE = 0.2, 0.05
-"""Standard deviation of the travel from log to log as a share of its mean, and its least value."""
+LEAST_PACE = 0.05
+"""Least travel between two logs as a share of its mean, about which it scatters."""
 ODOMETER = 1e5
 """Odometer at the baseline in m."""
 N_LIVES = 2000

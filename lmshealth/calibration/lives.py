@@ -16,7 +16,6 @@ from lmshealth.errors import BadQuestion, BadStage
 from lmshealth.life import constants as of_life
 from lmshealth.life.posterior.data import KM
 from lmshealth.life.posterior.likelihood import (
-    COMMON,
     NO_MODE,
     common_kernel,
     lone_kernel,
@@ -159,7 +158,8 @@ class Life:
 
     history: History
     parts: tuple[Part, ...]  # one for each health parameter
-    lone: int  # index of the mode that moves alone, `NO_MODE`, or as `COMMON`
+    lone: int  # index of the mode that moves alone, or `NO_MODE`
+    common: float  # standard deviation of ln f by a wander that all modes have in common
     walk: float  # standard deviation of ln f at the last log by its random walk
     rate: float  # mean travel in m per day
     scatter: float  # standard deviation of the travel from log to log, as a share of its mean
@@ -172,7 +172,7 @@ class Life:
     @property
     def kind(self) -> Kind:
         """What happens in this life."""
-        if self.lone > NO_MODE:
+        if self.lone != NO_MODE:
             return "foreign change"
         return "wearing" if any(part.changes for part in self.parts) else "healthy"
 
@@ -185,7 +185,7 @@ class Life:
         n_lives = (len(self.history.logs) - 1) / LOGS_PER_LIFE
         most = max(walk for walk, _ in HEALTHY_WALKS) * np.sqrt(n_lives)
         constant = self.kind == "healthy" and all(part.rate == 0 for part in self.parts)
-        return bool(constant and self.walk <= most and self.lone == NO_MODE)
+        return bool(constant and self.walk <= most and self.common == 0)
 
     @property
     def health(self) -> FloatArray:
@@ -227,7 +227,7 @@ def draw(
     schedule = schedule.resolved(stage)
     assert schedule.km_per_day is not None
     rate = schedule.km_per_day * KM
-    scatter = 0.0 if stage.description.usage.km_per_day else constants.USAGE_SCATTER
+    scatter = 0.0 if stage.description.usage.km_per_day else of_life.USAGE_SCATTER
     clock = np.r_[0.0, np.cumsum(rate * schedule.every * _paces(rng, n - 1, scatter))]
     first = int(rng.integers(5, n - 5)) if rng.random() < steps else None
     at = () if first is None else (float(clock[first - 1] + clock[first]) / 2,)
@@ -242,7 +242,7 @@ def draw(
     level, *alone = stage.drifts(np.log(_path(stage, clock, parts)), names)
     for own, error in zip(alone, map_errors(rng, stage, len(names)), strict=True):
         level = level + error * own
-    moved, lone, walk = without_health(rng, stage, clock, len(names), kind, at)
+    moved, lone, common, walk = without_health(rng, stage, clock, len(names), kind, at)
     known = np.log([mode.frequency_hz for mode in stage.modes if mode.name in names])
     level = level + moved + known + _covariate_effects(rng, stage, covariates, n, len(names))
     mode = np.array([names.index(one.mode) for one in series])
@@ -262,7 +262,7 @@ def draw(
         missing=rng.random((n, mode.size)) < constants.MISSING,
         every=schedule.every,
     )
-    return Life(history, parts, lone, walk, rate, scatter)
+    return Life(history, parts, lone, common, walk, rate, scatter)
 
 
 def make_history(
@@ -381,35 +381,35 @@ def without_health(
     n_modes: int,
     kind: Kind | None = None,
     steps: tuple[float, ...] = (),
-) -> tuple[FloatArray, int, float]:
-    """Draw intercepts, random walks, and the drift of a mode that moves alone, or jumps at a step.
+) -> tuple[FloatArray, int, float, float]:
+    """Draw intercepts, random walks, a common wander, and the drift of a mode that moves alone.
 
-    Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, `NO_MODE`, or, where all
-    modes wander together, as `COMMON`; and the standard deviation of the walks at the last log.
+    Of ln f at each log, ``(n_logs, n_modes)``; the index of that mode, which may jump at a step, or
+    `NO_MODE`; and the standard deviations of the wander, and of the walks at the last log.
     """
-    prior = stage.description.life
-    which, alone, common = rng.random(), prior.lone_mode, prior.common_wander * (n_modes > 1)
+    prior, common = stage.description.life, 0.0
+    which, alone, together = rng.random(), prior.lone_mode, prior.common_wander * (n_modes > 1)
     if kind is not None:
         alone = 1 / n_modes if kind == "foreign change" else 0.0
     lone = int(which / alone) if which < n_modes * alone else NO_MODE
-    if lone == NO_MODE and which < n_modes * alone + common:
-        lone = COMMON - int(rng.integers(len(of_life.COMMON_STDS)))
-    if lone == NO_MODE:
+    if lone == NO_MODE and which < n_modes * alone + together:
+        common = float(rng.choice(of_life.COMMON_STDS))
+    if lone == NO_MODE and not common:
         walk = rng.choice(of_life.WALK_STDS, p=shares(stage, "walk"))
     else:
         stds, weights = zip(*of_life.LONE_WALKS, strict=True)
         walk = rng.choice(stds, p=weights)
     stds_of_logs = walk * np.sqrt(np.diff(clock, prepend=0.0) / clock[-1])
     drift = np.cumsum(stds_of_logs[:, None] * rng.standard_normal((clock.size, n_modes)), axis=0)
-    if lone <= COMMON:
-        cov = of_life.COMMON_STDS[COMMON - lone] ** 2 * common_kernel(np.arange(clock.size))
+    if common:
+        cov = common**2 * common_kernel(np.arange(clock.size))
         drift += rng.multivariate_normal(np.zeros(clock.size), cov, method="cholesky")[:, None]
-    elif lone != NO_MODE:
+    if lone != NO_MODE:
         cov = of_life.LONE_STD**2 * lone_kernel(clock, clock, float(clock[-1]), steps)
         # It is 0 at the baseline: no Cholesky factor.
         drift[:, lone] += rng.multivariate_normal(np.zeros(clock.size), cov, method="eigh")
     level = constants.INTERCEPT_STD * rng.standard_normal(n_modes)
-    return drift + level, lone, float(walk)
+    return drift + level, lone, common, float(walk)
 
 
 def _covariates(rng: np.random.Generator, stage: Stage, n: int) -> dict[str, FloatArray]:

@@ -303,11 +303,11 @@ def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawE
         before = np.array(getattr(scatter_prior(stage), field))
         after = np.zeros(before.size)
         for one, weight in zip(life.scenarios, weights, strict=True):
-            whole = one.density.likelihood.grid
+            whole, grid = one.density.likelihood.grid, one.density.grid
             values = np.unique(getattr(whole, field)[whole.lone == NO_MODE])
-            has = np.equal.outer(values, getattr(one.density.grid, field))
-            # A mode that moves alone has a random walk of its own.
-            own = weight * (one.density.grid.lone == NO_MODE)
+            has = np.equal.outer(values, getattr(grid, field))
+            # Beside a foreign cause random walks have a prior of their own.
+            own = weight * ((grid.lone == NO_MODE) & (grid.common == 0))
             after += one.probability * (has @ own) / max(own.sum(), 1e-12)
         pairs = zip((before / before.sum()).tolist(), after.tolist(), strict=True)
         found[field] = tuple(LawEvidence(b, min(a, 1.0), _NO_PACE) for b, a in pairs)

@@ -347,7 +347,7 @@ def _drawn_now(
     off = density.deviations(one.mixture_draws, one.nuisances, now, rng)[:, 0]
     rate = density.grid.deviation[point, None] ** 2 / now * density.likelihood.data.free
     health = one.health_by_laws(now)[:, 0] * np.exp(off)
-    columns = (health, off, rate, np.maximum(density.grid.lone[point, None], NO_MODE))
+    columns = (health, off, rate, density.grid.lone[point, None])
     shape = (constants.N_ENSEMBLES, one.n_mixture_draws, -1)
     return [part.reshape(shape) for part in columns]
 
@@ -376,7 +376,7 @@ def _lone_modes(
     for one in scenarios:
         grid = one.density.grid
         for own, map_scale, k, x in one.density.by_nuisances(one.mixture_draws, one.nuisances):
-            if grid.lone[k] > NO_MODE:
+            if grid.lone[k] != NO_MODE:
                 some = x[:: own.size // _N_LONE + 1]
                 mean, variance = likelihood.lone_drift(grid, k, map_scale, some)
                 moments = 1.0, mean.mean(), np.mean(variance + mean**2)

@@ -47,8 +47,6 @@ _NEGLIGIBLE = 0.01
 
 NO_MODE = -1
 """Index in place of that of a mode that moves alone: none does."""
-COMMON = -2
-"""Largest such index of a wander that all modes have in common, of the first of `COMMON_STDS`."""
 
 Nuisances = tuple[np.ndarray, np.ndarray]
 """Indices of the map error and of the grid point of each draw, ``(n,)`` each."""
@@ -113,13 +111,17 @@ class LifeCovariance(ReadOnly):
         )
 
     def factor(
-        self, walk: float, noise_scale: float, deviation: float, lone: int = NO_MODE
+        self,
+        walk: float,
+        noise_scale: float,
+        deviation: float,
+        lone: int = NO_MODE,
+        common: float = 0.0,
     ) -> FloatArray:
         """Return the Cholesky factor of Σ, shape ``(n_data, n_data)``."""
         total = self.fixed + self.unknown + noise_scale**2 * self.noise + walk**2 * self.walk
-        if lone <= COMMON:
-            total += constants.COMMON_STDS[COMMON - lone] ** 2 * self.common
-        elif lone != NO_MODE:
+        total += common**2 * self.common
+        if lone != NO_MODE:
             own = (self.mode_of == lone).astype(float)
             total += constants.LONE_STD**2 * np.outer(own, own) * self.lone
         return np.asarray(np.linalg.cholesky(total + deviation**2 * self.deviation))
@@ -193,9 +195,10 @@ class NodeBasis(ReadOnly):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Grid(Rows):
-    """Data whitened at the points of a grid of walk, noise scale, deviation and lone mode.
+    """Data whitened at the points of a grid of walk, noise scale, deviation and foreign causes.
 
-    `lone` is the index of a mode that moves alone, or `NO_MODE`. `design` is R of each mode, shape
+    `lone` is the index of a mode that moves alone, or `NO_MODE`; `common` the standard deviation of
+    a wander that all modes have in common, or 0. `design` is R of each mode, shape
     ``(n_points, n_modes, n_nodes, n_rows)``; `target` is Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest`
     the χ² that no life explains, `log_weight` the log prior minus ln |L|, and `freedom` the data
     less the intercepts and coefficients that they determine, all ``(n_points,)``.
@@ -205,6 +208,7 @@ class Grid(Rows):
     noise_scale: FloatArray
     deviation: FloatArray
     lone: np.ndarray
+    common: FloatArray
     design: FloatArray
     target: FloatArray
     rest: FloatArray
@@ -225,22 +229,20 @@ class Grid(Rows):
         common = data.stage.description.life.common_wander * (n_modes > 1)
         others = (1 - common - n_modes * alone) / np.sum(prior.walk)
         walks = zip(constants.WALK_STDS, prior.walk, strict=True)
-        ways = [(walk, p * others, NO_MODE) for walk, p in walks]
-        if alone:
-            lone = product(range(n_modes), constants.LONE_WALKS)
-            ways += [(walk, alone * p, mode) for mode, (walk, p) in lone]
-        if common:
-            each = common / len(constants.COMMON_STDS)
-            together = product(enumerate(constants.COMMON_STDS), constants.LONE_WALKS)
-            ways += [(walk, each * p, COMMON - k) for (k, _), (walk, p) in together]
-        for (walk, p, lone), (scale, q), (deviation, r) in product(
+        ways = [(walk, p * others, NO_MODE, 0.0) for walk, p in walks]
+        own = product(range(n_modes), constants.LONE_WALKS)
+        ways += [(walk, alone * p, mode, 0.0) for mode, (walk, p) in own]
+        each = common / len(constants.COMMON_STDS)
+        together = product(constants.COMMON_STDS, constants.LONE_WALKS)
+        ways += [(walk, each * p, NO_MODE, std) for std, (walk, p) in together]
+        for (walk, p, lone, std), (scale, q), (deviation, r) in product(
             ways,
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
             zip(constants.DEVIATION_STDS, prior.deviation, strict=True),
         ):
             if p * q * r == 0:
                 continue
-            factor = covariance.factor(walk, scale, deviation, lone)
+            factor = covariance.factor(walk, scale, deviation, lone, std)
             u, basis_q, basis_r = _reduced(data, basis, factor)
             target = basis_q.T @ u
             log_weight = np.log(p * q * r) - np.sum(np.log(np.diag(factor)))
@@ -249,7 +251,7 @@ class Grid(Rows):
             # The trace of Σ⁻¹ times the fixed part.
             fixed = np.sum(solve_triangular(factor, root, lower=True) ** 2)
             values = (design, target, rest, log_weight, data.y.size - fixed)
-            points.append((walk, scale, deviation, lone, *values))
+            points.append((walk, scale, deviation, lone, std, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
 
 
@@ -257,20 +259,28 @@ class Grid(Rows):
 class LifeLikelihood:
     """Likelihood of a life under any scenario, vectorised over walkers.
 
-    Ln parameters at the nodes, `x`, are of shape ``(n, n_nodes, n_parameters)``.
+    Ln parameters at the nodes, `x`, are of shape ``(n, n_nodes, n_parameters)``. `precision` is
+    C⁻¹, ``(n_errors, n_errors)``, of the declared errors of the map, of each mode and within it of
+    each parameter, and `log_det` is ln |C|.
     """
 
     data: LifeData
     covariance: LifeCovariance
     basis: NodeBasis
     grid: Grid
+    precision: FloatArray
+    log_det: float
 
     @classmethod
     def of(cls, history: History, stage: Stage, min_logs: int = constants.MIN_LOGS) -> Self:
         """Make the likelihood of a history; raises what `LifeData.select` raises."""
         data = LifeData.select(history, stage, min_logs)
         covariance, basis = LifeCovariance.of(data), NodeBasis.of(data)
-        return cls(data, covariance, basis, Grid.of(data, covariance, basis))
+        map_cov, p = stage.map_cov(len(data.modes)), len(stage.parameters)
+        precision = np.kron(np.linalg.inv(map_cov), np.eye(p))
+        log_det = p * float(np.linalg.slogdet(map_cov)[1])
+        grid = Grid.of(data, covariance, basis)
+        return cls(data, covariance, basis, grid, precision, log_det)
 
     def path(self, scenario: Scenario, y: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Return ln parameters at the nodes of the lives inside the map, and which are inside.
@@ -302,16 +312,15 @@ class LifeLikelihood:
         rows = self._residuals(grid, x)
         gram = np.moveaxis(rows @ np.swapaxes(rows, 2, 3), (2, 3), (0, 1))[:, :, None]
         scales = np.array([scale for scale, _ in of_stage.MAP_ERRORS])
-        precision, log_det = _errors_of_map(self.data)
         # [C⁻¹ + V Vᵀ, V r; (V r)ᵀ, rᵀr + 1] of each scale of C, lives last for `_pivots`.
         prior = np.zeros((*gram.shape[:2], scales.size, 1, 1))
-        prior[:-1, :-1, :, 0, 0] = precision[:, :, None] / scales**2
+        prior[:-1, :-1, :, 0, 0] = self.precision[:, :, None] / scales**2
         prior[-1, -1] = 1.0
         # One decomposition has both: its last pivot is χ² plus 1.
         pivots = _pivots(np.add(gram, prior, order="C"))
         if (pivots <= 0).any():
             raise np.linalg.LinAlgError("the covariance of the errors of a map is not positive")
-        log_det += 2 * len(precision) * np.log(scales)[:, None, None]
+        log_det = self.log_det + 2 * len(self.precision) * np.log(scales)[:, None, None]
         return grid.rest[:, None] + pivots[-1] - 1, log_det + np.log(pivots[:-1]).sum(axis=0)
 
     def steps_given_laws(
@@ -334,7 +343,7 @@ class LifeLikelihood:
         moved = _SLOPE_STEP * np.concatenate([np.zeros_like(moves[:1]), moves])
         assert stage.modal_map is not None  # LifeData.select() has checked
         low, high = stage.modal_map.low, stage.modal_map.high - _SLOPE_STEP
-        prior = block_diag(np.eye(k) / constants.STEP_PRIOR.std**2, _errors_of_map(self.data)[0])
+        prior = block_diag(np.eye(k) / constants.STEP_PRIOR.std**2, self.precision)
         points = np.linspace(0, grid.walk.size - 1, _START_POINTS).astype(int)
         for point, own in zip(points, np.array_split(np.arange(len(y)), points.size), strict=True):
             size = np.zeros((own.size, k))
@@ -367,19 +376,19 @@ class LifeLikelihood:
         """
         point = grid[np.arange(grid.walk.size) == k]
         settings = (float(grid.walk[k]), float(grid.noise_scale[k]), float(grid.deviation[k]))
-        factor = self.covariance.factor(*settings, int(grid.lone[k]))
+        factor = self.covariance.factor(*settings, int(grid.lone[k]), float(grid.common[k]))
         n_data = cross.shape[2]
         a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
         u, q, _ = _reduced(self.data, self.basis, factor)
         b = a.T @ q
         of_group = a.T.reshape(cross.shape)
         known = of_group @ np.swapaxes(of_group, 1, 2)
-        precision, parts = _errors_of_map(self.data)[0], []
+        parts = []
         # A few lives at a time, for the memory.
         for one in np.array_split(x, x.shape[0] * b.size // _CACHED + 1):
             rows = self._residuals(point, one)[0]
             r, v = rows[:, -1], rows[:, :-1]
-            m = precision / map_scale**2 + v @ np.swapaxes(v, 1, 2)
+            m = self.precision / map_scale**2 + v @ np.swapaxes(v, 1, 2)
             explained = np.linalg.solve(m, v @ r[:, :, None])
             fitted = point.target[0] - r + (np.swapaxes(v, 1, 2) @ explained)[:, :, 0]
             # B Vᵀ M⁻¹ V Bᵀ by a root of M: of the columns of each group alone.
@@ -463,15 +472,6 @@ def drifts(data: LifeData, x: FloatArray) -> FloatArray:
     n, n_moments, n_parameters = x.shape
     drift = data.stage.drifts(x.reshape(-1, n_parameters), data.modes)
     return np.moveaxis(drift.reshape(1 + n_parameters, n, n_moments, len(data.modes)), 3, 0)
-
-
-def _errors_of_map(data: LifeData) -> tuple[FloatArray, float]:
-    """Return C⁻¹, ``(n_errors, n_errors)``, and ln |C| of the declared errors of the map.
-
-    Of each mode, and within it of each parameter.
-    """
-    cov, p = data.stage.map_cov(len(data.modes)), len(data.stage.parameters)
-    return np.kron(np.linalg.inv(cov), np.eye(p)), p * float(np.linalg.slogdet(cov)[1])
 
 
 def _pivots(matrices: FloatArray) -> FloatArray:
