@@ -285,8 +285,8 @@ def reach_of(law: Law, now: float, horizon: float) -> float:
 def early_life(law: AnyLaw, limit: float, rng: np.random.Generator) -> float:
     """Return the travel in m before which few machines of the description reach a limit.
 
-    It is 0 of a change without a law, whose prior states the change up to now, whenever now is: it
-    says nothing of how long machines last.
+    It is 0 of a change without a law, whose prior states the change up to now, whenever now is:
+    lives of other machines do not follow from it.
     """
     if isinstance(law, Free):
         return 0.0
@@ -412,64 +412,52 @@ def _usage(
                 stage=history.stage,
             )
         )
-    travel = np.clip(remaining, days.mean() * steps.sum() / days.sum(), horizon)
-    phase = rng.choice(days.size, remaining.size, p=_phases(days, steps))
-
-    rest = np.sum(_rests(days, steps), axis=0)
+    whole = steps.sum() / days.sum()
+    travel = np.clip(remaining, days.mean() * whole, horizon)
+    probability, rest = _phases(days, steps)
+    phase = rng.choice(days.size, remaining.size, p=probability)
+    # Days and travel of the increments from each one on.
+    lasted, moved = (np.cumsum(own[::-1])[::-1] for own in (days, steps))
 
     def rates(first: np.ndarray) -> FloatArray:
         """Draw the rate of each draw by the increments from one on, ``(n_draws,)``."""
-        total, moved = (np.cumsum(own[::-1])[::-1][first] for own in (days, steps))
-        rate = np.maximum(moved / total, _LEAST_USAGE * steps.sum() / days.sum())
+        rate = np.maximum(moved[first] / lasted[first], _LEAST_USAGE * whole)
         freedom = np.where(first > 0, max(days.size - 2, 1), days.size - 1)
         # Over less than the time between two logs the usage was never observed.
-        ahead = np.maximum(travel / rate, days.mean())
-        scatter = rng.standard_t(freedom) * np.sqrt(rest[first] / freedom * (1 / total + 1 / ahead))
+        variance = 1 / lasted[first] + 1 / np.maximum(travel / rate, days.mean())
+        scatter = rng.standard_t(freedom) * np.sqrt(rest[first] / freedom * variance)
         # Usage is positive: errors are those of its logarithm, with the tails of few logs cut.
         return np.asarray(rate * np.exp(np.clip(scatter / rate, -5.0, 5.0)))
 
     now = rates(phase)
     later = np.where(phase > 0, rates(np.zeros_like(phase)), now)
     # None has ended in the days that the phase has lasted.
-    age = np.cumsum(days[::-1])[::-1][phase]
-    left = age * (rng.uniform(1e-9, 1.0, remaining.size) ** (-1 / constants.USAGE_ENDS) - 1)
-    lasting = np.minimum(travel / now, left)
+    ended = rng.uniform(1e-9, 1.0, remaining.size) ** (-1 / constants.USAGE_ENDS)
+    lasting = np.minimum(travel / now, lasted[phase] * (ended - 1))
     return np.asarray(travel / (lasting + (travel - lasting * now) / later))
 
 
-def _phases(days: FloatArray, steps: FloatArray) -> FloatArray:
-    """Return the probability of each increment to be the first of the present usage, ``(n,)``.
+def _phases(days: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return how probably each increment is the first of the present usage, ``(n,)``.
 
-    That of increment 0 is that the usage has not changed. README.md has the model.
+    That of increment 0 is that the usage has not changed. And the sums of squares per day about the
+    rates before and since, ``(n,)``. README.md has the model.
     """
     n, rate, spread = days.size, steps.sum() / days.sum(), constants.USAGE_SCATTER
-    since, past = _rests(days, steps)
+    total, moved = np.cumsum(days), np.cumsum(steps)
+    before, past = total[:-1], moved[:-1]
+    since, present = total[-1] - before, moved[-1] - past
+    explained = np.append(moved[-1] ** 2 / total[-1], past**2 / before + present**2 / since)
+    rest = np.maximum(np.sum(steps**2 / days) - explained, 0.0)
     typical = (spread * rate) ** 2 * days.mean()
     known, freedom = constants.USAGE_KNOWN * typical, n - 1 + constants.USAGE_KNOWN
-    total, moved = np.cumsum(days)[:-1], np.cumsum(steps)[:-1]
-    apart = moved / total - (steps.sum() - moved) / (days.sum() - total)
-    variance, wide = 1 / total + 1 / (days.sum() - total), rate**2 / typical
-    rest = since[1:] + past[1:] + apart**2 / (variance + wide)
+    variance, wide = 1 / before + 1 / since, rate**2 / typical
+    apart = (past / before - present / since) ** 2 / (variance + wide)
     chance = constants.USAGE_CHANGED
-    changed = np.log(chance / max(n - 1, 1)) - 0.5 * np.log1p(wide / variance)
+    changed = np.log(chance / (n - 1)) - 0.5 * np.log1p(wide / variance)
     log_weight = np.append(np.log1p(-chance), changed)
-    log_weight -= freedom / 2 * np.log(np.append(since[0], rest) + known)
-    return np.asarray(softmax(log_weight))
-
-
-def _rests(days: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return the sums of squares about one rate, of the increments from each one on, and before it.
-
-    ``(n,)`` each, per day; that before the first is 0.
-    """
-    square = steps**2 / days
-    forward = [np.cumsum(own) for own in (square, days, steps)]
-    whole = [own[-1] for own in forward]
-    before = [np.append(0.0, own[:-1]) for own in forward]
-    since = [total - own for total, own in zip(whole, before, strict=True)]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        rests = [np.maximum(a - c**2 / b, 0.0) for a, b, c in (since, before)]
-    return rests[0], np.nan_to_num(rests[1])
+    log_weight -= freedom / 2 * np.log(rest + np.append(0.0, apart) + known)
+    return np.asarray(softmax(log_weight)), rest
 
 
 def parameters_with_limit(stage: Stage) -> list[tuple[int, ParameterSpec]]:

@@ -461,7 +461,7 @@ def test_early_lives_of_a_description_count_as_proven() -> None:
 
 
 def test_a_change_without_a_law_proves_no_more_than_the_machine_itself() -> None:
-    """Its prior has the scale of the travel seen: lives of other machines are not in it.
+    """Its prior has the scale of the travel seen: lives of other machines do not follow from it.
 
     With a twentieth of the lives by that prior up to now, which are longer than the travel seen,
     11 of 36 machines that settle, rest and fail late got a service after the end.
