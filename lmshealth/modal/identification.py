@@ -41,7 +41,7 @@ from lmshealth.modal.ambient.wandering import is_random, near_lines
 from lmshealth.modal.deterministic.free_decays import identify_decays
 from lmshealth.modal.deterministic.frequency_response import read_frf
 from lmshealth.modal.modes import Modes, Rejection, merge, numbered
-from lmshealth.modal.naming import is_near, name_resonances
+from lmshealth.modal.naming import is_near_light, name_resonances
 from lmshealth.modal.targets import (
     Target,
     check_band,
@@ -518,13 +518,12 @@ def _thomson_lines(
     Those are omitted that may be a light mode, as one is described there or they are random.
     """
     longest = max(stretches, key=lambda s: s.stop - s.start)
-    light = [hint for hint in hints if hint.is_light]
     return [
         (channel.name, f, amplitude)
         for channel in log.channels
         for span in spans
         for f, amplitude in find_lines(channel, (longest,), log.sample_rate, span).tolist()
-        if not (any(is_near(hint, f) for hint in light) or is_random(recording, f))
+        if not (is_near_light(hints, f) or is_random(recording, f))
     ]
 
 

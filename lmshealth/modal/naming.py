@@ -146,6 +146,11 @@ def is_near(target: Target, frequency: float, *, slack: float = 1.0) -> bool:
     return bool(abs(np.log(frequency / target.frequency)) <= slack * np.log1p(target.search))
 
 
+def is_near_light(targets: Sequence[Target], frequency: float) -> bool:
+    """Return whether a described mode that may look like a line is near a frequency in Hz."""
+    return any(one.is_light and is_near(one, frequency) for one in targets)
+
+
 def likeness(modes: Modes, targets: Sequence[Target]) -> FloatArray:
     """Return the modal assurance criterion of found and described shapes, ``(n_modes, n_targets)``.
 

@@ -247,5 +247,5 @@ def test_whole_processes(race: Race, both: Programs, name: str, asked: float, to
         "one new log on 39": both.run,
         "prognose after a step": both.prognose,
     }
-    ratios = both.ratios(words[name], new_log="new log" in name)
+    ratios = both.ratios(words[name])
     race.record(ratios, name=f"{name}, whole process", beside=REVISION, at_most=asked / today)

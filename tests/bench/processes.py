@@ -47,16 +47,19 @@ class Programs:
     folder: Path
     codes: dict[str, Path]
 
-    def ratios(self, words: Callable[[str], list[object]], *, new_log: bool = False) -> list[float]:
+    def forget(self, name: str) -> None:
+        """Restore the results of a program from all logs but the last."""
+        own = self.folder / name
+        shutil.rmtree(own / "out")
+        shutil.copytree(own / "known", own / "out")
+
+    def ratios(self, words: Callable[[str], list[object]]) -> list[float]:
         """Return the processor time of this code in times of that before, of each turn."""
         found = []
         for _ in range(TURNS):
             spent = []
             for name in self.codes:
-                own = self.folder / name
-                if new_log:
-                    shutil.rmtree(own / "out", ignore_errors=True)
-                    shutil.copytree(own / "known", own / "out")
+                self.forget(name)
                 spent.append(self.cpu_s(name, *words(name)))
             found.append(spent[1] / spent[0])
         return found
@@ -82,9 +85,8 @@ class Programs:
 
 def shares(both: Programs) -> dict[str, float]:
     """Return the shares of the processor time of one new log, all in one process."""
-    out, profile = both.folder / "now" / "out", both.folder / "profile"
-    shutil.rmtree(out)
-    shutil.copytree(both.folder / "now" / "known", out)
+    profile = both.folder / "profile"
+    both.forget("now")
     words = [str(word) for word in (*both.run("now"), "--workers", 1)]
     profiled = ["-m", "cProfile", "-o", str(profile), "-m", "lmshealth", *words]
     subprocess.run([sys.executable, *profiled], env=one_thread(), capture_output=True, cwd=ROOT,

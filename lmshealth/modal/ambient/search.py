@@ -31,7 +31,7 @@ from lmshealth.modal.ambient.joint_model import (
 from lmshealth.modal.ambient.subspace import Candidate, Poles, find_candidates
 from lmshealth.modal.ambient.wandering import Harmonic, find_harmonic, near_lines
 from lmshealth.modal.ambient.whittle import response
-from lmshealth.modal.naming import is_near
+from lmshealth.modal.naming import is_near, is_near_light
 from lmshealth.modal.targets import Target
 from lmshealth.signal.constants import LINE_WIDTH
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra
@@ -143,8 +143,7 @@ def search(
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
-    light = [hint for hint in hints if hint.is_light]
-    narrow = np.array([any(is_near(hint, f) for hint in light) for f in model.f.tolist()], bool)
+    narrow = np.array([is_near_light(hints, f) for f in model.f.tolist()], bool)
     wide = (width > LINE_WIDTH) & ~(
         near_lines(model.f, model.zeta, lines) & (model.zeta < constants.LIGHT)
     )
