@@ -50,8 +50,9 @@ from tests.oracles import cdf_at
 from tests.statistical.evidence import uniform
 
 N_LOGS = 12
-# Lives follow the law and the map: without a change of another course, or of a mode alone.
-BY_LAW = f"{TEMPERATURE}\n[life]\nfree = 0.0\nlone_mode = 0.0\n"
+# Lives follow the law and the map: without a change of another course, of a mode alone, or a wander
+# of all modes together.
+BY_LAW = f"{TEMPERATURE}\n[life]\nfree = 0\nlone_mode = 0\ncommon_wander = 0\n"
 
 
 def draw_history(rng: np.random.Generator, stage: Stage) -> tuple[History, float, float]:

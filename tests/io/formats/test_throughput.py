@@ -11,6 +11,7 @@ import pytest
 def test_readers_are_as_fast_as_their_libraries(root):
     """No bounded reader takes two and a half times its library's time, however busy the machine.
 
+    Of formats read in a process of their own, writing the samples to files counts as the library's.
     Nor does one hold four minutes of a longer log, which its library does.
     """
     command = [sys.executable, "-W", "error", "-m", "studies.cost.reading.run", "--quick"]
