@@ -406,12 +406,19 @@ def _is_admissible(trial: _State, before: _State) -> bool:
     # A mode narrower than a line at an end of the band represents one outside.
     if narrow[:_END].any() or narrow[-_END:].any():
         return False
-    f, zeta = trial.modes
-    near = np.abs(f[:, None] - f) < np.maximum.outer(zeta * f, zeta * f)
-    # Modes within a half-power bandwidth must reduce the distortion.
-    if near.sum() == f.size:
+    # Each mode within a half-power bandwidth of others must reduce the distortion.
+    if not (crowded := _crowded(trial)):
         return True
-    return trial.distortion <= constants.LESS_DISTORTED * before.distortion
+    further = max(1, crowded - _crowded(before))
+    return trial.distortion <= constants.LESS_DISTORTED**further * before.distortion
+
+
+def _crowded(state: _State) -> int:
+    """Count modes within a half-power bandwidth of one below."""
+    f, zeta = state.modes
+    width = (zeta * f)[order := np.argsort(f)]
+    near = np.abs(f[order][:, None] - f[order]) < np.maximum.outer(width, width)
+    return int(np.count_nonzero(np.triu(near, 1).any(axis=0)))
 
 
 def _wide_enough(state: _State) -> BoolArray:
