@@ -829,9 +829,10 @@ def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
     found = identify(read_log(path), band=(20.0, 200.0))
     assert found.frequency[0] == pytest.approx(40.5, rel=0.005)
     assert abs(found.damping_ratio[0] - 0.015) < 3 * found.damping_ratio_std[0]
-    # 140 and 143 Hz overlap: one mode stands for both.
-    apart = np.abs(found.frequency[:, None] - [140.0, 143.0]).min(axis=1)
-    assert (apart < 3 * found.frequency_std).sum() == 1
+    # 140 and 143 Hz overlap: one mode stands for both, and may lie between them. Which of the weak
+    # modes beside it are found depends on how the processor rounds.
+    low, high = 140 - 3 * found.frequency_std, 143 + 3 * found.frequency_std
+    assert ((low < found.frequency) & (found.frequency < high)).sum() == 1
     assert ((found.damping_ratio > 0.01) & (found.damping_ratio < 0.05)).all()
     assert np.abs(found.frequency - np.array([[50.0], [100.0], [150.0]])).min() > 1
     assert {50, 100} <= {round(line.frequency) for line in found.lines if line.kind == "mains"}

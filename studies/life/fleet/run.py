@@ -53,7 +53,7 @@ FLEET, SMALL, LEAST = "fleet", "small fleet", "fleet of the quick form"
 N_TEACHERS = {FLEET: 16, SMALL: 8, LEAST: 4}
 N_YOUNG, MOST_DRAWN = {FLEET: 4, SMALL: 4, LEAST: 2}, 12
 # Fleets with a prior from another fleet too.
-FOREIGN_FLEETS, TIMES = 20, 5.0
+FOREIGN_FLEETS, TIMES = 40, 5.0
 ENOUGH = 5  # fleets, of which a mean has a standard error
 DESCRIPTION, LEARNED, LAWS, KNOWN = "description", "learned", "learned, laws alone", "known"
 WORN, FOREIGN = "only the worn teach", "another fleet teaches"
