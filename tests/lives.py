@@ -455,6 +455,7 @@ def make_prognosis(remaining: FloatArray, usage: FloatArray, *, horizon: float =
         limits=np.array([0.6, np.nan]),
         remaining=np.column_stack([remaining, remaining]),
         usage=np.array(usage),
+        usage_now=np.array(usage),
         half=remaining / 2,
         horizon=horizon,
         health=np.full((remaining.size, 1), 0.8),

@@ -4,7 +4,7 @@ README.md has both models.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import msgspec
@@ -33,7 +33,8 @@ _LOG_PRIOR = -0.5 * (_MEAN**2 / (1 - _VARIANCE) + np.log(1 - _VARIANCE))
 _SHARE_EDGES = np.sin(np.linspace(0, np.pi / 2, 33)) ** 2
 # By the field that is the prior of a law's pace: the natural parameter, and its unit.
 _PACES = {"life_km": ("life_m", 1e3), "rate_per_km": ("rate_per_m", 1e-3)}
-_SCATTERS = tuple(field.name for field in fields(ScatterPrior))
+# Fields of `ScatterPrior`, and the constants that have their values.
+_SCATTERS = {"walk": "WALK_STDS", "noise_scale": "NOISE_SCALES", "deviation": "DEVIATION_STDS"}
 _NO_PACE = np.zeros((1, 1))
 
 Pace = Lognormal | Normal
@@ -299,17 +300,17 @@ def _scatter_evidence(stage: Stage, life: LifePosterior) -> dict[str, tuple[LawE
     """Return the evidence on each value of the grid of scatter, averaged over scenarios."""
     weights = [one.density.weights(one.some_draws) for one in life.scenarios]
     found = {}
-    for field in _SCATTERS:
+    for field, values in _SCATTERS.items():
         before = np.array(getattr(scatter_prior(stage), field))
-        after = np.zeros(before.size)
+        before, after = before / before.sum(), np.zeros(before.size)
         for one, weight in zip(life.scenarios, weights, strict=True):
-            whole, grid = one.density.likelihood.grid, one.density.grid
-            values = np.unique(getattr(whole, field)[whole.lone == NO_MODE])
-            has = np.equal.outer(values, getattr(grid, field))
-            # Beside a foreign cause random walks have a prior of their own.
-            own = weight * ((grid.lone == NO_MODE) & (grid.common == 0))
-            after += one.probability * (has @ own) / max(own.sum(), 1e-12)
-        pairs = zip((before / before.sum()).tolist(), after.tolist(), strict=True)
+            grid = one.density.grid
+            has = np.equal.outer(getattr(constants, values), getattr(grid, field))
+            # Beside a foreign cause random walks have their own prior: no evidence on this one.
+            shows = (grid.lone == NO_MODE) & (grid.common == 0) if field == "walk" else True
+            own = weight * shows
+            after += one.probability * (has @ own + max(1 - own.sum(), 0.0) * before)
+        pairs = zip(before.tolist(), after.tolist(), strict=True)
         found[field] = tuple(LawEvidence(b, min(a, 1.0), _NO_PACE) for b, a in pairs)
     return found
 

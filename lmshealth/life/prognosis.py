@@ -61,9 +61,11 @@ class Prognosis(Result):
     unidentifiable: tuple[str, ...]
     limits: FloatArray  # NaN for ``any``, ``(n + 1,)``
     # Draws of the remaining travel in m, negative if the limit has been passed and infinite if it
-    # is never reached, ``(n_draws, n + 1)``; and of the mean travel in m per day, ``(n_draws,)``.
+    # is never reached, ``(n_draws, n + 1)``; and of the travel in m per day, its mean over the
+    # remaining life and that of the present, ``(n_draws,)``.
     remaining: FloatArray
     usage: FloatArray
+    usage_now: FloatArray
     # Draws of the travel in m, by the laws, at which half of ln(health now / limit) is lost, of the
     # limit that is reached first, ``(n_draws,)``.
     half: FloatArray
@@ -93,7 +95,7 @@ class Prognosis(Result):
             self,
             ("limits", n),
             ("remaining", n_draws, n),
-            ("usage half", n_draws),
+            ("usage usage_now half", n_draws),
             ("health", self.health.shape[0], n - 1),
             ("curve_quantiles", 5, self.curve_travel.size, n - 1),
         )
@@ -195,7 +197,7 @@ def prognosis_of(life: LifePosterior, history: History, stage: Stage) -> Prognos
     since = float(history.travel[-1] - history.travel[history.baseline])
     of_passage, of_usage, of_curve = (np.random.default_rng(own) for own in seeds)
     remaining, half = passages(life, limited, of_passage, now=since, horizon=horizon)
-    usage = _usage(history, stage, of_usage, remaining[:, -1], horizon)
+    usage, usage_now = _usage(history, stage, of_usage, remaining[:, -1], horizon)
     travel = _curve_grid(remaining, since, horizon)
     columns = [j for j, _ in limited]
     unit = np.array([parameter.baseline for _, parameter in limited])
@@ -209,6 +211,7 @@ def prognosis_of(life: LifePosterior, history: History, stage: Stage) -> Prognos
         limits=np.array([p.limit.below for _, p in limited if p.limit] + [np.nan]),
         remaining=remaining,
         usage=usage,
+        usage_now=usage_now,
         half=half,
         horizon=horizon,
         health=life.health.reshape(-1, len(life.parameters))[:, columns] * unit,
@@ -398,11 +401,14 @@ def _curve_grid(remaining: FloatArray, since: float, horizon: float) -> FloatArr
 
 def _usage(
     history: History, stage: Stage, rng: np.random.Generator, remaining: FloatArray, horizon: float
-) -> FloatArray:
-    """Draw the mean travel in m per day over the remaining life, ``(n_draws,)`` (README.md)."""
+) -> tuple[FloatArray, FloatArray]:
+    """Draw the travel in m per day: its mean over the remaining life, and now (README.md).
+
+    Shape ``(n_draws,)`` each.
+    """
     stated = stage.description.usage.km_per_day
     if stated is not None:
-        return np.full(remaining.size, stated * KM)
+        return (np.full(remaining.size, stated * KM),) * 2
     days, steps = np.diff(history.seconds) / SECONDS_PER_DAY, np.diff(history.travel)
     days, steps = days[days > 0], steps[days > 0]
     if days.size < 2 or steps.sum() <= 0:
@@ -412,20 +418,24 @@ def _usage(
                 stage=history.stage,
             )
         )
-    whole = steps.sum() / days.sum()
+    whole, spread = steps.sum() / days.sum(), constants.USAGE_SCATTER
     travel = np.clip(remaining, days.mean() * whole, horizon)
     probability, rest = _phases(days, steps)
     phase = rng.choice(days.size, remaining.size, p=probability)
+    # Two phases of few increments each show little of their scatter.
+    known = constants.USAGE_KNOWN, constants.USAGE_KNOWN * (spread * whole) ** 2 * days.mean()
     # Days and travel of the increments from each one on.
     lasted, moved = (np.cumsum(own[::-1])[::-1] for own in (days, steps))
 
     def rates(first: np.ndarray) -> FloatArray:
         """Draw the rate of each draw by the increments from one on, ``(n_draws,)``."""
         rate = np.maximum(moved[first] / lasted[first], _LEAST_USAGE * whole)
-        freedom = np.where(first > 0, max(days.size - 2, 1), days.size - 1)
+        changed = first > 0
+        freedom = days.size - 1 + changed * (known[0] - 1)
+        square = (rest[first] + changed * known[1]) / freedom
         # Over less than the time between two logs the usage was never observed.
         variance = 1 / lasted[first] + 1 / np.maximum(travel / rate, days.mean())
-        scatter = rng.standard_t(freedom) * np.sqrt(rest[first] / freedom * variance)
+        scatter = rng.standard_t(freedom) * np.sqrt(square * variance)
         # Usage is positive: errors are those of its logarithm, with the tails of few logs cut.
         return np.asarray(rate * np.exp(np.clip(scatter / rate, -5.0, 5.0)))
 
@@ -434,7 +444,7 @@ def _usage(
     # None has ended in the days that the phase has lasted.
     ended = rng.uniform(1e-9, 1.0, remaining.size) ** (-1 / constants.USAGE_ENDS)
     lasting = np.minimum(travel / now, lasted[phase] * (ended - 1))
-    return np.asarray(travel / (lasting + (travel - lasting * now) / later))
+    return travel / (lasting + (travel - lasting * now) / later), now
 
 
 def _phases(days: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:

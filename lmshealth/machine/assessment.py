@@ -143,8 +143,10 @@ class Assessment:
         refused = [(one.log, one.mode) for one in self.refused if one.reason in _NAMELESS]
         nameless = {log for log, _ in refused}
         n_seen = 1 + int(np.flatnonzero(seen.any(axis=1)).max(initial=-1))
-        if n := len([*takewhile(nameless.__contains__, reversed(history.logs[n_seen:]))]):
-            left |= {mode: n for log, mode in refused if log == history.logs[-1] and mode}
+        last_logs = [*takewhile(nameless.__contains__, reversed(history.logs[n_seen:]))]
+        if last_logs:
+            for mode in {*left, *(mode for log, mode in refused if log in last_logs and mode)}:
+                left[mode] = left.get(mode, 0) + len(last_logs)
         return dict(sorted(left.items()))
 
     @property

@@ -76,7 +76,7 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     risk = np.nan if by is None else risk_before(prognosis, by)[1]
     planned_risk = unknown if planned is None else risk_before(prognosis, planned)
     every, earliest = _inspection(prognosis, decision)
-    next_log = day_after(prognosis, every / float(np.median(prognosis.usage)))
+    next_log = day_after(prognosis, days_to(prognosis, every))
     end = day_after(prognosis, earliest)
     log_by = min((day for day in (next_log, by, end) if day is not None), default=None)
     return Service(kind, by, wait, risk, planned, planned_risk, *criterion, log_by, every, end)
@@ -147,6 +147,15 @@ def remaining_days(prognosis: Prognosis) -> FloatArray:
         return np.asarray(prognosis.censored() / prognosis.usage[:, None])
 
 
+def days_to(prognosis: Prognosis, travel: float) -> float:
+    """Return the days to a travel in m within the remaining life, by the larger median usage.
+
+    A present usage above that of the record goes on for some time; one below it may end soon.
+    """
+    fastest = np.maximum(prognosis.usage, prognosis.usage_now)
+    return travel / float(np.median(fastest))
+
+
 def day_after(prognosis: Prognosis, wait: float) -> date | None:
     """Return the day so many days after the last log, at least that of the log.
 
@@ -161,8 +170,7 @@ def day_after(prognosis: Prognosis, wait: float) -> date | None:
 def _wait(prognosis: Prognosis, decision: Decision) -> float:
     """Return the days from the last log to the service, infinite without one."""
     if decision.cost_ratio is not None:
-        usage = float(np.median(prognosis.usage))
-        return cheapest_travel(prognosis, decision.cost_ratio) / usage
+        return days_to(prognosis, cheapest_travel(prognosis, decision.cost_ratio))
     assert decision.accepted is not None  # one of the two is
     max_risk = decision.accepted
     remaining = prognosis.remaining[:, -1]

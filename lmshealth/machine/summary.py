@@ -17,7 +17,7 @@ from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import Service, day_after, remaining_days, risk_before
+from lmshealth.machine.service import Service, day_after, days_to, remaining_days, risk_before
 from lmshealth.stage.description import ParameterSpec, Stage
 
 Step = Literal[
@@ -86,7 +86,7 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     first = first_limit(prognosis)
     name = first[0] if first else prognosis.parameters[0]
     words = {spec.name: spec.word for spec in assessment.stage.parameters}
-    every = service.inspect_every / float(np.median(prognosis.usage))
+    every = days_to(prognosis, service.inspect_every)
     return NextStep(
         kind=step,
         parameter=name,

@@ -8,8 +8,9 @@ Numerical tolerances, step sizes and iteration counts are next to the code that 
 
 # Usable share of the sample rate: anti-alias filters reach below the Nyquist frequency.
 USABLE = 0.45
-# Standard deviations of ln f and ln ζ beyond which an estimate is refused: a frequency known to
-# 3 % cannot show the drifts that are tracked, a damping known to a factor of two cannot be used.
+# Standard deviations of ln f and ln ζ beyond which an estimate is refused, before an average over
+# coloured forces widens it: a frequency known to 3 % cannot show the drifts that are tracked, a
+# damping known to a factor of two cannot be used.
 WORST_STD_LN_F, WORST_STD_LN_ZETA = 0.03, 0.7
 # Most channels of free decays that are fitted together, those that add most to each other: the time
 # of a fit grows with the cube of their number, and 10 hold all but 2 % of the information of 16.

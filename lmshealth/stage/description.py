@@ -498,7 +498,7 @@ def _check_map(path: Path, description: Description, modal_map: ModalMap) -> Non
             f"tracked [[mode]] ({described})"
         )
     each, most = description.life.lone_mode, 1 - description.life.common_wander
-    if each * len(known) > most:
+    if each * len(known) > most + 1e-12:
         raise BadStage(
             f"{path}: life.lone_mode: {len(known)} modes with {each:g} each and the common wander "
             f"have a probability above 1 together; needed is at most {most / len(known):.3g}"

@@ -28,7 +28,7 @@ from lmshealth.life.fleet_prior import (
     pace_likelihood,
 )
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
-from lmshealth.life.posterior.likelihood import LifeLikelihood, scatter_prior
+from lmshealth.life.posterior.likelihood import LifeLikelihood, common_kernel, scatter_prior
 from lmshealth.life.posterior.scenarios import list_scenarios
 from lmshealth.life.prognosis import Prognosis
 from lmshealth.stage.degradation_laws import AnyLaw, HertzWear, Linear, Loosening, Power, Unchanging
@@ -415,9 +415,25 @@ def test_a_free_change_has_its_share_of_the_prior_and_no_evidence_of_its_own(
     assert [one.prior for one in preload.values()] == pytest.approx([0.4, 0.4])
     for kind, one in preload.items():
         assert one.posterior == pytest.approx(laws.get((kind, 0.0), 0.0))
-    # The scatter is that of draws in which no mode moves alone.
     for own in evidence.scatter.values():
         assert sum(one.posterior for one in own) == pytest.approx(1, abs=1e-9)
+
+
+def test_a_machine_that_wanders_is_little_evidence_on_walks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Where a wander of all modes is probable, walks keep their prior."""
+    monkeypatch.setattr(constants, "WALK_STDS", (1e-5, 1e-3, 5e-3))
+    monkeypatch.setattr(constants, "WALK_PRIOR", (0.4, 0.3, 0.3))
+    stage = make_stage(tmp_path, (WEAR_OR_NOT,), n_modes=3, tail="[life]\ncommon_wander = 0.4\n")
+    rng = np.random.default_rng(4)
+    together = 3e-3 * rng.multivariate_normal(np.zeros(24), common_kernel(np.arange(24)))
+    noise = 3e-4 * rng.standard_normal((24, 3))
+    posterior = fitted(make_history(np.log(FREQUENCY) + together[:, None] + noise, std=3e-4), stage)
+    scatter = machine_evidence(stage, posterior).scatter
+    for own in scatter.values():
+        assert sum(one.posterior for one in own) == pytest.approx(1, abs=1e-9)
+    assert [one.posterior / one.prior for one in scatter["walk"]] == pytest.approx([1] * 3, abs=0.3)
 
 
 def test_a_law_that_is_ruled_out_changes_its_share_alone(small_grid: None, stage: Stage) -> None:

@@ -202,7 +202,7 @@ def test_usage_that_is_stated_is_taken(fading: Prognosis) -> None:
 def test_stated_usage_needs_no_odometer(stage: Stage) -> None:
     """A machine with one log, which gives no usage, has the stated usage."""
     rng, left = np.random.default_rng(9), np.array([-1e5, 1e6, np.inf])
-    usage = _usage(cut(fading_life(1e-4), 1), stage, rng, left, 2e7)
+    usage, _ = _usage(cut(fading_life(1e-4), 1), stage, rng, left, 2e7)
     np.testing.assert_array_equal(usage, np.full(3, 2e4), strict=True)
 
 
@@ -230,7 +230,7 @@ def test_usage_is_estimated_from_the_odometer(unstated: Stage) -> None:
     """Of three weeks' logs the mean of years to come has the relative error of Student's t."""
     history, n_draws = moved(np.random.default_rng(7), 3, 0.2), 10_000
     steps = np.diff(history.travel)
-    usage = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, np.inf), 2e8)
+    usage, _ = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, np.inf), 2e8)
     off = np.log(usage * 7 / steps.mean()) / (np.std(steps, ddof=1) / steps.mean())
     assert stats.kstest(off * np.sqrt(3), stats.t(2).cdf).pvalue > 1e-3
     # Negative control: a normal distribution in place of Student's t.
@@ -242,7 +242,7 @@ def test_a_short_life_has_the_usage_of_few_days(unstated: Stage) -> None:
     """The uncertainty of the next week is the scatter of weeks and that of the mean of 40."""
     history, n_draws = moved(np.random.default_rng(7), 40, 0.2), 10_000
     steps = np.diff(history.travel)
-    usage = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, 1.4e5), 1e7)
+    usage, _ = _usage(history, unstated, np.random.default_rng(8), np.full(n_draws, 1.4e5), 1e7)
     off = np.log(usage * 7 / steps.mean()) / (np.std(steps, ddof=1) / steps.mean())
     spread = np.sqrt(1 / 40 + steps.mean() / 1.4e5)
     assert stats.kstest(off / spread, stats.norm.cdf).pvalue > 1e-3
@@ -256,7 +256,7 @@ def test_life_past_or_without_end_has_a_usage(unstated: Stage) -> None:
     history = moved(np.random.default_rng(11), 10, 0.3)
     stds = []
     for left in (-1e6, 1e6, np.inf):
-        usage = _usage(history, unstated, np.random.default_rng(12), np.full(4000, left), 2e7)
+        usage, _ = _usage(history, unstated, np.random.default_rng(12), np.full(4000, left), 2e7)
         assert (usage > 0).all()
         stds.append(np.std(np.log(usage)))
     assert stds[0] > stds[1] > stds[2] > 0
@@ -275,7 +275,8 @@ def test_usage_is_that_of_the_present_phase(unstated: Stage, since: int, factor:
     """With the mean of the whole record, services of a machine with a new shift came too late."""
     history = with_usage(np.where(np.arange(30) < 30 - since, 1.0, factor))
     left = np.full(4000, 0.5 * since * factor * 1.4e5)  # half as long as the phase has lasted
-    usage = _usage(history, unstated, np.random.default_rng(1), left, 2e8) / 20_000
+    usage, _ = _usage(history, unstated, np.random.default_rng(1), left, 2e8)
+    usage = usage / 20_000
     assert np.median(usage) == pytest.approx(factor, rel=0.15)
     low, high = np.quantile(usage, (0.05, 0.95))
     assert low < factor < high
@@ -286,7 +287,7 @@ def test_usage_is_that_of_the_present_phase(unstated: Stage, since: int, factor:
 def test_a_holiday_is_no_usage_of_years_to_come(unstated: Stage) -> None:
     """A phase of one log lasts about as long again: the mean of a long life is that before."""
     history = with_usage(np.append(np.ones(29), 0.02))
-    usage = _usage(history, unstated, np.random.default_rng(1), np.full(4000, 7e6), 2e8)
+    usage, _ = _usage(history, unstated, np.random.default_rng(1), np.full(4000, 7e6), 2e8)
     assert np.median(usage) == pytest.approx(20_000, rel=0.15)
     assert np.mean(usage < 10_000) < 0.25
 

@@ -255,6 +255,14 @@ def test_a_last_log_without_a_certain_name_deviates(make: Maker, reason: str, to
     found = [one for one in notices(bad) if one.code == "last-logs-left-out"]
     assert [one.severity for one in found] == told * ["caution"]
     assert bad.left_out == (dict.fromkeys(sorted(modes), 1) if told else {})
+    if told:  # the log before was far from those before it
+        assert good.track is not None
+        n = len(good.track.logs)
+        outliers = tuple((n - 2, mode) for mode in modes[:1])
+        both = replace(bad, track=replace(good.track, outliers=outliers))
+        assert both.left_out == dict.fromkeys(sorted(modes), 1) | {modes[0]: 2}
+        found = [one for one in notices(both) if one.code == "last-logs-left-out"]
+        assert {one.where: one.severity for one in found}[modes[0]] == "serious"
     # One of two logs at the end that has a name is no outlier.
     with_name = replace(bad, history=good.history)
     assert with_name.left_out == {}

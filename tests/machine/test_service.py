@@ -222,6 +222,19 @@ def test_costs_choose_a_day_at_the_median_usage() -> None:
     assert low == high == probability_before(prognosis, date(2026, 3, 21))[1, -1]
 
 
+def test_a_new_shift_brings_the_next_log_and_the_cheapest_day_forward() -> None:
+    """Travel to the next log is at the present usage, not at that of the whole life to come."""
+    prognosis = aged(weibull(3.0), 1e5)
+    busy = replace(prognosis, usage_now=2 * prognosis.usage)
+    slow = replace(prognosis, usage_now=prognosis.usage / 2)
+    before, after, low = (decide(one, Decision(cost_ratio=10.0)) for one in (prognosis, busy, slow))
+    assert after.wait == pytest.approx(before.wait / 2)
+    assert before.inspect_by is not None and after.inspect_by is not None
+    assert after.inspect_by < before.inspect_by
+    # A rest may end: what comes is as before.
+    assert (low.wait, low.inspect_by) == (before.wait, before.inspect_by)
+
+
 # a given day
 
 

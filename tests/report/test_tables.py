@@ -76,6 +76,7 @@ def prognosis(remaining: np.ndarray, usage: float = 10_000.0) -> Prognosis:
         limits=np.array([0.6, np.nan]),
         remaining=np.column_stack([remaining, remaining]),
         usage=np.full(n, usage),
+        usage_now=np.full(n, usage),
         half=remaining / 2,
         horizon=2e7,
         health=np.full((n, 1), 0.9),

@@ -240,7 +240,7 @@ def test_usage_covers_what_comes(rng: np.random.Generator, claims: Claims, tmp_p
             history = make_history(still, travel=np.r_[0, np.cumsum(steps)])
             truth = 1.4e5 / 7 * (1 + 0.1 * rng.standard_normal(weeks).mean())
             for found, left in ((levels, weeks * 1.4e5), (wrong, 4e7)):
-                usage = _usage(history, stage, rng, np.full(500, left), 4e7)
+                usage, _ = _usage(history, stage, rng, np.full(500, left), 4e7)
                 found.append(np.mean(usage < truth))
         claims.claim(name, uniform(levels))
         claims.control(name, uniform(wrong))

@@ -51,6 +51,8 @@ class World:
     std: tuple[float, float] = STD_F  # range of the standard deviations of ln f
     walk: float = 3e-4  # standard deviation of the random walk of ln f over the logs
     wander: float = 0.0  # standard deviation of its stationary wander, five logs long
+    common: float = 0.0  # the same of a wander of all modes together, ten logs long
+    busier: float = 1.0  # factor on the travel per day from one of the logs on
     season_k: float = 6.0  # amplitude of the seasons
     per_kelvin: float = -5e-4  # median effect on ln f
     # Standard deviation of the jumps of ln f at one log, which is declared as a retuning.
@@ -73,6 +75,8 @@ OTHERS = {
     "mount, loosening, short logs": World(mount="loosening", std=WIDE_STD_F),
     "preload, linear, a declared step": World(preload="linear", retuned=0.01),
     "preload, linear, a sudden loss": World(preload="jump", jumps=True),
+    "preload, linear, common wander": World(preload="linear", walk=0.0, common=2e-3),
+    "preload, linear, usage doubles": World(preload="linear", busier=2.0),
 }
 LONE = {
     f"{mode} alone, {100 * size:.0f} %": World(lone=(mode, size))
@@ -83,6 +87,7 @@ HEALTHY = {
     "healthy, quiet": World(walk=0.0),
     "healthy, wander": World(walk=0.0, wander=8e-4),
     "healthy, temperature": World(walk=0.0, season_k=12.0, per_kelvin=-1e-3),
+    "healthy, common wander": World(walk=0.0, common=2e-3),
 }
 WORLDS = WEARING | OTHERS | LONE | HEALTHY
 
@@ -204,7 +209,13 @@ def life_of(name: str, number: int) -> Life:
     if world.retuned:
         retuned_at = int(rng.integers(N_LOGS // 3, 5 * N_LOGS // 6))
         true[retuned_at:] += world.retuned * rng.standard_normal(len(MODES))
-    days = length_km * u / km_per_day
+    # The travel as if all of it were at the last usage.
+    paced = u
+    if world.busier != 1:
+        slow = np.minimum(u, share * rng.uniform(0.3, 0.85))
+        paced = u + (world.busier - 1) * slow
+        km_per_day *= world.busier
+    days = length_km * paced / km_per_day
     temperature, heated = _temperature(rng, world, days)
     std = rng.uniform(*world.std, (N_LOGS, len(MODES)))
     ln_f = np.log(FREQUENCY_HZ) + true + heated + _walks(rng, world, u)
@@ -263,4 +274,8 @@ def _walks(rng: np.random.Generator, world: World, u: Array) -> Array:
     walk = world.walk * np.cumsum(steps * rng.standard_normal((N_LOGS, len(MODES))), axis=0)
     lags = np.abs(np.subtract.outer(np.arange(N_LOGS), np.arange(N_LOGS)))
     root = np.linalg.cholesky(np.exp(-lags / 5.0))
-    return np.asarray(walk + world.wander * root @ rng.standard_normal(walk.shape))
+    walk += world.wander * root @ rng.standard_normal(walk.shape)
+    if world.common:
+        root = np.linalg.cholesky(np.exp(-lags / 10.0))
+        walk += world.common * (root @ rng.standard_normal(N_LOGS))[:, None]
+    return np.asarray(walk)
