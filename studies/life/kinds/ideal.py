@@ -13,7 +13,7 @@ import numpy as np
 from scipy.special import logsumexp
 
 from studies.life.kinds.plant import FREQUENCY_HZ, MODES, PARAMETERS, Array, drift, drifts_alone
-from studies.life.kinds.worlds import N_LOGS, REFERENCE_C, Life
+from studies.life.kinds.worlds import COMMON_LOGS, N_LOGS, REFERENCE_C, Life
 
 # Priors: ln of a parameter now (that of the description), intercept, slope (per K), jump.
 HEALTH_STD, INTERCEPT_STD, SLOPE_STD, JUMP_STD = 0.3, 0.03, 1e-3, 0.01
@@ -73,8 +73,9 @@ def _density(life: Life, moving: list[int], axes: list[Array]) -> Array:
         ln_health[:, :, j] = np.log1p(np.expm1(points[:, k : k + 1]) * share)
     residual = life.ln_f - np.log(FREQUENCY_HZ) - drift(ln_health)
     alone = drifts_alone(ln_health)
+    groups = [list(_EACH)] if life.world.common else [[i] for i in _EACH]
     parts = [
-        np.log(weight) + sum(_log_likelihood(life, i, residual, size * alone) for i in _EACH)
+        np.log(weight) + sum(_log_likelihood(life, own, residual, size * alone) for own in groups)
         for size, weight in MAP_ERRORS
     ]
     prior = -0.5 * np.sum((points / HEALTH_STD) ** 2, axis=1)
@@ -82,11 +83,20 @@ def _density(life: Life, moving: list[int], axes: list[Array]) -> Array:
     return np.asarray(np.exp(log_density - log_density.max()).reshape(grid.shape[:-1]))
 
 
-def _log_likelihood(life: Life, mode: int, residual: Array, wrong: Array) -> Array:
-    """Return the log likelihood of the estimates of a mode, for a size of the map's errors."""
-    own = wrong[..., mode]
-    root = np.linalg.cholesky(_known_cov(life, mode) + np.einsum("nkj,nlj->nkl", own, own))
-    white = np.linalg.solve(root, residual[:, :, mode, None])[..., 0]
+def _log_likelihood(life: Life, modes: list[int], residual: Array, wrong: Array) -> Array:
+    """Return the log likelihood of the estimates of modes, for a size of the map's errors."""
+    cov = np.zeros((len(residual), len(modes), N_LOGS, len(modes), N_LOGS))
+    if len(modes) > 1:
+        logs = np.arange(N_LOGS)
+        wander = np.exp(-np.abs(np.subtract.outer(logs, logs)) / COMMON_LOGS)
+        cov += life.world.common**2 * wander[:, None]
+    for k, mode in enumerate(modes):
+        own = wrong[..., mode]
+        cov[:, k, :, k] += _known_cov(life, mode) + np.einsum("nkj,nlj->nkl", own, own)
+    size = len(modes) * N_LOGS
+    root = np.linalg.cholesky(cov.reshape(-1, size, size))
+    errors = np.swapaxes(residual[:, :, modes], 1, 2).reshape(-1, size, 1)
+    white = np.linalg.solve(root, errors)[..., 0]
     log_det = np.log(np.einsum("nkk->nk", root)).sum(axis=1)
     return np.asarray(-0.5 * np.sum(white**2, axis=1) - log_det)
 

@@ -33,6 +33,7 @@ KM_PER_DAY = 3.0, 8.0
 STD_F, WIDE_STD_F, STD_ZETA = (2e-4, 6e-4), (1e-3, 1.6e-3), 0.08
 MAP_ERROR, WIDE_MAP_ERROR = 0.05, 0.1
 REFERENCE_C = 21.0
+COMMON_LOGS = 10.0
 # Share of the loss at the limit from which a parameter is degraded (README), and how close is near.
 DEGRADED, NEAR = 0.25, 0.05
 _START = datetime(2023, 3, 1, 8, tzinfo=UTC)
@@ -51,7 +52,7 @@ class World:
     std: tuple[float, float] = STD_F  # range of the standard deviations of ln f
     walk: float = 3e-4  # standard deviation of the random walk of ln f over the logs
     wander: float = 0.0  # standard deviation of its stationary wander, five logs long
-    common: float = 0.0  # the same of a wander of all modes together, ten logs long
+    common: float = 0.0  # the same of a wander of all modes together, `COMMON_LOGS` long
     busier: float = 1.0  # factor on the travel per day from one of the logs on
     season_k: float = 6.0  # amplitude of the seasons
     per_kelvin: float = -5e-4  # median effect on ln f
@@ -276,6 +277,6 @@ def _walks(rng: np.random.Generator, world: World, u: Array) -> Array:
     root = np.linalg.cholesky(np.exp(-lags / 5.0))
     walk += world.wander * root @ rng.standard_normal(walk.shape)
     if world.common:
-        root = np.linalg.cholesky(np.exp(-lags / 10.0))
+        root = np.linalg.cholesky(np.exp(-lags / COMMON_LOGS))
         walk += world.common * (root @ rng.standard_normal(N_LOGS))[:, None]
     return np.asarray(walk)
