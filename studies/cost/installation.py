@@ -4,17 +4,14 @@ Method
     `pip install` of a copy of the project into a fresh virtual environment, with control, and, for
     the negative control, with the extra that has pyarrow. Size is that of the files that each
     distribution lists, in MB of 10⁶ bytes, with the byte code that pip compiles and without
-    (`pip install --no-compile`; Python then compiles what is used). A plain installation is the
-    package with all that it requires; its core are the libraries that a program of this kind
-    builds on, with what these require. pip and setuptools, which the environment has before, do
-    not count.
+    (`pip install --no-compile`). A plain installation is the package with all that it requires, its
+    core the libraries that the user asked for, with what these require; pip does not count.
 Run time
     A minute, most of it the installation.
 """
 
 from __future__ import annotations
 
-import re
 import shutil
 import subprocess
 import sysconfig
@@ -25,6 +22,7 @@ from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 from studies.harness.checkout import ROOT
 from studies.harness.claims import Claim, number
@@ -68,7 +66,7 @@ def installed() -> Row:
 
 def measured(site: str | Path) -> Row:
     """Return the MB of distributions that are installed in a folder, by part."""
-    there = {normal(one.name): one for one in distributions(path=[str(site)])}
+    there = {canonicalize_name(one.name): one for one in distributions(path=[str(site)])}
     whole, control = needed(there, "lmshealth"), needed(there, "lmshealth", {"formats"})
     core = set().union(*(needed(there, name) for name in CORE))
     sizes = {name: size(there[name]) for name in core | control}
@@ -80,11 +78,6 @@ def measured(site: str | Path) -> Row:
     }
 
 
-def normal(name: str) -> str:
-    """Return the normalised name of a distribution."""
-    return re.sub(r"[-_.]+", "-", name).lower()
-
-
 def needed(there: Installed, name: str, extras: Collection[str] = ()) -> set[str]:
     """Return the names of a distribution and of all that it requires, of those that are there."""
     found, to_do = set[str](), [(name, extras)]
@@ -92,7 +85,7 @@ def needed(there: Installed, name: str, extras: Collection[str] = ()) -> set[str
         name, extras = to_do.pop()
         found.add(name)
         for one in map(Requirement, there[name].requires or ()):
-            other, places = normal(one.name), [{"extra": own} for own in ("", *extras)]
+            other, places = canonicalize_name(one.name), [{"extra": own} for own in ("", *extras)]
             holds = one.marker is None or any(map(one.marker.evaluate, places))
             if holds and other in there.keys() - found:
                 to_do.append((other, one.extras))
@@ -111,11 +104,9 @@ def claims(record: Row) -> Iterator[Claim]:
     passed, whole, core = record["passed"], record["whole"], record["core"]
     for check, key in zip(("as pip installs", "without byte code"), KEYS, strict=True):
         more = number(record["control"][key])
-        beside = (
-            f"at most {MOST_MB:g} MB required; core {number(core[key])}, with pyarrow {more} MB"
-        )
-        size = f"{number(whole[key])} MB"
-        yield Claim(f"a plain installation, {check}", size, "", beside, passed[check])
+        beside = f"at most {MOST_MB:g} MB required; core {number(core[key])}, with pyarrow {more}"
+        mb = f"{number(whole[key])} MB"
+        yield Claim(f"a plain installation, {check}", mb, "", beside, passed[check])
     parts = {name: own["mb"] for name, own in record.items() if "mb" in own and own["mb"] < 100}
     beside = ", ".join(f"{name} {number(mb)} MB" for name, mb in parts.items())
     times = f"{number(whole['mb'] / core['mb'])} times"

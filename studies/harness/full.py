@@ -56,8 +56,8 @@ def run_all(root: Path, groups: Sequence[str], kept: Path = KEPT) -> list[str]:
         minutes = f"{(time.perf_counter() - start) / 60:.1f} min"
         if done.returncode:
             failed.append(module)
-        print(f"{module}: {'FAILED, see ' + str(log) if done.returncode else 'done'}, {minutes}",
-              flush=True)  # fmt: skip
+        how = f"FAILED, see {log}" if done.returncode else "done"
+        print(f"{module}: {how}, {minutes}", flush=True)
     return failed
 
 

@@ -3,12 +3,11 @@
 Method
     A fleet of stages Y from estimates as identified, two of three healthy, in one store, by two
     worker processes. Four runs of what `run` does after identification: all logs but the last two,
-    one more log of every machine, one more of a single machine, and nothing new. The evidence of
-    every machine moves the prior of those whose own logs constrain their wear little (healthy and
-    young ones), whose lives are then sampled again. Time and processor time are of all processes,
-    and are reckoned for 1,000 machines. The remaining travel by the prior of the fleet is compared
-    with that of lives fitted from nothing under the same prior, as in `run`. Control, which must
-    fail: the remaining travel by the description alone.
+    one more log of every machine, one more of one machine, and nothing new. The evidence of each
+    moves the prior of machines whose own logs constrain their wear little, whose lives are then
+    sampled again. Times are of all processes, and are reckoned for 1,000 machines. The remaining
+    travel is compared with that of lives fitted from nothing under the same prior. Control, which
+    must fail: the remaining travel by the description alone.
 Run time
     Four minutes on two processors.
 """

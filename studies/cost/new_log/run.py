@@ -7,8 +7,7 @@ Method
     all, then nothing new. Then the machine is assessed from nothing. Both answers are random, the
     first by an update of the draws before, and means of health now and of the remaining travel up
     to the horizon must agree within four standard errors, from the published effective sample
-    sizes. Control, which must fail: the life without the last third
-    of its logs.
+    sizes. Control, which must fail: the life without the last third of its logs.
 Run time
     Six minutes on one processor.
 """

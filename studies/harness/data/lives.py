@@ -38,26 +38,20 @@ _SIZES_SEED = 7
 # ln ζ of roll, pitch and yaw, and scatter and jump (at the retuning) of the ln of the loop error.
 _SIZES: dict[str, Any] = {
     "lms-y": {
-        "median_std_ln_frequency": [
-            0.0012876092413990504,
-            0.0010781502058618596,
-            0.0013689205749773865,
-        ],
+        "median_std_ln_frequency":
+            [0.0012876092413990504, 0.0010781502058618596, 0.0013689205749773865],
         "median_std_ln_damping": [0.10081697807916898, 0.07677341426717191, 0.07841702850568039],
         "ln_loop_error_scatter": 0.051752114732961214,
         "ln_loop_error_jump": -1.4783747102041005,
     },
     "lms-x": {
-        "median_std_ln_frequency": [
-            0.0016215925779128333,
-            0.0012199464910371805,
-            0.001336322507954427,
-        ],
+        "median_std_ln_frequency":
+            [0.0016215925779128333, 0.0012199464910371805, 0.001336322507954427],
         "median_std_ln_damping": [0.18007474441592103, 0.04018668339940101, 0.09258308601184624],
         "ln_loop_error_scatter": 0.05775228448537332,
         "ln_loop_error_jump": -0.39161895272703795,
     },
-}
+}  # fmt: skip
 _LOOP_ERROR = 1e-8  # in m; of it the jump and the scatter count alone
 
 

@@ -23,10 +23,8 @@ Method
     fewer of them, by the code that had a posterior of its own at each epoch: its health alone, and
     with the prognosis, without its chains, for lives that wear and are seen up to 90 %.
 Run time
-    One to ten seconds of one processor a life, 1,110 lives: an hour. ``--kinds`` does the kinds
-    whose names contain one of some words (``late;opposite``), ``--lives`` so many of each,
-    ``--earlier`` by the code of the control; they print their claims, record nothing, and keep all
-    answers.
+    An hour of one processor. ``--kinds`` does those whose names contain one of some words
+    (``late;opposite``), ``--lives`` so many of each, ``--earlier`` by the code of the control.
 """
 
 from __future__ import annotations
