@@ -5,9 +5,9 @@ Method
     cluster, and two runs of one worker each that share a PostgreSQL store, as two computers do.
     Rate is that between the first log identified and the last. The bound is measured in the same
     turn: bare processes identify the same logs, because the processors of a shared machine are
-    seldom whole. Serial is the processor time per log of the main process. Model: n workers identify c / (t + s) logs per s, at most one per
-    serial time; t is the time of a log with one worker, c what n bare processes do over one, and s
-    the processor time of main process and scheduler, which share the processors with the workers.
+    seldom whole. Model: n workers identify c / (t + s) logs per s, at most one per serial time, the
+    processor time per log of the main process; t is the time of a log with one worker, c what n
+    bare processes do over one, and s the processor time of main process and scheduler.
 Run time
     Twelve minutes of two processors.
 """
