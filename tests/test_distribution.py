@@ -12,8 +12,9 @@ from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
-from studies.cost.installation import needed, normal
+from studies.cost.installation import needed
 
 ROOT = Path(__file__).parents[1]
 # Extras that people install to use the package; `peers` and `dev` stay with who develops it.
@@ -50,7 +51,7 @@ def refused(licences: dict[str, str]) -> dict[str, str]:
 
 def test_licences_of_dependencies() -> None:
     """All dependencies have a permissive licence, or are named; a strong copyleft is refused."""
-    there = {normal(one.name): one for one in distributions()}
+    there = {canonicalize_name(one.name): one for one in distributions()}
     found = needed(there, "lmshealth", {*EXTRAS}) - {"lmshealth"}
     assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= found
     licences = {name: licence(there[name]) for name in found}
@@ -62,7 +63,7 @@ def test_licences_of_dependencies() -> None:
 
 def test_core_has_no_copyleft() -> None:
     """Without extras nothing is under any copyleft but MPL."""
-    there = {normal(one.name): one for one in distributions()}
+    there = {canonicalize_name(one.name): one for one in distributions()}
     assert not WEAK_COPYLEFT & needed(there, "lmshealth")
 
 
@@ -88,10 +89,10 @@ def test_a_release_states_one_version() -> None:
 def test_lock_holds_what_is_declared() -> None:
     """The lock file for development has every direct dependency, with hashes and no address."""
     text = (ROOT / "tests" / "requirements.lock").read_text()
-    locked = {normal(name) for name in re.findall(r"^([\w.\-]+)==", text, re.M)}
+    locked = {canonicalize_name(name) for name in re.findall(r"^([\w.\-]+)==", text, re.M)}
     requirements = map(Requirement, distribution("lmshealth").requires or ())
     direct = {
-        normal(r.name)
+        canonicalize_name(r.name)
         for r in requirements
         if not r.marker or any(r.marker.evaluate({"extra": e}) for e in (*EXTRAS, "dev", ""))
     }
