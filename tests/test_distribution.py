@@ -51,7 +51,7 @@ def refused(licences: dict[str, str]) -> dict[str, str]:
 
 def test_licences_of_dependencies() -> None:
     """All dependencies have a permissive licence, or are named; a strong copyleft is refused."""
-    there = {canonicalize_name(one.name): one for one in distributions()}
+    there: dict[str, Distribution] = {canonicalize_name(one.name): one for one in distributions()}
     found = needed(there, "lmshealth", {*EXTRAS}) - {"lmshealth"}
     assert {"numpy", "scipy", "pandas", "emcee", "filterpy", "jinja2"} <= found
     licences = {name: licence(there[name]) for name in found}
@@ -63,7 +63,7 @@ def test_licences_of_dependencies() -> None:
 
 def test_core_has_no_copyleft() -> None:
     """Without extras nothing is under any copyleft but MPL."""
-    there = {canonicalize_name(one.name): one for one in distributions()}
+    there: dict[str, Distribution] = {canonicalize_name(one.name): one for one in distributions()}
     assert not WEAK_COPYLEFT & needed(there, "lmshealth")
 
 

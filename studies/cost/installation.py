@@ -66,7 +66,7 @@ def installed() -> Row:
 
 def measured(site: str | Path) -> Row:
     """Return the MB of distributions that are installed in a folder, by part."""
-    there = {canonicalize_name(one.name): one for one in distributions(path=[str(site)])}
+    there = {str(canonicalize_name(one.name)): one for one in distributions(path=[str(site)])}
     whole, control = needed(there, "lmshealth"), needed(there, "lmshealth", {"formats"})
     core = set().union(*(needed(there, name) for name in CORE))
     sizes = {name: size(there[name]) for name in core | control}
