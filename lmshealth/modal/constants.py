@@ -143,8 +143,8 @@ OUTLIER_FALSE_ALARM, MOST_OUTLIERS = 1e-3, 0.1
 FRF_MOST_MODES, FRF_BACKGROUND_COST = 8, 2.0
 # Damping ratio above which a pole belongs to the background.
 FRF_MOST_DAMPING = 0.2
-# Gain in -2 ln L from which on a distortion is included: 1 % of linear responses reach it. Two
-# modes within a half-power bandwidth, and fits from other starts, must reduce the distortion to
+# Gain in -2 ln L from which on a distortion is included: 1 % of linear responses reach it. Each
+# mode within a half-power bandwidth, and fits from other starts, must reduce the distortion to
 # this share: distortion bends whole resonances and looks like further modes.
 DISTORTED, LESS_DISTORTED = 6.6, 1 / 3
 # A fit that misses this share of the response (amplitude, beyond noise) shows no modes, and where
