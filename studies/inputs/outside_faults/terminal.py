@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
-import pty
 import re
 import signal
 import sqlite3
 import struct
 import subprocess
-import termios
 import time
 from collections.abc import Callable
 from functools import partial
@@ -124,7 +121,10 @@ def _identified(out: Path) -> bool:
 
 def widest(program: Program, folder: Path, *, columns: int, words: tuple[str, ...]) -> Seen:
     """Print tables on a terminal of some columns; return its longest line."""
-    reader, writer = pty.openpty()
+    import fcntl  # Windows has neither
+    import termios
+
+    reader, writer = os.openpty()
     fcntl.ioctl(writer, termios.TIOCSWINSZ, struct.pack("HHHH", 50, columns, 0, 0))
     env = {name: value for name, value in program.environment().items() if name != "COLUMNS"}
     with subprocess.Popen(
