@@ -85,7 +85,7 @@ def test_all_are_recorded_and_failures_are_named(
 
 def forget() -> None:
     """Forget what was known of all code."""
-    for known in (provenance._digest, provenance._tree):
+    for known in (provenance._digest, provenance._tree, provenance._statements):
         known.cache_clear()
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import json
 import sys
 from collections.abc import Iterator
@@ -46,9 +45,7 @@ def written(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     """Write a script as a module, and forget what was known of all code."""
 
     def forget() -> None:
-        for known in (
-            provenance._digest, provenance._tree, provenance._content, provenance._imported
-        ):  # fmt: skip
+        for known in (provenance._digest, provenance._tree, provenance._statements):
             known.cache_clear()
 
     def write(text: str) -> ModuleType:
@@ -153,38 +150,79 @@ def test_run_times_are_never_taken_over(written: Any, tmp_path: Path) -> None:
     assert script.done == tasks
 
 
-def test_changed_module(written: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trials are done anew when a module that they import has changed, however indirectly."""
+PLACE, READ = "lmshealth.calibration.ranks import place", "lmshealth import read_log as place"
+
+
+def needed_by(script: Any) -> dict[str, str]:
+    """Return the code that the trials of a script need, by the names of its modules."""
+    found = provenance._needed({(Path(script.__file__ or ""), "draw")})
+    return {module.name: "".join(codes) for module, codes in found.items()}
+
+
+@pytest.mark.parametrize(
+    ("module", "old", "new", "counts"),
+    [
+        ("script.py", "SCALE = 2.0", "SCALE = 4.0", True),
+        ("script.py", "def outcomes(rows):", "def outcomes(rows, more=1):", False),
+        ("ranks.py", "def place(", "def place(more: int, ", True),
+        # A function of the same module that nothing here calls.
+        ("ranks.py", "def share_row(", "def share_row(more: int, ", False),
+        # What is needed through another module, and what that runs when it is imported.
+        ("arrays.py", "FloatArray = ", "FloatArray = None or ", True),
+        ("arrays.py", "FloatArray = ", "print(1)\nFloatArray = ", True),
+    ],
+)
+def test_code_that_is_reached_counts(
+    written: Any, monkeypatch: pytest.MonkeyPatch, module: str, old: str, new: str, counts: bool
+) -> None:
+    """Trials are done anew when code has changed that they reach, however indirectly."""
     text = SCRIPT.replace("SCALE *", "place.__name__ and SCALE *")
     before = provenance.code_of(written(text).draw)
     assert provenance.code_of(written(text).draw) == before
-    modules = provenance._closure({provenance.PROJECT / "lmshealth" / "calibration" / "ranks.py"})
-    assert len(modules) > 1
-    for module in sorted(modules):
-        plain = provenance._tree(module)
+    script, read, changed = written(text), Path.read_text, []
+
+    def other(path: Path, *words: Any, **named: Any) -> str:
+        content = read(path, *words, **named)
+        if path.name == module and old in content:
+            changed.append(path)
+            content = content.replace(old, new, 1)
+        return content
+
+    monkeypatch.setattr(Path, "read_text", other)
+    assert (provenance.code_of(script.draw) != before) == counts
+    assert changed
+
+
+def test_tables_that_are_read_count(written: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the tables of the program the sections that the code reads."""
+    text = SCRIPT.replace(PLACE, "lmshealth.machine.status import notices as place")
+    text = text.replace("SCALE *", "place.__name__ and SCALE *")
+    read = Path.read_bytes
+    for section, counts in (("[notices]", True), ("[refusals]", False)):
+        script = written(text)
+        before = provenance.code_of(script.draw)
         with monkeypatch.context() as patched:
-            changed = type(plain)([*plain.body, ast.Pass()], [])  # a package may be empty
-            real = provenance._tree.__wrapped__
-
-            def other(path: Path, at: Path = module, tree: Any = changed, own: Any = real) -> Any:
-                return tree if path == at else own(path)
-
-            script = written(text)
-            patched.setattr(provenance, "_tree", other)
-            assert provenance.code_of(script.draw) != before
+            patched.setattr(
+                Path, "read_bytes",
+                lambda path, at=section: read(path).replace(at.encode(), f"{at} # x".encode()),
+            )  # fmt: skip
+            provenance._digest.cache_clear()
+            assert (provenance.code_of(script.draw) != before) == counts
 
 
 def test_gathered_names(written: Any) -> None:
     """Of the package a trial needs the homes of the names it uses, and what these register."""
-    text = SCRIPT.replace(
-        "lmshealth.calibration.ranks import place", "lmshealth import read_log as place"
-    )
-    tree = provenance._tree(Path(written(text).__file__ or ""))
-    needed = provenance._closure(provenance._imports(tree.body))
-    names = {path.relative_to(provenance.PROJECT).as_posix() for path in needed}
-    assert {"lmshealth/io/reading.py", "lmshealth/errors.py"} <= names
-    assert any(name.startswith("lmshealth/io/formats/") and "native" in name for name in names)
-    assert not {"lmshealth/report/pages.py", "lmshealth/__init__.py"} & names
+    text = SCRIPT.replace(PLACE, READ).replace("SCALE *", "place.__name__ and SCALE *")
+    names = needed_by(written(text))
+    assert "name='read_log'" in names["reading.py"]
+    assert {"errors.py", "native.py"} <= names.keys()
+    assert not {"pages.py", "__main__.py", "kalman_filters.py"} & names.keys()
+
+
+def test_a_program_that_is_started_counts_whole(written: Any) -> None:
+    """Its commands are imported by their names, which no import states."""
+    assert "log_commands.py" not in needed_by(written(SCRIPT))
+    assert "log_commands.py" in needed_by(written(SCRIPT.replace("SCALE *", '"-m" and SCALE *')))
 
 
 def test_options_and_names_part_trials(written: Any, tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import platform
 import re
 import subprocess
 import sys
+from collections import defaultdict
 from collections.abc import Callable, Iterable
 from functools import cache, partial
 from importlib import import_module
@@ -21,6 +22,15 @@ _PACKAGES = ("lmshealth", "models", "studies")
 _LIBRARIES = ("numpy", "scipy", "emcee")
 _CODE = ("*.py", "*.toml", "*.csv")
 _DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef)
+_HERE = Path(__file__).resolve()
+# A part of a module is a name of it, all of it, or what runs when it is imported.
+_Part = tuple[Path, str]
+_Origins = dict[str, tuple[str, _Part | None]]
+_ALL, _RUN = "*", ""
+_MAIN = ast.unparse(ast.parse('__name__ == "__main__"'))
+_PROGRAMS = ("lmshealth/cli/*.py", "models/__main__.py")
+# Decorators that hand a function to nobody.
+_HARMLESS = {"cache", "contextmanager", "dataclass", "lru_cache", "overload"}
 # The package itself gathers names of all its modules: of it a trial needs those that it names.
 _GATHERING = PROJECT / "lmshealth" / "__init__.py"
 
@@ -61,9 +71,10 @@ def name_of(work: Callable[..., Any]) -> str:
 def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     """Digest the code that a work depends on.
 
-    This is the function and what it needs of its own module, every module of the project that is
-    imported for it, directly or not, all tables and descriptions of their packages, and the
-    versions of libraries. Comments, docstrings and layout do not count.
+    This is the function with the functions, classes and constants of the project that it names,
+    directly or not, what modules run when they are imported for it, the tables and descriptions
+    whose file or folder this code names, and the versions of libraries. Comments, docstrings,
+    layout and code that it does not reach do not count.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 
@@ -79,50 +90,120 @@ def _script(work: Callable[..., Any]) -> Path:
 
 @cache
 def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
-    needed = _reached(_tree(path), {name.split(".")[0]})
+    files = (_file(module.split(".")) for module in also)
+    needed = _needed({(path, name)} | {(file, _ALL) for file in files if file is not None})
     total = hashlib.sha256(" ".join(version(library) for library in _LIBRARIES).encode())
-    total.update("".join(ast.dump(statement) for statement in needed).encode())
-    roots = _imports(needed) | {_file(module.split(".")) for module in also}
-    modules = sorted(_closure({root for root in roots if root is not None}))
-    for module in modules:
-        total.update(module.relative_to(PROJECT).as_posix().encode())
-        total.update(_content(module))
-    # Of the packages whose code it runs.
-    used = {module.relative_to(PROJECT).parts[0] for module in modules}
-    for package in sorted(used & {"lmshealth", "models"}):
+    for module in sorted(needed):
+        # A script is known by what it does, wherever it is.
+        total.update(b"" if module == path else module.relative_to(PROJECT).as_posix().encode())
+        total.update("".join(needed[module]).encode())
+    code = "".join(one for codes in needed.values() for one in codes)
+    for package in ("lmshealth", "models"):
         for table in sorted((PROJECT / package).rglob("*")):
-            if table.suffix in (".toml", ".csv"):
-                total.update(table.name.encode() + table.read_bytes())
+            named = f"'{table.name}'" in code or f"'{table.parent.name}'" in code
+            if table.suffix in (".toml", ".csv") and named:
+                total.update(table.name.encode())
+                for section in re.split(rb"(?m)^(?=\[)", table.read_bytes()):
+                    # Of the tables of the program those whose attribute is read.
+                    key = re.match(rb"\[(\w+)", section)
+                    if (
+                        table.name != "tables.toml"
+                        or not key
+                        or f"attr='{key[1].decode()}'" in code
+                    ):
+                        total.update(section)
     return total.hexdigest()[:16]
 
 
 @cache
 def _tree(path: Path) -> ast.Module:
-    """Parse a module without its docstrings."""
+    """Parse a module without its docstrings, those of constants too."""
     tree = ast.parse(path.read_text(encoding="utf-8"))
     for node in ast.walk(tree):
-        if isinstance(node, _DOCUMENTED) and ast.get_docstring(node):
-            del node.body[0]
+        if isinstance(node, _DOCUMENTED):
+            node.body = [one for one in node.body if not _is_text(one)]
     return tree
 
 
+def _is_text(statement: ast.stmt) -> bool:
+    value = statement.value if isinstance(statement, ast.Expr) else None
+    return isinstance(value, ast.Constant) and isinstance(value.value, str)
+
+
+def _needed(parts: set[_Part]) -> dict[Path, list[str]]:
+    """Return, by module, what parts of modules need of the project, in an order of its own."""
+    found: dict[Path, set[str]] = {}
+    seen, left = set[_Part](), list(parts)
+    while left:
+        module, name = part = left.pop()
+        # The package gathers names of all its modules, which count at their homes; what is here
+        # says by which code a value was made, and makes none.
+        if part in seen or part == (_GATHERING, _RUN) or module == _HERE or not module.exists():
+            continue
+        seen.add(part)
+        if module not in found:
+            found[module] = set()
+            # Whoever imports from a package runs all that it begins with, and what this imports.
+            left += [(module.parent / "__init__.py", _RUN), (module, _RUN)]
+        for code, needs in _statements(module).get(name, ()):
+            found[module] |= {code} - {""}
+            left += needs
+    return {module: sorted(codes) for module, codes in found.items() if codes}
+
+
 @cache
-def _content(path: Path) -> bytes:
-    return ast.dump(_tree(path)).encode()
+def _statements(module: Path) -> dict[str, list[tuple[str, set[_Part]]]]:
+    """Return the code of each name of a module, with the parts that it needs."""
+    found = defaultdict[str, list[tuple[str, set[_Part]]]](list)
+    origins = _origins(_tree(module).body)
+    for name, (code, part) in origins.items():
+        for one in (name, _ALL):
+            found[one].append((code, {part} if part else set()))
+        # What a module registers when it is imported counts for whoever imports it.
+        found[_RUN].append(("", {(part[0], _RUN)} if part else set()))
+    for statement in _tree(module).body:
+        test = ast.unparse(statement.test) if isinstance(statement, ast.If) else ""
+        if isinstance(statement, ast.Import | ast.ImportFrom) or test == _MAIN:
+            continue
+        names = _defined(statement)
+        if test != "TYPE_CHECKING" and (not names or _registers(statement)):
+            names.add(_RUN)
+        row = ast.dump(statement), _uses(module, statement, origins)
+        for name in {*names, _ALL}:
+            found[name].append(row)
+    return dict(found)
 
 
-def _reached(tree: ast.Module, names: set[str]) -> list[ast.stmt]:
-    """Return the statements of a module that define names, and what these need in turn."""
-    wanted, left = set(names), list(tree.body)
-    while more := [statement for statement in left if _defined(statement) & wanted]:
-        left = [statement for statement in left if statement not in more]
-        wanted |= {node.id for s in more for node in ast.walk(s) if isinstance(node, ast.Name)}
-    return [statement for statement in tree.body if statement not in left]
+def _uses(module: Path, statement: ast.stmt, origins: _Origins) -> set[_Part]:
+    """Return the names that a statement needs; of an imported module those after its dot."""
+    nodes = list(ast.walk(statement))
+    inner = {name: part for name, (_, part) in _origins(nodes).items() if part}
+    known = {name: part for name, (_, part) in origins.items() if part} | inner
+    modules = {name: file for name, (file, of) in known.items() if of == _ALL}
+    dotted = {
+        id(node.value): (modules[node.value.id], node.attr)
+        for node in nodes
+        if isinstance(node, ast.Attribute)
+        and isinstance(node.value, ast.Name)
+        and node.value.id in modules
+    }
+    names = {node.id for node in nodes if isinstance(node, ast.Name) and id(node) not in dotted}
+    parts = {_source(_words(file), attribute) for file, attribute in dotted.values()}
+    parts |= {part for name, part in inner.items() if name in names or part[1] != _ALL}
+    words = {node.value for node in nodes if isinstance(node, ast.Constant)}
+    if "-m" in words:
+        # A program is started, whose commands are imported by their names.
+        parts |= {(file, _ALL) for pattern in _PROGRAMS for file in PROJECT.glob(pattern)}
+    return {(module, name) for name in names} | {part for part in parts if part}
+
+
+def _registers(statement: ast.stmt) -> bool:
+    """Return whether a definition may be used by who does not name it: a decorator has it."""
+    decorators = getattr(statement, "decorator_list", [])
+    return not all(ast.unparse(one).split("(")[0] in _HARMLESS for one in decorators)
 
 
 def _defined(statement: ast.stmt) -> set[str]:
-    if isinstance(statement, ast.Import | ast.ImportFrom):
-        return {(alias.asname or alias.name).split(".")[0] for alias in statement.names}
     if isinstance(statement, ast.FunctionDef | ast.ClassDef):
         return {statement.name}
     return {
@@ -132,44 +213,38 @@ def _defined(statement: ast.stmt) -> set[str]:
     }
 
 
-def _closure(roots: set[Path]) -> set[Path]:
-    """Return modules and all that they import of the project."""
-    found: set[Path] = set()
-    left = set(roots)
-    while left:
-        module = left.pop()
-        found.add(module)
-        # Who imports from a package has all of it that it begins with.
-        begun = {module.parent / "__init__.py"} - {_GATHERING}
-        left |= {path for path in begun if path.exists()} | _imported(module)
-        left -= found
+def _origins(nodes: Iterable[ast.AST]) -> _Origins:
+    """Return what names are imported as: the code, and the part of the project if it is one."""
+    found: _Origins = {}
+    for node in nodes:
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                file = _file(alias.name.split("."))
+                part = (file, _ALL) if file else None
+                found[alias.asname or alias.name.split(".")[0]] = ast.dump(alias), part
+        elif isinstance(node, ast.ImportFrom):
+            package = (node.module or "").split(".")
+            for alias in node.names:
+                code = f"{node.module} {ast.dump(alias)}"
+                found[alias.asname or alias.name] = code, _source(package, alias.name)
     return found
 
 
-@cache
-def _imported(path: Path) -> set[Path]:
-    return _imports(_tree(path).body)
-
-
-def _imports(statements: Iterable[ast.stmt]) -> set[Path]:
-    """Return the modules of the project that statements import, at the top or within functions."""
-    found: set[Path | None] = set()
-    for node in (node for statement in statements for node in ast.walk(statement)):
-        if isinstance(node, ast.Import):
-            found |= {_file(alias.name.split(".")) for alias in node.names}
-        elif isinstance(node, ast.ImportFrom):
-            package = (node.module or "").split(".")
-            found |= {_source(package, alias.name) for alias in node.names}
-    return {path for path in found if path is not None}
-
-
-def _source(package: list[str], name: str) -> Path | None:
-    """Return where a name comes from: a module of its own, or one that has it or gathers it."""
-    path = _file([*package, name]) or _file(package)
+def _source(package: list[str], name: str) -> _Part | None:
+    """Return what a name is: a module of its own, or a name of one that has it or gathers it."""
+    if file := _file([*package, name]):
+        return file, _ALL
+    path = _file(package)
     if path == _GATHERING:
         home = getattr(getattr(import_module(package[0]), name, None), "__module__", package[0])
         path = _file(home.split("."))
-    return path
+    return (path, name) if path else None
+
+
+def _words(file: Path) -> list[str]:
+    """Return the name of a module of the project, in its parts."""
+    parts = list(file.relative_to(PROJECT).with_suffix("").parts)
+    return parts[:-1] if parts[-1] == "__init__" else parts
 
 
 def _file(parts: list[str]) -> Path | None:
