@@ -52,7 +52,7 @@ test: .venv/installed
 # `make studies slow statistics` in one run: tests are collected once, and no processor waits for
 # the last test of each.
 long: .venv/installed
-	$(BIN)/pytest -n 2 --dist worksteal -m "study or slow or statistical"
+	$(BIN)/pytest -n 2 --dist worksteal --durations=30 -m "study or slow or statistical"
 
 # Quick forms of all studies: the questions of studies/README.md on few data. With FULL=1 all are
 # recorded in full, which takes a night; an interrupted run goes on where it was.

@@ -16,6 +16,7 @@ from collections.abc import Callable, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -356,6 +357,13 @@ def case(name: str, right: str, fault: Callable[..., Seen], control: Callable[..
 
 TWO, TEXTS = ("0.csv", "1.csv"), ("0.txt", "1.txt")
 all_used = partial(counted, there=TWO, listed=TWO, notes=True, used="2 of 2 logs", status=0)
+
+
+def of_manifest(name: str, right: str, **files: Any) -> Case:
+    """Make a case of files, some of which a manifest lists; in its control all are."""
+    return case(name, right, partial(counted, **files), all_used)
+
+
 CASES: tuple[Case, ...] = (
     case(
         "alert fails, then a run without",
@@ -413,70 +421,31 @@ CASES: tuple[Case, ...] = (
         partial(read_only, wal=True),
         partial(read_only, wal=True, unwritable=False),
     ),
-    case(
-        "row of a manifest without its file",
-        "2 of 3, exit 3, missing-file",
-        partial(
-            counted,
-            there=TWO,
-            listed=(*TWO, "2.csv"),
-            used="2 of 3 logs",
-            status=3,
-            reason="missing-file",
-        ),
-        all_used,
+    of_manifest(
+        "row of a manifest without its file", "2 of 3, exit 3, missing-file",
+        there=TWO, listed=(*TWO, "2.csv"), used="2 of 3 logs", status=3, reason="missing-file",
     ),
-    case(
-        "no file of a manifest is there",
-        "2 found, 2 refused, exit 1",
-        partial(
-            counted,
-            there=(),
-            listed=TWO,
-            used="2 found, 2 refused",
-            status=1,
-            reason="missing-file",
-        ),
-        all_used,
+    of_manifest(
+        "no file of a manifest is there", "2 found, 2 refused, exit 1",
+        there=(), listed=TWO, used="2 found, 2 refused", status=1, reason="missing-file",
     ),
-    case(
-        "log that the manifest omits",
-        "analysed, exit 3, not-listed",
-        partial(
-            counted, there=TWO, listed=TWO[:1], used="2 of 2 logs", status=3, reason="not-listed"
-        ),
-        all_used,
+    of_manifest(
+        "log that the manifest omits", "analysed, exit 3, not-listed",
+        there=TWO, listed=TWO[:1], used="2 of 2 logs", status=3, reason="not-listed",
     ),
-    case(
-        "log without metadata that the manifest omits",
-        "1 of 2, exit 3, metadata",
-        partial(
-            counted,
-            there=TWO,
-            listed=TWO[:1],
-            head=False,
-            used="1 of 2 logs",
-            status=3,
-            reason="metadata",
-        ),
-        all_used,
+    of_manifest(
+        "log without metadata that the manifest omits", "1 of 2, exit 3, metadata",
+        there=TWO, listed=TWO[:1], head=False, used="1 of 2 logs", status=3, reason="metadata",
     ),
-    case(
-        "manifest lists .txt",
-        "2 of 2, exit 0",
-        partial(counted, there=TEXTS, listed=TEXTS, head=False, used="2 of 2 logs", status=0),
-        all_used,
+    of_manifest(
+        "manifest lists .txt", "2 of 2, exit 0",
+        there=TEXTS, listed=TEXTS, head=False, used="2 of 2 logs", status=0,
     ),
-    case(
-        "folder of .txt",
-        "2 of 2, exit 0",
-        partial(counted, there=TEXTS, used="2 of 2 logs", status=0),
-        all_used,
+    of_manifest(
+        "folder of .txt", "2 of 2, exit 0", there=TEXTS, used="2 of 2 logs", status=0
     ),
-    case(
-        "log with an unread suffix",
-        "2 of 3, exit 3, skipped",
-        partial(counted, there=(*TWO, "2.prn"), used="2 of 3 logs", status=3, reason="skipped"),
-        all_used,
+    of_manifest(
+        "log with an unread suffix", "2 of 3, exit 3, skipped",
+        there=(*TWO, "2.prn"), used="2 of 3 logs", status=3, reason="skipped",
     ),
-)
+)  # fmt: skip
