@@ -1,6 +1,6 @@
 """Spectral lines: multitaper test, detection, and naming by their sources (README.md, "Lines")."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import pairwise
@@ -28,6 +28,8 @@ _REACH = _TAPERS * _PER_ORDINATE // 2
 _WINDOW, _VICINITY, _MOST_LINES = 128, 32, 40
 # Octaves end at this frequency in Hz times powers of two: away from harmonics of the mains.
 _EDGE, _MOST_OCTAVES = 45.0, 40
+# Share of the largest ordinate below which an amplitude may be an error of rounding.
+_ROUNDING = 1e-9
 
 
 def detect_sinusoids(
@@ -51,8 +53,14 @@ def detect_sinusoids(
     octaves = [_plan(lengths, sample_rate, *cut) for cut in cuts]
     tested = [octave for octave in octaves if octave.start < octave.stop]
     n_tests = sum(octave.stop - octave.start for octave in tested)
-    rows = [row for octave in tested for row in _search(octave, read, false_alarm / n_tests)]
-    return np.array(sorted(rows)).reshape(-1, 2)
+    found: list[tuple[float, float]] = []
+    for octave in tested:
+        # Windows overlap, and a line near a cut is seen from both sides.
+        near = _TAPERS / 2 * sample_rate / octave.n
+        for f, amplitude in _search(octave, read, false_alarm / n_tests):
+            if low <= f < high and all(abs(f - other) > near for other, _ in found):
+                found.append((f, amplitude))
+    return np.array(sorted(found)).reshape(-1, 2)
 
 
 def _octaves(low: float, high: float) -> list[tuple[float, float]]:
@@ -67,28 +75,45 @@ class _Octave:
     """Blocks and frequencies by which an octave is tested.
 
     `n` are the samples of a block, 0 where the segments are too short; `blocks` the first
-    samples of those of each segment; `start` and `stop` a half-open range of indices of the padded
-    transform of a block.
+    samples of those of each segment. Of the ordinates of a block `size` are used, from the
+    number `first` on: the octave, from `low` to `high`, and half a window on either side, at most
+    all. `start` and `stop` are a half-open range of indices of the padded transform of the series
+    of these ordinates.
     """
 
     sample_rate: float
     n: int
     blocks: list[range]
+    low: float
+    high: float
+    first: int
+    size: int
     start: int
     stop: int
 
-    @property
-    def ordinates(self) -> float:
-        """Ordinates per index of the padded transform."""
-        return self.n / (_PER_ORDINATE * (self.n + 1))
+    def ordinate(self, index: int) -> float:
+        """Return the ordinate of a block at an index of the padded transform."""
+        return self.first + index * self.size / (_PER_ORDINATE * (self.size + 1))
 
-    def each(self, read: Callable[[int], FloatArray]) -> Iterator[FloatArray]:
-        """Yield the blocks without their means."""
+    def transformed(self, read: Callable[[int], FloatArray]) -> tuple[ComplexArray, float]:
+        """Return the ordinates of the blocks without their means, shape ``(n_blocks, size)``.
+
+        Returns also the largest of all ordinates.
+        """
+        # The transform is periodic, and that of real samples its own mirror image.
+        index = np.arange(self.first, self.first + self.size) % max(self.n, 1)
+        mirrored = index > self.n // 2
+        index[mirrored] = self.n - index[mirrored]
+        rows, largest = list[ComplexArray](), 0.0
         for number, starts in enumerate(self.blocks):
             values = read(number) if starts else np.empty(0)
             for a in starts:
                 part = values[a : a + self.n]
-                yield part - part.mean()
+                transform = fft.rfft(part - part.mean(), norm="forward")
+                rows.append(transform[index])
+                largest = max(largest, float(np.abs(transform).max()))
+        found = np.array(rows).reshape(-1, self.size)
+        return np.where(mirrored, found.conj(), found), largest
 
 
 def _plan(lengths: Sequence[int], sample_rate: float, low: float, high: float) -> _Octave:
@@ -98,15 +123,20 @@ def _plan(lengths: Sequence[int], sample_rate: float, low: float, high: float) -
     apart = [length // max(1, round(length * top / coherent)) for length in lengths]
     room = min(own for own, size in zip(apart, lengths, strict=True) if 2 * size >= max(lengths))
     # A few samples are omitted for a fast transform.
-    n = fft.prev_fast_len(room + 1, real=True) - 1 if room > 4 * _TAPERS else 0
+    n = fft.prev_fast_len(room, real=True) if room > 4 * _TAPERS else 0
     blocks = [
         range(0, length - n + 1, own) if n and 2 * length >= max(lengths) else range(0)
         for length, own in zip(lengths, apart, strict=True)
     ]
-    size = _PER_ORDINATE * (n + 1)
-    start, stop = (int(np.ceil(edge * size / sample_rate)) for edge in (low, high))
-    start, stop = max(start, _REACH), min(stop, size // 2 + 1 - _REACH)
-    return _Octave(sample_rate, n, blocks, start, stop)
+    least = _REACH / _PER_ORDINATE
+    low, high = max(low * n / sample_rate, least), min(high * n / sample_rate, n / 2 - least)
+    first = int(low) - _WINDOW // 2
+    size = fft.next_fast_len(max(int(high) + 1 + _WINDOW // 2 - first, 1))
+    first, size = (first, size) if size < n else (0, n)
+    # From the index before the first frequency to that after the last: a line between two is seen.
+    per = _PER_ORDINATE * (size + 1) / max(size, 1)
+    start, stop = int((low - first) * per), int((high - first) * per) + 2
+    return _Octave(sample_rate, n, blocks, low, high, first, size, start, stop)
 
 
 def _search(
@@ -114,40 +144,33 @@ def _search(
 ) -> list[tuple[float, float]]:
     """Return frequency in Hz and amplitude of the lines of an octave."""
     evidence, power = np.zeros((2, octave.stop - octave.start))
-    for part in octave.each(read):
-        transform = fft.rfft(part, _PER_ORDINATE * (octave.n + 1))
-        ratio, squared = _line_test(transform, octave.n, octave.start, octave.stop)
+    blocks, largest = octave.transformed(read)
+    for ordinates in blocks:
+        series = fft.ifft(ordinates, norm="forward")
+        padded = fft.fft(series, _PER_ORDINATE * (octave.size + 1))
+        ratio, squared = _line_test(padded, octave.size, octave.start, octave.stop)
         evidence += _noise_evidence(ratio)
         power += squared
-    threshold = float(gammainccinv(sum(map(len, octave.blocks)), p_value))
-    passed = np.flatnonzero(evidence > threshold)
+    threshold = float(gammainccinv(len(blocks), p_value))
+    # Without noise the errors of rounding would have lines.
+    real = power > len(blocks) * (_ROUNDING * largest) ** 2
+    passed = np.flatnonzero((evidence > threshold) & real)
     centres: list[int] = []
     for index in passed[np.argsort(-power[passed])].tolist():
-        centre = round((octave.start + index) * octave.ordinates)
+        centre = round(octave.ordinate(octave.start + index))
         if all(abs(centre - other) > _VICINITY - _TAPERS for other in centres):
             centres.append(centre)
-    low, high = octave.start * octave.ordinates, octave.stop * octave.ordinates
     found: list[tuple[float, float]] = []
-    starts = [centre - _WINDOW // 2 for centre in centres]
-    for first, window in zip(starts, _windows(octave.each(read), starts), strict=True):
-        for ordinate, amplitude in _window_lines(window, first, threshold):
-            # Windows overlap.
-            new = all(abs(ordinate - other) > _TAPERS / 2 for other, _ in found)
-            if new and low <= ordinate < high:
-                found.append((ordinate, amplitude))
-    return [(ordinate * octave.sample_rate / octave.n, amplitude) for ordinate, amplitude in found]
-
-
-def _windows(blocks: Iterator[FloatArray], starts: list[int]) -> list[ComplexArray]:
-    """Return the series of windows, ``(n_blocks, _WINDOW)``, from their first ordinates on."""
-    cut: list[list[ComplexArray]] = [[] for _ in starts]
-    for part in blocks if starts else ():
-        transform = fft.fft(part, norm="forward")
-        for own, start in zip(cut, starts, strict=True):
-            # The transform is periodic.
-            index = np.arange(start, start + _WINDOW)
-            own.append(fft.ifft(transform.take(index, mode="wrap"), norm="forward"))
-    return [np.array(own) for own in cut]
+    for centre in centres:
+        begin = centre - _WINDOW // 2
+        index = np.arange(begin, begin + _WINDOW) - octave.first
+        window = fft.ifft(blocks.take(index, axis=1, mode="wrap"), norm="forward")
+        found += [
+            (ordinate * octave.sample_rate / octave.n, amplitude)
+            for ordinate, amplitude in _window_lines(window, begin, threshold)
+            if octave.low - 1 <= ordinate < octave.high + 1 and amplitude > _ROUNDING * largest
+        ]
+    return found
 
 
 def _line_test(

@@ -832,8 +832,9 @@ def test_a_vibrating_machine_shows_its_modes_and_not_its_mains(
     # 140 and 143 Hz overlap: one mode stands for both, and may lie between them. Which of the weak
     # modes beside it are found depends on how the processor rounds.
     low, high = 140 - 3 * found.frequency_std, 143 + 3 * found.frequency_std
-    assert ((low < found.frequency) & (found.frequency < high)).sum() == 1
-    assert ((found.damping_ratio > 0.01) & (found.damping_ratio < 0.05)).all()
+    (place,) = np.flatnonzero((low < found.frequency) & (found.frequency < high))
+    assert found.damping_ratio[place] < 0.05
+    assert (found.damping_ratio > 0.01).all()
     assert np.abs(found.frequency - np.array([[50.0], [100.0], [150.0]])).min() > 1
     assert {50, 100} <= {round(line.frequency) for line in found.lines if line.kind == "mains"}
 

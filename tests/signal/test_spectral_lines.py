@@ -62,7 +62,7 @@ def test_a_strong_line_has_no_companions() -> None:
 
 def test_two_lines_beside_each_other_are_two() -> None:
     """Sixteen ordinates apart, one ten times the other, both are found."""
-    noise = white(np.random.default_rng(3), 1e-4, 4000, RATE)
+    noise = white(np.random.default_rng(3), 1e-5, 4000, RATE)
     values = sine(4000, RATE, 100.0, 1.0) + sine(4000, RATE, 104.0, 0.1) + noise
     found = lines(values, alarm=1e-4)
     np.testing.assert_allclose(found[:, 0], [100.0, 104.0], atol=0.01)
