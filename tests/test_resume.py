@@ -165,7 +165,8 @@ def needed_by(script: Any) -> dict[str, str]:
         ("script.py", "SCALE = 2.0", "SCALE = 4.0", True),
         ("script.py", "def outcomes(rows):", "def outcomes(rows, more=1):", False),
         ("ranks.py", "def place(", "def place(more: int, ", True),
-        # A function of the same module that nothing here calls.
+        # Threads, and a function of the same module that nothing here calls.
+        ("ranks.py", "def place(", "@one_thread\ndef place(", False),
         ("ranks.py", "def share_row(", "def share_row(more: int, ", False),
         # What is needed through another module, and what that runs when it is imported.
         ("arrays.py", "FloatArray = ", "FloatArray = None or ", True),

@@ -2,15 +2,34 @@
 
 from collections.abc import Callable
 from datetime import datetime
-from typing import Any, Self
+from functools import wraps
+from typing import Any, ParamSpec, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+from threadpoolctl import threadpool_limits
+
+Given = ParamSpec("Given")
+Result = TypeVar("Result")
 
 FloatArray = NDArray[np.float64]
 BoolArray = NDArray[np.bool_]
 IntArray = NDArray[np.int64]
 ComplexArray = NDArray[np.complex128]
+
+
+def one_thread(function: Callable[Given, Result]) -> Callable[Given, Result]:
+    """Let linear algebra use one thread while a function runs.
+
+    Its arrays are small: threads would wait for one another, and sum in another order.
+    """
+
+    @wraps(function)
+    def limited(*args: Given.args, **named: Given.kwargs) -> Result:
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **named)
+
+    return limited
 
 
 def freeze(result: Any, *shapes: tuple[str, *tuple[int, ...]]) -> None:

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from lmshealth._private.arrays import one_thread
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
@@ -163,6 +164,7 @@ def identify(
     return read_modes(log, stage, channels=channels, band=band).modes
 
 
+@one_thread
 def read_modes(
     log: Log,
     stage: Stage | None = None,

@@ -14,7 +14,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import chdtrc, ndtr
 
-from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze
+from lmshealth._private.arrays import BoolArray, FloatArray, diagonal, freeze, one_thread
 from lmshealth._private.result import Result
 from lmshealth._private.tables import TABLES, fact
 from lmshealth.errors import NotEnoughData
@@ -200,6 +200,7 @@ def consistency(nis: FloatArray, dof: FloatArray, innovations: FloatArray) -> Co
     )
 
 
+@one_thread
 def track(history: History, stage: Stage | None = None) -> Track:
     """Track the modes of a history by a bank of Kalman filters.
 

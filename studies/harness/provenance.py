@@ -31,6 +31,8 @@ _MAIN = ast.unparse(ast.parse('__name__ == "__main__"'))
 _PROGRAMS = ("lmshealth/cli/*.py", "models/__main__.py")
 # Decorators that hand a function to nobody.
 _HARMLESS = {"cache", "contextmanager", "dataclass", "lru_cache", "overload"}
+# Those that change run times alone.
+_NO_VALUE = {"one_thread"}
 # The package itself gathers names of all its modules: of it a trial needs those that it names.
 _GATHERING = PROJECT / "lmshealth" / "__init__.py"
 
@@ -74,7 +76,7 @@ def code_of(work: Callable[..., Any], also: tuple[str, ...] = ()) -> str:
     This is the function with the functions, classes and constants of the project that it names,
     directly or not, what modules run when they are imported for it, the tables and descriptions
     whose file or folder this code names, and the versions of libraries. Comments, docstrings,
-    layout and code that it does not reach do not count.
+    layout, threads and code that it does not reach do not count.
     """
     return _digest(_script(work), bare(work).__qualname__, also)
 
@@ -122,6 +124,9 @@ def _tree(path: Path) -> ast.Module:
     for node in ast.walk(tree):
         if isinstance(node, _DOCUMENTED):
             node.body = [one for one in node.body if not _is_text(one)]
+        if isinstance(node, ast.FunctionDef):
+            kept = [one for one in node.decorator_list if ast.unparse(one) not in _NO_VALUE]
+            node.decorator_list = kept
     return tree
 
 

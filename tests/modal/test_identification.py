@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.signal import lfilter
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from lmshealth.errors import BadLog
 from lmshealth.io.buffers import MINUTE, Stored
@@ -1148,3 +1149,18 @@ def test_a_line_at_a_mode_that_is_no_harmonic_costs_no_second_fit(
     monkeypatch.setattr(modal, "_n_harmonics", lambda _: next(counts))
     identify(log, stage)
     assert fitted[0] == 4 * once
+
+
+def test_one_thread_of_linear_algebra_is_used() -> None:
+    """Also from Python, where nobody has set a variable; the caller's number is back in the end."""
+
+    def threads() -> set[int]:
+        return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
+
+    seen = list[set[int]]()
+    with threadpool_limits(2, user_api="blas"):
+        read_modes(
+            one_mode_log(8.0), band=(90.0, 120.0), progress=lambda *step: seen.append(threads())
+        )
+        assert {1} in seen and all(own == {1} for own in seen)
+        assert threads() == {2}

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.special import gammainccinv, gammaincinv
 
-from lmshealth._private.arrays import FloatArray, stack
+from lmshealth._private.arrays import FloatArray, one_thread, stack
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
@@ -55,6 +55,7 @@ Range = tuple[float, float]
 """Lowest and highest frequency in Hz."""
 
 
+@one_thread
 def identify_decays(
     log: Log,
     stage: Stage | None = None,

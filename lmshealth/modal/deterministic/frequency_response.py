@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy import fft
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import FloatArray, one_thread
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Channel, Log, Refusal
 from lmshealth.modal import constants
@@ -41,6 +41,7 @@ class FrfReading:
     modes: Modes  # credible modes, and why others are refused
 
 
+@one_thread
 def read_frf(
     log: Log,
     input: str,
@@ -133,6 +134,7 @@ def read_frf(
     return _identify(log.name, frf, ordinates, log.refused, output=response)
 
 
+@one_thread
 def read_measured(
     response: MeasuredResponse,
     *,
