@@ -168,7 +168,7 @@ def _fit_beside_lines(
         lines = optimum.likelihood.collapsed(optimum.p)
         if not lines:
             return data, optimum, rejected
-        data = _mask_at(data, optimum.poles[0][lines])
+        data = _mask_at(data, optimum, lines)
         left = list(optimum.targets)
         for i, f in zip(lines, optimum.poles[0][lines].tolist(), strict=True):
             name, duration = left[i].name, data.duration
@@ -374,12 +374,21 @@ def mask_residual_lines(data: ClusterData, expected: list[ComplexArray]) -> Clus
     return replace(data, masks=tuple(masks)) if n_free // 2 <= n_left < n_free else data
 
 
-def _mask_at(data: ClusterData, lines: FloatArray) -> ClusterData:
-    """Mask lines at these frequencies in Hz with their neighbours."""
-    masks = []
-    for spectrum, mask in zip(data.spectra.spectra, data.masks, strict=True):
-        apart = np.abs(spectrum.frequency[:, None] - lines).min(axis=1) * spectrum.duration
-        masks.append(mask & (apart > _LINE_BINS + 0.5))
+def _mask_at(data: ClusterData, optimum: _Optimum, lines: list[int]) -> ClusterData:
+    """Mask the lines that poles became, with their neighbours.
+
+    Means of several ordinates show only where about a line is: it is the strongest of them.
+    """
+    masks = list(data.masks)
+    means = [b.frequency for b in optimum.likelihood.blocks if b.frequency.size > 1]
+    for f in optimum.poles[0][lines].tolist():
+        reach = max(float(np.interp(f, own[:-1], np.diff(own))) for own in means)
+        for k, (spectrum, mask) in enumerate(zip(data.spectra.spectra, masks, strict=True)):
+            near = mask & (np.abs(spectrum.frequency - f) <= reach)
+            strongest = int(np.where(near, spectrum.powers().sum(axis=1), 0.0).argmax())
+            line = spectrum.frequency[strongest] if near.any() else f
+            apart = np.abs(spectrum.frequency - line) * spectrum.duration
+            masks[k] = mask & (apart > _LINE_BINS + 0.5)
     return replace(data, masks=tuple(masks))
 
 

@@ -23,6 +23,7 @@ from lmshealth.modal.ambient.cluster_fit import (
 from lmshealth.modal.ambient.cluster_modes import ClusterModes
 from lmshealth.modal.ambient.expected_periodogram import MeanOrdinates
 from lmshealth.modal.ambient.whittle import Likelihood
+from lmshealth.modal.identification import identify
 from lmshealth.modal.targets import Target
 from lmshealth.signal.segments import Segment
 from lmshealth.signal.spectra import CrossSpectrum, LogSpectra, cross_spectra
@@ -46,6 +47,7 @@ from tests.signals import (
     cut_band,
     displacements,
     make_log,
+    make_stage,
     mean_ordinate,
     of_channel,
     sine,
@@ -553,3 +555,14 @@ def test_directions_leave_most_of_a_mode_beside_a_strong_harmonic(
     assert basis.shape[1] == (2 if seen == 0.9 else 1)
     assert share[n // 2 :].min() > 0.95
     assert (share[: n // 2].min() > 0.9) == (seen == 0.9)
+
+
+def test_a_pole_that_becomes_a_line_leaves_no_part_of_it() -> None:
+    """Means of ordinates show only where about a line is: it is masked where it is strongest."""
+    c = case("mains in the band of a mode", 15)
+    log = make_log({f"acc_{k}": row.copy() for k, row in enumerate(c.samples.T)}, c.sample_rate)
+    modes = [(name, f, 0.012) for name, f in c.request()["modes"].items()]
+    found = identify(log, make_stage(modes))
+    assert found.names == ("m0", "m1", "m2")
+    error = np.abs(found.frequency - c.frequency) / found.frequency_std
+    assert error.max() < 3
