@@ -24,6 +24,7 @@ def one_thread(function: Callable[Given, Result]) -> Callable[Given, Result]:
     Its arrays are small: threads would wait for one another, and sum in another order.
     """
 
+    # `threadpool_limits.wrap` may look for libraries once, before SciPy has loaded its own.
     @wraps(function)
     def limited(*args: Given.args, **named: Given.kwargs) -> Result:
         with threadpool_limits(1, user_api="blas"):

@@ -10,7 +10,7 @@ import re
 import subprocess
 import sys
 from collections import defaultdict
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from functools import cache, partial
 from importlib import import_module
 from importlib.metadata import version
@@ -100,21 +100,26 @@ def _digest(path: Path, name: str, also: tuple[str, ...]) -> str:
         total.update(b"" if module == path else module.relative_to(PROJECT).as_posix().encode())
         total.update("".join(needed[module]).encode())
     code = "".join(one for codes in needed.values() for one in codes)
+    for part in _tables(code):
+        total.update(part)
+    return total.hexdigest()[:16]
+
+
+def _tables(code: str) -> Iterator[bytes]:
+    """Yield names and contents of the tables whose file or folder code names.
+
+    Of those of the program only the sections whose attribute is read.
+    """
     for package in ("lmshealth", "models"):
         for table in sorted((PROJECT / package).rglob("*")):
             named = f"'{table.name}'" in code or f"'{table.parent.name}'" in code
-            if table.suffix in (".toml", ".csv") and named:
-                total.update(table.name.encode())
-                for section in re.split(rb"(?m)^(?=\[)", table.read_bytes()):
-                    # Of the tables of the program those whose attribute is read.
-                    key = re.match(rb"\[(\w+)", section)
-                    if (
-                        table.name != "tables.toml"
-                        or not key
-                        or f"attr='{key[1].decode()}'" in code
-                    ):
-                        total.update(section)
-    return total.hexdigest()[:16]
+            if table.suffix not in (".toml", ".csv") or not named:
+                continue
+            yield table.name.encode()
+            for section in re.split(rb"(?m)^(?=\[)", table.read_bytes()):
+                key = re.match(rb"\[(\w+)", section)
+                if table.name != "tables.toml" or not key or f"attr='{key[1].decode()}'" in code:
+                    yield section
 
 
 @cache
@@ -141,8 +146,8 @@ def _needed(parts: set[_Part]) -> dict[Path, list[str]]:
     seen, left = set[_Part](), list(parts)
     while left:
         module, name = part = left.pop()
-        # The package gathers names of all its modules, which count at their homes; what is here
-        # says by which code a value was made, and makes none.
+        # Names that the package gathers count in their own modules. This module records by which
+        # code a value was computed, and computes none.
         if part in seen or part == (_GATHERING, _RUN) or module == _HERE or not module.exists():
             continue
         seen.add(part)

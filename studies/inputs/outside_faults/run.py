@@ -52,7 +52,7 @@ def main() -> None:
     chosen = chosen[::EACH] if study.quick else chosen
     # Each call is a process of its own, so that threads do.
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        ask = partial(study.trials.collect, answer, pool=pool, also=["lmshealth"])
+        ask = partial(study.trials.collect, answer, pool=pool)
         present = ask([(name, side, "") for name in chosen for side in SIDES])
         now = dict(zip(chosen, zip(present[::2], present[1::2], strict=True), strict=True))
         before: dict[str, Answer] = dict.fromkeys(chosen, (False, ""))
