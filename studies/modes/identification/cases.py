@@ -15,7 +15,7 @@ from studies.modes.identification.records import Array, Truth
 
 # A fit reaches that many damping ratios beyond its modes: the bound is that of the same band.
 REACH = 8.0
-HEADLINE, OTHERS = 2000, 400
+HEADLINE, OTHERS = 600, 200
 SHAPES = ((1.0, 0.6, -0.4), (0.5, -1.0, 0.7), (-0.3, 0.8, 1.0))
 
 

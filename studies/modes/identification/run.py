@@ -9,7 +9,7 @@ Method
     that must fail: intervals half as wide again and two thirds as wide; following error and
     accelerometers identified separately and averaged as if independent.
 Run time
-    Twenty minutes on two processors.
+    Forty minutes on two processors.
 """
 
 from __future__ import annotations
