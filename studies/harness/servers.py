@@ -30,10 +30,19 @@ _SETTINGS = ("fsync=off", "shared_buffers=16MB", "max_connections=50", "log_min_
 
 
 def free_port() -> int:
-    """Return a port of 127.0.0.1 on which nothing listens."""
-    with socket.socket() as listener:
-        listener.bind(("127.0.0.1", 0))
-        return int(listener.getsockname()[1])
+    """Return a port of 127.0.0.1 on which nothing listens.
+
+    It is below the ports that the system itself gives away (from 32768 on, Linux), so that no
+    connection or server takes it before the one that it is meant for, or while that restarts.
+    """
+    while True:
+        port = 20000 + secrets.randbelow(12000)
+        with socket.socket() as listener:
+            try:
+                listener.bind(("127.0.0.1", port))
+            except OSError:  # in use
+                continue
+            return port
 
 
 def wait_until(done: Callable[[], bool], what: str, within_s: float = WAIT_S) -> None:
