@@ -23,14 +23,12 @@ from lmshealth.io.log import Log, Refusal
 from lmshealth.io.manifest import MANIFEST, NOT_LOGS, Manifest, read_manifest_beside
 from lmshealth.io.reading import read_log
 from lmshealth.io.refusal import shown
-from lmshealth.modal.acceleration_survey import survey
 from lmshealth.modal.deterministic.frequency_response import FrfReading, read_frf, read_measured
 from lmshealth.modal.deterministic.measured import MeasuredResponse, read_responses
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.mode_shapes import mode_shapes
 from lmshealth.modal.naming import compare, name_response, why_unnamed
-from lmshealth.modal.setups import merge_setups
-from lmshealth.report import log_figures, tables
+from lmshealth.report import tables
 from lmshealth.signal.readings import find_growth, loop_error, read_error
 from lmshealth.stage.description import ModeSpec, Stage
 from lmshealth.stage.proposal import moment_of, propose, searches, write_skeleton
@@ -232,6 +230,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
         else:
             reading = read(log, stage, **chosen, progress=ctx.obj)
         if given["plot"]:
+            from lmshealth.report import log_figures  # late: most commands draw nothing
+
             figure = log_figures.modes_figure(log, reading, stage, band=band)
             log_figures.write_figure(given["plot"], figure)
         shapes = mode_shapes(reading.modes, reading.fitted)
@@ -240,6 +240,8 @@ def modes(ctx: click.Context, /, **given: Any) -> None:
 
     found, lost = _each(ctx, estimate)
     if given["merge"] and found:
+        from lmshealth.modal.setups import merge_setups
+
         found = [merge_setups(found)]
     content = _modes_content(found, stage)
     refused = [refusal for one in found for refusal in one.modes.refused]
@@ -366,6 +368,8 @@ def spectrum(ctx: click.Context, /, **given: Any) -> None:
     10 Hz. The magnitude is the amplitude of the strongest harmonic of a band. The test for spectral
     lines has a false-alarm probability of 1 % per channel.
     """
+    from lmshealth.modal.acceleration_survey import survey
+
     stage, band, part = given["stage"], given["band"], given["part"]
     found, lost = _each(ctx, lambda log: survey(log, stage, band, part=part))
     magnitudes = [item for own in found for item in own.magnitudes]
@@ -457,9 +461,10 @@ def frf(ctx: click.Context, /, **given: Any) -> None:
         named = name_response(own.modes, stage) if stage else own.modes
         estimates.append(LogEstimates(log.name, log.digest, log.metadata, named))
         if given["plot"]:
-            log_figures.write_figure(
-                given["plot"], log_figures.response_figure(log, own, named, stage)
-            )
+            from lmshealth.report import log_figures  # late: most commands draw nothing
+
+            figure = log_figures.response_figure(log, own, named, stage)
+            log_figures.write_figure(given["plot"], figure)
     rows = [row for one in estimates for row in tables.modes_rows(one)]
     content = {
         "modes": rows,

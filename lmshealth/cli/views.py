@@ -19,18 +19,18 @@ from lmshealth.cli.terminal import (
     print_view,
     short_names,
 )
-from lmshealth.life.health import Health
 from lmshealth.machine.constants import RUL_LEVELS
-from lmshealth.machine.service import Service
-from lmshealth.machine.summary import Life, ParameterHealth, Summary
 from lmshealth.report import constants, text
 from lmshealth.report.tables import events_rows, to_rows, track_rows
 from lmshealth.report.text import GAP
 from lmshealth.signal.segments import distinct_velocities
-from lmshealth.tracking.track import Track
 
-if TYPE_CHECKING:
+if TYPE_CHECKING:  # so that single logs need nothing of lives
     from lmshealth.calibration.check import CalibrationCheck
+    from lmshealth.life.health import Health
+    from lmshealth.machine.service import Service
+    from lmshealth.machine.summary import Life, ParameterHealth, Summary
+    from lmshealth.tracking.track import Track
 
 _MATRIX = 6  # columns of a matrix that fit on a terminal
 

@@ -14,12 +14,9 @@ import numpy as np
 from lmshealth._private.arrays import finite_or_none
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.io.log import Refusal, covariates
-from lmshealth.machine.status import notices
-from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.stage.constants import TYPICAL_DURATION
-from lmshealth.tracking.track import Track, mode_columns
 
-if TYPE_CHECKING:  # so that help needs no scipy.stats
+if TYPE_CHECKING:
     from lmshealth.machine.assessment import Assessment
     from lmshealth.modal.deterministic.frequency_response import FrfReading
     from lmshealth.modal.log_estimates import LogEstimates
@@ -29,6 +26,7 @@ if TYPE_CHECKING:  # so that help needs no scipy.stats
     from lmshealth.signal.spectral_lines import Line
     from lmshealth.stage.check import Diagnostic, ParameterCheck, StageCheck
     from lmshealth.stage.identifiability import Plan
+    from lmshealth.tracking.track import Track
 
 _KM, _MILLI, _MICRO, _NANO = 1000.0, 1e-3, 1e-6, 1e-9
 
@@ -87,6 +85,9 @@ def log_tables(reading: LogEstimates) -> dict[str, str]:
 
 def machine_tables(assessment: Assessment) -> dict[str, list[Row]]:
     """Return the rows of the tables of one machine without those of its logs, by table."""
+    from lmshealth.machine.status import notices  # late: single logs need nothing of lives
+    from lmshealth.machine.summary import prognosis_rows, summarise_life
+
     rows: dict[str, list[Row]] = {}
     if assessment.track is not None:
         rows |= track_tables(assessment.track)
@@ -158,6 +159,8 @@ def refused_rows(refused: Iterable[Refusal]) -> list[Row]:
 
 def track_rows(track: Track, smoothed: Track | None = None) -> list[Row]:
     """Return a track, one row per epoch and mode, with columns of smoothed values."""
+    from lmshealth.tracking.track import mode_columns  # late, as above
+
     columns = track.to_columns()
     if smoothed is not None:
         later = mode_columns(smoothed)

@@ -214,6 +214,22 @@ def test_modes_as_a_table_name_frequency_and_damping(folder: Path, stage: Path) 
     assert "±" in result.stdout
 
 
+def test_modes_of_a_log_load_no_tracker_and_no_life(folder: Path, stage: Path) -> None:
+    """Who identifies one log does not wait for what judges machines and draws pages."""
+    words = ["modes", str(folder / "good" / "log-00.h5"), "--stage", str(stage)]
+    code = (
+        "import sys\nfrom lmshealth.cli.main import main\n"
+        f"main({words}, standalone_mode=False)\nprint(*sys.modules, file=sys.stderr)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = done.stderr.split()
+    assert "roll" in done.stdout and "lmshealth.modal.identification" in loaded
+    assert not {
+        name for name in loaded
+        if name.startswith(("lmshealth.tracking", "lmshealth.life", "lmshealth.report.figures"))
+    }  # fmt: skip
+
+
 def test_a_refused_log_is_printed_once(folder: Path, stage: Path) -> None:
     """On standard error alone; json has it too, for programs."""
     broken = folder / "bad" / "broken.h5"
