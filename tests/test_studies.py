@@ -278,6 +278,18 @@ def test_crossings(root: Path) -> None:
     assert answer["kinds"]["crossing, unnamed"]["nearest_lives_swapped"]["hits"] == 2
 
 
+def test_drift(root: Path) -> None:
+    """Of a kind of each group: drifts near the truth, fast wear alarmed, and no quiet life."""
+    few = {"wear": ("linear",), "slow wear": ("slow linear",), "healthy": ("quiet",)}
+    groups = few | {"fast wear": ("fast from the start",)}
+    with patch.object(import_module("studies.track.drift"), "GROUPS", groups):
+        rows = json.loads(run_study(root, "studies.track.drift"))["rows"]
+    assert abs(rows["linear"]["slope"] - 1) < 0.05
+    assert rows["fast wear"]["alarms"]["hits"] == 3 and rows["healthy"]["alarms"]["hits"] == 0
+    # So few lives do not tell nine from eight in ten, but wide intervals from narrow ones.
+    assert all(rows[kind]["held_narrower"] < rows[kind]["held"] for kind in few)
+
+
 def test_detectability(root: Path) -> None:
     """The posterior finds planned losses, and hardly any of none; the mount of X is not shown."""
     answer = json.loads(run_study(root, "studies.health.detectability"))
