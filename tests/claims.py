@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import hashlib
 import os
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -151,6 +153,7 @@ class _Judgement:
 
     def __init__(self) -> None:
         self.rows: list[Any] = []
+        self.begin = time.time()
 
     def pytest_runtest_logreport(self, report: pytest.TestReport) -> None:
         """Take the claims of a test."""
@@ -190,11 +193,15 @@ class _Judgement:
             f" rule: a suite without fault fails in at most {level:.0%} of reseeded runs"
         )
         if target := os.environ.get("LMSHEALTH_STATISTICS"):
-            from tests.statistical.page import write_page  # late: few runs need it
+            from studies.harness.provenance import commit  # late: few runs need these
+            from tests.statistical.page import write_page
 
             failed = exitstatus != pytest.ExitCode.OK
             held = zip(asked.tolist(), rejected.tolist(), strict=True)
-            write_page(Path(target), self.rows, list(held), failed=failed)
+            minutes = (time.time() - self.begin) / 60
+            seed = os.environ.get("LMSHEALTH_SEED", "that of the suite")
+            made = f"{date.today():%Y-%m-%d}, code {commit()}, seed {seed}, {minutes:.0f} minutes"
+            write_page(Path(target), self.rows, list(held), failed=failed, made=made)
             write(f"Page: {target}")
 
 

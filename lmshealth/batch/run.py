@@ -32,7 +32,7 @@ from lmshealth.batch.assess import (
     reason_if_failed,
     unpack_logs,
 )
-from lmshealth.batch.ingest import NOT_LISTED, Settings, ingest
+from lmshealth.batch.ingest import NOT_LISTED, Ingested, Settings, ingest
 from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_or_none
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
@@ -262,31 +262,43 @@ def run(
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
         notes += store.notes
-    excluded = {log for output in made.values() for log in output.excluded}
-    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
-    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
-    lost = (others - copies | excluded) & ingested.logs
-    misspelt = [f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT]
+    counts, lost = _count(ingested, refused, made)
     if not machines:
         raise NothingUsable(
             f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
             f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
+    misspelt = tuple(f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT)
     return RunResult(
         index=out / "index.html",
         rows=rows,
         failed=failed | lacking,
-        n_logs=len(ingested.logs - copies),
-        n_refused=len(lost),
-        n_remembered=ingested.n_cached,
-        n_unlisted=len(unlisted),
-        n_unread=sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - len(misspelt),
         statuses=statuses,
         changes=tuple(changes),
         unsent=unsent,
         notes=(*misspelt, *notes),
+        **counts,
     )
+
+
+def _count(
+    ingested: Ingested, refused: Sequence[Refusal], made: Mapping[str, MachineOutput]
+) -> tuple[dict[str, int], set[str]]:
+    """Count the logs of a run, by field of `RunResult`; return also which were refused whole."""
+    excluded = {log for output in made.values() for log in output.excluded}
+    copies, unlisted = ({one.log for one in refused if one.reason == reason} for reason in _COPIES)
+    others = {refusal.log for refusal in refused if refusal.reason not in _COPIES}
+    lost = (others - copies | excluded) & ingested.logs
+    misspelt = sum(one.reason == MISSPELT for one in refused)
+    counts = {
+        "n_logs": len(ingested.logs - copies),
+        "n_refused": len(lost),
+        "n_remembered": ingested.n_cached,
+        "n_unlisted": len(unlisted),
+        "n_unread": sum(PurePosixPath(one.log).name in NOT_LOGS for one in refused) - misspelt,
+    }
+    return counts, lost
 
 
 def report(

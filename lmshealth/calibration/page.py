@@ -15,7 +15,7 @@ from scipy import stats
 from lmshealth._private.files import write_text
 from lmshealth._private.tables import TABLES, Row
 from lmshealth.calibration import constants
-from lmshealth.calibration.check import DAYS, CalibrationCheck, Coverage, Rate
+from lmshealth.calibration.check import DAYS, DRAWN, CalibrationCheck, Coverage, Rate
 from lmshealth.machine.constants import JSON_SCHEMA
 from lmshealth.report.figures import BLUE, INK, MUTED, RED, svg
 from lmshealth.report.rendering import render
@@ -108,10 +108,12 @@ def share_plot(ax: Axes, rows: Sequence[Share]) -> Axes:
     return ax
 
 
-def histogram_picture(title: str, places: ArrayLike, note: str, *, salt: str) -> Picture:
-    """Draw a histogram of ranks with a caption."""
+def histogram_picture(
+    title: str, places: ArrayLike, note: str, *, salt: str, good: str = _FLAT
+) -> Picture:
+    """Draw a histogram of ranks with a caption, which says what is good of it."""
     text = svg(lambda ax: rank_histogram(ax, places), salt=salt)
-    return Picture(title, text, f"{_FLAT} {note}")
+    return Picture(title, text, f"{good} {note}".strip())
 
 
 def share_picture(
@@ -180,7 +182,7 @@ def expectation_rows(check: CalibrationCheck) -> list[dict[str, str]]:
         wrong = [f"{100 * x.level:.0f}{GAP}%: {x.verdict}" for x in own if x.verdict != "as stated"]
         row |= {
             f"median width at {100 * own[-1].level:.0f}{GAP}%": _width(own[-1]),
-            "": ", ".join(wrong) or "as stated",
+            "": ", ".join(wrong) or ("as stated" if kind == DRAWN else "not excluded"),
         }
         rows.append(row)
     return rows
@@ -215,7 +217,8 @@ def _expectations(check: CalibrationCheck, quantities: Sequence[str]) -> Block:
             "wide, and its uncertainty too large.",
             "“as described” has lives of all kinds as often as the description expects them; only "
             "there coverage must be as stated. In lives of one kind alone it may be higher or "
-            "lower, which is shown beside it. In brackets: 95 % Monte-Carlo interval.",
+            "lower, which is shown beside it; few lives do not exclude the level. In brackets: "
+            "95 % Monte-Carlo interval.",
             *(f"Without a result are {k} lives: {why}." for why, k in check.without_result.items()),
         ),
         [

@@ -2,7 +2,7 @@
 
 ``python -m studies.harness.summary`` writes what stands between `MARKS` in ``studies/README.md``,
 one line a record, and in the page of each group, all claims of its records, and the figure of each
-record with enough shares.
+record with enough shares. ``FRONT_PAGE.md`` has the statements of the front page (`front_page`).
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from studies.harness import front_page
 from studies.harness.claims import Claim
 from studies.harness.figures import draw, shown
 from studies.harness.study import STUDIES, record_of
@@ -107,6 +108,17 @@ def overview() -> str:
     return between_marks(HERE / "README.md", lines)
 
 
+def statements() -> str:
+    """Return the page of the statements of the front page."""
+    found = {}
+    for group in GROUPS:
+        for record in records(group):
+            name = record.script.relative_to(HERE).with_suffix("").as_posix().removesuffix("/run")
+            address = f"{group}/README.md#{anchor(record)}"
+            found[name] = front_page.Support(record.claims, record.command, address)
+    return between_marks(HERE / "FRONT_PAGE.md", list(front_page.lines(found)))
+
+
 def group_page(group: str) -> str:
     """Return the page of a group: all claims of its records."""
     lines: list[str] = []
@@ -136,7 +148,8 @@ def section(record: Record, folder: Path) -> Iterator[str]:
     made = record.content["recorded"]
     link = f"[record]({record.path.relative_to(folder).as_posix()})"
     when = made["date"] + (f" by {made['commit']}" if made.get("commit") else "")
-    yield f"{record.question} {script}, recorded {when} in {_duration(made)}: {link}."
+    where = f" ({made['machine']})" if made.get("machine") else ""
+    yield f"{record.question} {script}, recorded {when} in {_duration(made)}{where}: {link}."
     yield ""
     yield "| claim | figure | uncertainty | comparison | |"
     yield "| --- | --- | --- | --- | --- |"
@@ -176,6 +189,7 @@ def main() -> None:
                 record.figure.unlink(missing_ok=True)
         (HERE / group / "README.md").write_text(group_page(group), encoding="utf-8")
     (HERE / "README.md").write_text(overview(), encoding="utf-8")
+    (HERE / "FRONT_PAGE.md").write_text(statements(), encoding="utf-8")
 
 
 if __name__ == "__main__":

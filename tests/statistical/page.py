@@ -33,9 +33,17 @@ _SIDES = {"as": "", "most": "at most ", "least": "at least "}
 
 
 def write_page(
-    target: Path, rows: Sequence[Row], held: Sequence[tuple[float, bool]], *, failed: bool
+    target: Path,
+    rows: Sequence[Row],
+    held: Sequence[tuple[float, bool]],
+    *,
+    failed: bool,
+    made: str,
 ) -> None:
-    """Write the page of claims; `held` has the level of each, and whether it is rejected."""
+    """Write the page of claims; `held` has the level of each, and whether it is rejected.
+
+    ``made`` says when, from which code, seed and in which time.
+    """
     level, of = rows[0]["level"], rows[0]["of"]
     rejected = [row["name"] for row, (_, out) in zip(rows, held, strict=True) if out]
     groups = dict.fromkeys(row["name"].split(": ")[0] for row in rows)
@@ -66,7 +74,7 @@ def write_page(
         *(_block(group, rows, held, k) for k, group in enumerate(groups)),
     ]
     title = "Statistical claims of lmshealth"
-    sub = "Written by make statistics; other data: LMSHEALTH_SEED=7 make statistics"
+    sub = f"Written by make statistics, {made}; other data: LMSHEALTH_SEED=7 make statistics"
     write_text(target, render_page(title, sub, (state, headline, why), blocks))
 
 
@@ -81,7 +89,7 @@ def _block(
     if shares:
         caption = (
             "Good: each bar reaches its dashed line, or lies on the claimed side of it. By chance "
-            "one of twenty misses it (red)."
+            "one of twenty misses it (red): that alone is no rejection, which the table tells."
         )
         figures.append(
             share_picture("Coverages and rates", shares, caption, salt=f"s{number}", wide=True)
@@ -97,7 +105,8 @@ def _block(
         figures.append(
             histogram_picture(
                 f"Control: {name}, wrong on purpose", control["wrong"]["places"],
-                f"This one must not look good; p = {control['control']:.1g}.", salt=f"c{number}",
+                f"p {_probability(control['control'])}.", salt=f"c{number}",
+                good="This one must not look good: its bars must not be of equal height.",
             )
         )  # fmt: skip
     table = [
@@ -107,13 +116,18 @@ def _block(
             "measured (95 % Monte-Carlo interval)": "; ".join(map(_measured, row["shares"])) or "–",
             "p": f"{row['p']:.2g}",
             "rejected below": f"{level:.1g}",
-            "p of the control": f"{row['control']:.1g}",
+            "p of the control": _probability(row["control"]).removeprefix("= "),
             "": "REJECTED" if out else "holds",
         }
         for row, (level, out) in own
     ]
     text = f"{len(table)} claims, tested by tests/statistical/test_{group}_calibration.py."
     return Block(_TITLES[group], (text,), figures, table)
+
+
+def _probability(p: float) -> str:
+    """Format a p value that may be too small for a number of the machine."""
+    return f"= {p:.1g}" if p > 0 else "below 1e-300"
 
 
 def _measured(share: Sequence[Any]) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cache
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ LENGTH, THICKNESS, MODULUS, DENSITY = 0.501, 0.00666, 200e9, 7850.0
 # Distance of the roller from the clamp in mm: the testbed's range (README of data set 2), which
 # the commands of the set divide into five equal steps.
 PLACES = np.linspace(48.0, 175.0, 6)
+REPEATS, QUICK_REPEATS = 11, 3
 DAMPING = (0.0073, 0.0022, 0.0013, 0.0010, 0.0008, 0.0013)
 # The roller rests where its smoothed sensor stays this near to the level of the dwell; a log holds
 # at least so much of that, and so much before it that is marked as moving (V, s, s).
@@ -87,6 +89,18 @@ class Machine:
         return ["run", self.logs, "--stage", self.stage, *columns]
 
 
+def check_recordings(data: Path) -> None:
+    """End the study with the next step where a recording that its full form needs is missing."""
+    beams = [f"dropbear_ds8/open/10steps_test{k}.txt.gz" for k in range(REPEATS)]
+    frames = product(FRAMES, EVENTS, FLOORS)
+    every = [*beams, *("shake_3storey/open/{}_{}_{}.csv".format(*one) for one in frames)]
+    if lacking := [name for name in every if not (data / name).exists()]:
+        raise SystemExit(
+            f"{data}: {len(lacking)} of {len(every)} recordings are missing, the first is "
+            f"{lacking[0]}; `python -m studies.health.measured.fetch {data}` fetches them"
+        )
+
+
 @cache
 def bending(place: float) -> float:
     """Return the first natural frequency in Hz of the beam with its roller at a place in mm.
@@ -143,8 +157,7 @@ def write_manifest(folder: Path, name: str) -> None:
 
 def beam(data: Path, scratch: Path, *, quick: bool) -> list[Machine]:
     """Return the machines of the beam: its roller moved by one step, or by five, or left alone."""
-    n_repeats = len(list((data / "dropbear_ds8/open").glob("10steps_test*.txt.gz")))
-    repeats = range(3 if quick else n_repeats)
+    repeats = range(QUICK_REPEATS if quick else REPEATS)
     ways = [(k, way) for k in range(6) for way in ("up", "down")]
     dwells: dict[tuple[int, str], list[Path]] = {one: [] for one in ways}
     for repeat in repeats:
@@ -211,8 +224,7 @@ def frame(data: Path, scratch: Path) -> list[Machine]:
         name = f"frame-{'-'.join(frames).lower()}"
         (scratch / name).mkdir()
         every = [(f, e, floor) for f in frames for e in EVENTS for floor in FLOORS]
-        there = [w for w in every if (folder / "{}_{}_{}.csv".format(*w)).exists()]
-        for n, which in enumerate(there):
+        for n, which in enumerate(every):
             shutil.copy(folder / "{}_{}_{}.csv".format(*which), scratch / name / f"{n:03d}.csv")
         write_manifest(scratch / name, name)
         columns = scratch / f"{name}.columns.toml"

@@ -189,7 +189,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         "99.9 %",
         met=not short,
     )
-    head = [row for row in rows if row["n"] + row["refused"] == HEADLINE]
+    head = [row for row in rows if row["case"] in HEADLINES]
     yield covered(
         "coverage of 95 % intervals in the headline kinds",
         [row["coverage"] for row in head],

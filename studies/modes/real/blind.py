@@ -1,4 +1,4 @@
-"""Which modes of real records are found without a description, and what else is?
+"""Which modes of records that others made are found without a description, and what else is?
 
 Method
     The sets of `run` are searched in a band that a user would choose, each record as one log: a
@@ -152,8 +152,9 @@ def claims(record: Mapping[str, Any]) -> Iterator[Claim]:
         others = row["others"]
         best = max(others, key=lambda k: others[k]["found"] - others[k]["else"] / 10)
         what = "false" if row["complete"] else "others"
+        made = ", simulated by others" if row["complete"] else ", measured"
         yield Claim(
-            f"known modes found without a description: {row['set']}",
+            f"known modes found without a description: {row['set']}{made}",
             f"{row['found']} of {row['known']}, {row['else']} {what}",
             beside=f"best preset ({best}): {others[best]['found']}, {others[best]['else']} {what}",
             met=row["found"] == row["known"] and not (row["complete"] and row["else"]),

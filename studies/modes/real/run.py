@@ -1,4 +1,4 @@
-"""Do identified modes and their intervals agree with what is known of real measurements?
+"""Do modes and their intervals agree with what is known of records that others made?
 
 Method
     A timber building under ambient excitation (90 min, 6 accelerometers, 100 Hz) is cut into
@@ -113,7 +113,7 @@ def claims(answer: Row) -> Iterator[Claim]:
     light = answer["light_frame"]
     off = [abs(row["f_hz"] / row["known_f_hz"] - 1) for row in light]
     yield Claim(
-        f"a light frame: {len(light)} frequencies off the known ones, at most",
+        f"a light frame, simulated by others: {len(light)} frequencies off the known ones, at most",
         f"{100 * max(off):.3f} %",
         beside="0.1 % required",
         met=max(off) < 1e-3,
@@ -123,7 +123,7 @@ def claims(answer: Row) -> Iterator[Claim]:
         held = sum(row[f"holds_{what}_f"] for row in frame)
         more = "" if what == "documented" else ", as its integration in steps has them"
         yield Claim(
-            f"a shear frame: frequencies inside their 95 % intervals, {what}{more}",
+            f"a shear frame, simulated by others: 95 % intervals that hold f, {what}{more}",
             f"{held} of {len(frame)}",
             met=held == len(frame),
         )
