@@ -35,6 +35,12 @@ FACTOR = 1.5
 CHUNK = 50
 FUSED = "following error and two accelerometers"
 HEADLINES = tuple(case.name for case in CASES if case.seeds == HEADLINE)
+NOT_MET = {
+    "headline coverages hold": "intervals of a mode that is fitted alone are up to a tenth too "
+    "wide: they include slopes of the floors and of the force that these records do not have",
+    "headline errors are near the bound": "the bound knows that floors and force have no slope, "
+    "the fit estimates them",
+}
 QUICK, QUICK_SEEDS = ("isolated, SNR 100", "isolated as 7 moves of 3 s", FUSED), 6
 
 
@@ -55,7 +61,8 @@ def main() -> None:
     }
     rows = [row for k in cases for row in summarise(CASES[k], found[k])]
     passed = verdicts(rows, quick=study.quick)
-    study.conclude({"cases": rows, "passed": passed, "not_met": shortfalls(rows)})
+    answer = {"cases": rows, "passed": passed, "short": shortfalls(rows)}
+    study.conclude(answer, not_met={} if study.quick else NOT_MET)
 
 
 def identify_some(k: int, first: int, last: int) -> list[list[list[float]]]:

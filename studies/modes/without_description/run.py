@@ -51,6 +51,8 @@ NOT_MET = {
         "a record of six to eight channels with a harmonic that wanders is searched twice, and "
         "every group of modes is fitted, which SSI without intervals does not do"
     ),
+    "no wandering harmonic is a mode": "one that wanders as far as a mode is wide looks like one",
+    "false modes": "of the turbine one of these harmonics in 16 logs, more than one in 20",
 }
 
 
