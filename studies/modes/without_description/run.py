@@ -43,6 +43,7 @@ FAR_OFF = 5.0
 WANDERED = 0.03
 NARROWER = 1.5
 CONTROL = "peaks of single channels"
+PROGRAMS = "pyOMA2", "pyoma-toolbox", "koma", CONTROL
 # The first of all seeds, so that records are others than those of development.
 KEY = 20261125
 
@@ -194,18 +195,21 @@ def verdicts(families: Mapping[str, Mapping[str, Any]]) -> dict[str, bool]:
 
 
 def claims(record: Mapping[str, Any]) -> Iterator[Claim]:
-    """Claim what is found and what is false, beside other programs on the same records."""
+    """Claim what is found, what is false, and time, beside all programs on the same records."""
     for name, one in record["families"].items():
-        rows = {k: o for k, o in one["others"].items() if k != CONTROL}
-        best = max(rows, key=lambda k: rows[k]["recall"] - rows[k]["false_per_log"] / 10)
-        control = one["others"][CONTROL]
+        beside = []
+        for program in PROGRAMS:
+            rows = {k: o for k, o in one["others"].items() if k.startswith(program)}
+            best = max(rows, key=lambda k: rows[k]["recall"] - rows[k]["false_per_log"] / 10)
+            share, false = 100 * rows[best]["recall"], rows[best]["false_per_log"]
+            beside.append(
+                f"{best} {share:.0f} %, {false:.1f} false a log on {rows[best]['records']}"
+            )
         yield Claim(
             f"modes found without a description, {name}",
             f"{one['found']} of {one['there']}, {one['false']} false in {one['records']} logs",
             "{:.3f} to {:.3f}".format(*clopper_pearson(one["found"], one["there"])),
-            f"best preset of {len(rows)} ({best}): {100 * rows[best]['recall']:.0f} % and "
-            f"{rows[best]['false_per_log']:.1f} false a log on {rows[best]['records']}; {CONTROL} "
-            f"{100 * control['recall']:.0f} % and {control['false_per_log']:.1f}",
+            f"best presets: {'; '.join(beside)}",
             record["passed"][f"recall, {name}"] and one["false_per_log"] <= MOST_FALSE,
         )
     families = record["families"].values()
@@ -223,11 +227,11 @@ def claims(record: Mapping[str, Any]) -> Iterator[Claim]:
         f"93 to 97 % required; a third less wide {100 * narrow / n:.1f} %",
         record["passed"]["intervals of f cover"],
     )
-    ssi = [o["time_over_ours"] for one in families for k, o in one["others"].items() if "SSI," in k]
-    yield Claim(
-        "processor time of pyOMA2's SSI with a preset, over ours", span(ssi),
-        beside="at least 1 required", met=record["passed"]["at most the time of pyOMA2's SSI"],
-    )  # fmt: skip
+    for program in PROGRAMS[:-1]:
+        rows = [o for one in families for k, o in one["others"].items() if k.startswith(program)]
+        ratios = [o["time_over_ours"] for o in rows]
+        what = f"processor time of {program} over ours, all its presets"
+        yield Claim(what, span(ratios), "", "at least 1 required", min(ratios) >= 1)
 
 
 if __name__ == "__main__":

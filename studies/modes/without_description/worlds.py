@@ -21,35 +21,17 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class World:
-    """A record and the truth about it.
-
-    Attributes
-    ----------
-    family : str
-        Of which family it is.
-    sample_rate : float
-        In Hz.
-    samples : ndarray
-        Channels in m/s², of displacements in m, shape ``(n_samples, n_channels)``.
-    n_displacements : int
-        The first channels are displacements.
-    band : (float, float)
-        In which a user would search, in Hz.
-    frequency, damping_ratio : ndarray
-        Of the modes, in Hz, ascending, shape ``(n_modes,)``.
-    steady, wandering : tuple of float
-        Mean frequencies in Hz of sines and of harmonics whose frequency wanders.
-    """
+    """A record and the truth about it."""
 
     family: str
-    sample_rate: float
-    samples: Array
-    n_displacements: int
-    band: tuple[float, float]
-    frequency: Array
-    damping_ratio: Array
-    steady: tuple[float, ...] = ()
-    wandering: tuple[float, ...] = ()
+    sample_rate: float  # in Hz
+    samples: Array  # in m/s², of displacements in m, (n_samples, n_channels)
+    n_displacements: int  # these are the first channels
+    band: tuple[float, float]  # in which a user would search, in Hz
+    frequency: Array  # of the modes, in Hz, ascending, (n_modes,)
+    damping_ratio: Array  # (n_modes,)
+    steady: tuple[float, ...] = ()  # frequencies of sines in Hz
+    wandering: tuple[float, ...] = ()  # mean frequencies of harmonics that wander, in Hz
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,11 +123,8 @@ def turbine(rng: np.random.Generator) -> World:
 
 
 FAMILIES: dict[str, Callable[[np.random.Generator], World]] = {
-    "four modes": four_modes,
-    "varied": varied,
-    "eight modes": eight_modes,
-    "turbine": turbine,
-}
+    "four modes": four_modes, "varied": varied, "eight modes": eight_modes, "turbine": turbine
+}  # fmt: skip
 
 
 def shapes_of(rng: np.random.Generator, n_channels: int, n_modes: int) -> Array:
