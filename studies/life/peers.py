@@ -1,27 +1,32 @@
-"""Is the remaining life predicted better than by the particle filter of progpy, on the same lives?
+"""Is the remaining life predicted better than by particle filters and a line, on the same lives?
 
 Method
     Lives of the study `kinds` (30 logs up to 50, 70 or 90 % of the life): losses of preload by two
-    courses that the peer's law has as well (linear, power), and by one that it has not (late).
-    `lmshealth` assesses raw estimates with the shipped laws. The peer is the `ParticleFilter` of
-    progpy with 2,000 particles (100 by default) and its `MonteCarlo` predictor, as its guide to
-    parameter estimation has it: states are the travel, the length and the exponent of a power law,
-    and a factor on each mode's drift, with small process noise in the filter and none in the
-    prediction. It has advantages: the plant's map itself, that the mount stays, the
-    distribution of the lengths, and the size of the map's error; temperature is removed by least
-    squares on temperature and powers of the travel, and the first log is the baseline.
-    Scores of both on the same lives: coverage of 90 % intervals of health and of the remaining
-    life, mean continuous ranked probability score of the remaining life up to 10,000 km, and
-    processor time. Control, which must be worse: the distribution of lengths without any log.
-    Noise, jitter and baseline of the peer were chosen by its scores on the first two kinds here.
+    courses that the law of progpy's filter has as well (linear, power), and by one that it has not
+    (late). `lmshealth` assesses raw estimates with the shipped laws. Peers:
+    the `ParticleFilter` of progpy with 2,000 particles (100 by default) and its `MonteCarlo`
+    predictor, as its guide to parameter estimation has it (states are the travel, the length and
+    the exponent of a power law, and a factor on each mode's drift, with small process noise in the
+    filter and none in the prediction); a plain bootstrap particle filter (loss, its rate, whose
+    logarithm is a random walk, and the factors; systematic resampling; particles are propagated to
+    the limit); the least-squares line of the modes' mean drift over the travel, extrapolated to the
+    drift at the limit with its prediction interval (Student's t).
+    Peers have advantages: the plant's map itself, that the mount stays, and, of the filters, the
+    distribution of the lengths and the size of the map's error; temperature is removed by least
+    squares on temperature and powers of the travel, and the first log is the baseline. Noise,
+    walk and jitter of the filters were chosen by their scores on the first two kinds here.
+    Scores of all on the same lives: coverage of 90 % intervals of health and of the remaining
+    life, continuous ranked probability score of the remaining life up to 10,000 km, error of the
+    median of ln preload, processor time. Trivial prediction: the lengths' distribution without any
+    log, which every predictor must surpass.
 Run time
-    Ten minutes on one processor. progpy comes with the extra ``peers``.
+    A quarter of an hour on one processor. progpy comes with the extra ``peers``.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,29 +34,32 @@ import numpy as np
 from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import Claim, number
 from studies.harness.metrics import crps
+from studies.harness.peers import mean
 from studies.harness.study import Row, Study
 from studies.life.kinds.answers import IMPORTANCE, answer
 from studies.life.kinds.plant import LIMITS, MODES, Array, drift, map_table
-from studies.life.kinds.worlds import LIFE_KM, MAP_ERROR, REFERENCE_C, life_of
+from studies.life.kinds.worlds import LIFE_KM, MAP_ERROR, REFERENCE_C, Life, life_of
 
-KINDS, LIVES = ("preload, linear", "preload, power", "preload, late"), 8
-PEER, OURS, CONTROL = "progpy", "lmshealth", "no log"
+KINDS, LIVES = ("preload, linear", "preload, power", "preload, late"), 24
+OURS, CONTROL = "lmshealth", "no log"
 LOST = 1 - LIMITS["guide_preload"]
 PARTICLES, SAMPLES, HORIZON_KM, STEP_KM = 2000, 300, 10_000.0, 20.0
 # Of a log's ln f beside the map: stated errors, walk, and the baseline.
 NOISE, JITTER, POWER_STD = 7e-4, 3e-4, 0.4
+# Of the plain filter: particles, walk of ln rate over a median life, jitter of the factors.
+PLAIN, RATE_WALK, FACTOR_JITTER = 5000, 0.5, 3e-3
 NOT_MET = {
     f"preload, late: {name} predicts better than no log": f"a fast end that no log shows yet: {why}"
-    for name, why in ((PEER, "its law has none"), (OURS, "it may begin at any time"))
+    for name, why in (("progpy", "its law has none"), (OURS, "it may begin at any time"))
 }
 _SCALES = [f"scale_{mode}" for mode in MODES]
 
 
 def main() -> None:
-    """Run the study; ``--quick`` does one life by the peer alone and records nothing."""
+    """Run the study; ``--quick`` does one life by all others and records nothing."""
     study = Study(__file__, __doc__)
     tasks = [(kind, k) for k in range(1 if study.quick else LIVES) for kind in KINDS]
-    work = {PEER: by_progpy, CONTROL: without_logs} | ({} if study.quick else {OURS: by_lmshealth})
+    work = WORK if study.quick else {OURS: by_lmshealth} | WORK
     found = {name: study.trials.collect(own, tasks) for name, own in work.items()}
     rows = {
         name: {kind: scored(kind, [one for one, task in zip(own, tasks, strict=True)
@@ -89,18 +97,13 @@ def preload_model() -> Any:
         outputs: ClassVar = list(MODES)
         events: ClassVar = ["limit"]
 
-        def initialize(self, u: object = None, z: object = None) -> object:
-            return self.StateContainer(dict.fromkeys(self.states, 0.0))
-
         def next_state(self, x: Row, u: object, dt: float) -> object:
             kept = {name: x[name] for name in self.states}
             return self.StateContainer(kept | {"travel": x["travel"] + dt})
 
         def output(self, x: Row) -> object:
-            ln_health = np.atleast_1d(_ln_health(x))
-            found = drift(np.stack([ln_health, 0 * ln_health], axis=-1))
-            scales = [x[name] for name in _SCALES]
-            return self.OutputContainer(dict(zip(MODES, found.T * scales, strict=True)))
+            found = _drift(np.atleast_1d(_ln_health(x))).T * [x[name] for name in _SCALES]
+            return self.OutputContainer(dict(zip(MODES, found, strict=True)))
 
         def event_state(self, x: Row) -> dict[str, Array]:
             return {"limit": 1 - _loss(x) / LOST}
@@ -125,15 +128,9 @@ def by_progpy(kind: str, k: int) -> Row:
         "ln_power": rng.normal(0.0, POWER_STD, PARTICLES),
         **{scale: rng.normal(1.0, MAP_ERROR, PARTICLES) for scale in _SCALES},
     }
-    rows = zip(*(values.tolist() for values in prior.values()), strict=True)
-    particles = [model.StateContainer(dict(zip(prior, row, strict=True))) for row in rows]
-    begin = UnweightedSamples(particles, _type=model.StateContainer)
+    begin = UnweightedSamples(prior, _type=model.StateContainer)
     own = ParticleFilter(model, begin, measurement_noise=dict.fromkeys(MODES, NOISE))
-    # Ln f since the first log, without the effect of temperature.
-    travel, warm = life.travel / 1e3, life.temperature - REFERENCE_C
-    table = np.column_stack([travel[:, None] ** [0, 0.5, 1, 2], warm])
-    seen = life.ln_f - np.outer(warm, np.linalg.lstsq(table, life.ln_f, rcond=None)[0][-1])
-    seen -= seen[0]
+    travel, seen = _drifts(life)
     for s, row in zip(travel, seen.tolist(), strict=True):
         if s > own.t:
             own.estimate(s, {}, dict(zip(MODES, row, strict=True)), dt=s - own.t)
@@ -159,74 +156,141 @@ def _ln_health(x: Row) -> Array:
     return np.asarray(np.log1p(-np.minimum(_loss(x), 0.95)))
 
 
+def _drifts(life: Life) -> tuple[Array, Array]:
+    """Return travel in km, and ln f since the first log without the effect of temperature."""
+    travel, warm = life.travel / 1e3, life.temperature - REFERENCE_C
+    table = np.column_stack([travel[:, None] ** [0, 0.5, 1, 2], warm])
+    seen = life.ln_f - np.outer(warm, np.linalg.lstsq(table, life.ln_f, rcond=None)[0][-1])
+    return travel, seen - seen[0]
+
+
+def _drift(ln_preload: Array) -> Array:
+    """Return the drifts of the modes by the map, ``(..., n_modes)``."""
+    return drift(np.stack([ln_preload, 0 * ln_preload], axis=-1))
+
+
+def by_particles(kind: str, k: int) -> Row:
+    """Filter a life by a bootstrap filter of loss, ln rate and factors, and propagate it."""
+    start, life, rng = time.process_time(), life_of(kind, k), np.random.default_rng([k, 1])
+    travel, seen = _drifts(life)
+    walk, loss = RATE_WALK / np.sqrt(LIFE_KM[0]), np.zeros(PLAIN)
+    ln_rate = np.log(LOST / LIFE_KM[0]) + LIFE_KM[1] * rng.standard_normal(PLAIN)
+    factor = 1 + MAP_ERROR * rng.standard_normal((PLAIN, len(MODES)))
+    for step, row in zip(np.diff(travel), seen[1:], strict=True):
+        ln_rate += walk * np.sqrt(step) * rng.standard_normal(PLAIN)
+        loss = np.minimum(loss + step * np.exp(ln_rate), 0.95)
+        misfit = np.sum((row - factor * _drift(np.log1p(-loss))) ** 2, axis=1) / NOISE**2
+        below = np.cumsum(np.exp(-0.5 * (misfit - misfit.min())))
+        # Systematic resampling; the factors, which have no process, are jittered.
+        chosen = np.searchsorted(below / below[-1], (np.arange(PLAIN) + rng.uniform()) / PLAIN)
+        loss, ln_rate, factor = loss[chosen], ln_rate[chosen], factor[chosen]
+        factor += FACTOR_JITTER * rng.standard_normal(factor.shape)
+    steps = rng.standard_normal((int(HORIZON_KM / STEP_KM), PLAIN))
+    rates = np.exp(ln_rate + walk * np.sqrt(STEP_KM) * np.cumsum(steps, axis=0))
+    whole = np.sum(loss + STEP_KM * np.cumsum(rates, axis=0) < LOST, axis=0)
+    return _answer(np.log1p(-loss), STEP_KM * (whole + 0.5), start)
+
+
+def by_line(kind: str, k: int) -> Row:
+    """Extrapolate the least-squares line of the mean drift to its value at the limit."""
+    start, life, rng = time.process_time(), life_of(kind, k), np.random.default_rng([k, 2])
+    travel, seen = _drifts(life)
+    table = np.column_stack([np.ones_like(travel), travel])
+    best, rss, *_ = np.linalg.lstsq(table, seen.mean(axis=1), rcond=None)
+    std = np.sqrt(rss / rng.chisquare(travel.size - 2, PLAIN))
+    root = np.linalg.cholesky(np.linalg.inv(table.T @ table))
+    level, slope = best[:, None] + std * (root @ rng.standard_normal((2, PLAIN)))
+    grid = np.linspace(-1.5, 0.5, 2001)  # of ln preload
+    by_map = _drift(grid).mean(axis=1)
+    limit = np.interp(np.log1p(-LOST), grid, by_map) - std * rng.standard_normal(PLAIN)
+    end = np.where(slope < 0, (limit - level) / np.minimum(slope, -1e-12), np.inf)
+    now = np.interp(level + slope * travel[-1], by_map, grid)
+    return _answer(now, np.clip(end - travel[-1], 0.0, HORIZON_KM), start)
+
+
+def _answer(health: Array, left: Array, start: float) -> Row:
+    """Return draws of ln preload and of the travel left in km, and the processor time in s."""
+    health, left = (draws[:: PLAIN // SAMPLES].tolist() for draws in (health, left))
+    return {"health": health, "left": left, "cpu_s": time.process_time() - start}
+
+
+WORK = {"progpy": by_progpy, "plain particle filter": by_particles, "straight line": by_line,
+        CONTROL: without_logs}  # fmt: skip
+
+
 def scored(kind: str, found: list[Row]) -> Row:
-    """Score the answers to lives of a kind, of which the first ones are asked for."""
+    """Score the answers to lives of a kind; lists have a value of each life, None without one."""
     lives = [life_of(kind, k) for k in range(len(found))]
-    both = list(zip(lives, found, strict=True))
-    health = [(one.ln_health[-1, 0], own["health"]) for one, own in both if own["health"]]
-    left = [(one.left_km, np.array(own["left"])) for one, own in both if own["left"]]
-    scores = [float(crps(own[:, None], np.array([t]), horizon=HORIZON_KM)[0]) for t, own in left]
-    off = [np.median(own) - t for t, own in health]
-    return {
-        "n": len(found),
-        "health": _held([(t, np.array(own)) for t, own in health]),
-        "health_rms": float(np.sqrt(np.mean(np.square(off)))) if off else None,
-        "left": _held(left),
-        "left_width": float(np.median([np.ptp(np.quantile(own, [0.05, 0.95])) for _, own in left])),
-        "crps_km": float(np.mean(scores)),
-        "cpu_s": float(np.median([own["cpu_s"] for own in found])),
-    }
+    row: Row = {"n": len(found), "cpu_s": float(np.median([own["cpu_s"] for own in found]))}
+    truths = {"health": [one.ln_health[-1, 0] for one in lives]}
+    for what, truth in (truths | {"left": [one.left_km for one in lives]}).items():
+        each = [_placed(t, own[what]) for t, own in zip(truth, found, strict=True)]
+        there = [one for one in each if one]
+        row[what] = {
+            "held": [sum(one["held"] for one in there), len(there)],
+            "width": float(np.median([one["width"] for one in there])) if there else None,
+            **{key: [one and one[key] for one in each] for key in ("crps", "square")},
+        }
+    return row
 
 
-def _held(pairs: list[tuple[float, Array]]) -> list[int]:
-    """Count the truths inside 90 % intervals, and all."""
-    inside = [np.quantile(own, 0.05) <= t <= np.quantile(own, 0.95) for t, own in pairs]
-    return [sum(map(bool, inside)), len(inside)]
+def _placed(truth: float, draws: list[float] | None) -> Row | None:
+    """Return score, squared error of the median, width of the 90 % interval, and if it holds."""
+    if not draws:
+        return None
+    low, middle, high = np.quantile(draws, [0.05, 0.5, 0.95])
+    score = crps(np.array(draws)[:, None], np.array([truth]), horizon=HORIZON_KM)[0]
+    row = {"crps": float(score), "square": float(middle - truth) ** 2, "width": float(high - low)}
+    return row | {"held": bool(low <= truth <= high)}
 
 
 def judge(rows: Row) -> dict[str, bool]:
-    """Return whether logs help both, and whether `lmshealth` holds what it states and is better."""
-    score = {name: {kind: own[kind]["crps_km"] for kind in KINDS} for name, own in rows.items()}
-    passed = {
-        f"{kind}: {name} predicts better than no log": score[name][kind] < score[CONTROL][kind]
-        for name in rows
-        for kind in KINDS
-        if name != CONTROL
-    }
-    for kind, row in rows.get(OURS, {}).items():
-        passed[f"{kind}: as good as {PEER}"] = score[OURS][kind] <= score[PEER][kind]
-        passed[f"{kind}: intervals hold"] = clopper_pearson(*row["left"])[1] >= 0.9
+    """Return whether logs help all, and whether `lmshealth` holds what it states and is better."""
+    passed = {}
+    for name, kind in ((name, kind) for name in rows if name != CONTROL for kind in KINDS):
+        score, none = (mean(rows[one][kind]["left"]["crps"])[0] for one in (name, CONTROL))
+        passed[f"{kind}: {name} predicts better than no log"] = score < none
+        if name == OURS:
+            held = clopper_pearson(*rows[OURS][kind]["left"]["held"])
+            passed[f"{kind}: intervals hold"] = held[1] >= 0.9
+        elif OURS in rows:
+            own = mean(rows[OURS][kind]["left"]["crps"])[0]
+            passed[f"{kind}: as good as {name}"] = own <= score
     return passed
 
 
 def claims(answer: Row) -> Iterator[Claim]:
-    """Claim error, coverage and time beside the peer, and where the peer is better."""
-    rows = answer["programs"]
+    """Claim errors, coverage and time; not met where a peer, or no log, has the smaller figure."""
+    rows, passed = answer["programs"], answer["passed"]
     for kind in KINDS:
-        ours, peer, none = (rows[name][kind] for name in (OURS, PEER, CONTROL))
-        yield Claim(
-            f"score of the remaining life (0 is best), {kind}",
-            f"{number(ours['crps_km'])} km",
-            f"{ours['n']} lives",
-            f"{PEER} {number(peer['crps_km'])} km, no log {number(none['crps_km'])} km",
-            ours["crps_km"] <= peer["crps_km"],
-        )
+        own = {name: row[kind] for name, row in rows.items()}
+        what, there = "score of the remaining life (0 is best)", own[OURS]["n"]
+        score = {name: mean(row["left"]["crps"]) for name, row in own.items()}
+        yield _claim(f"{what}, {kind}", score, " km", f"{there} lives")
+        square = {k: mean(row["health"]["square"]) for k, row in own.items() if k != CONTROL}
+        off = {k: (value**0.5, error / (2 * value**0.5)) for k, (value, error) in square.items()}
+        yield _claim(f"root mean square error of ln preload now, {kind}", off, "", "")
+        ours, *others = (f"{name} {_counts(row['left'])}" for name, row in own.items())
         yield Claim(
             f"90 % intervals that hold the remaining life, and their median width, {kind}",
-            _counts(ours),
-            beside=f"{PEER} {_counts(peer)}; preload now {_health(ours)}, {PEER} {_health(peer)}",
-            met=answer["passed"][f"{kind}: intervals hold"],
+            ours.removeprefix(f"{OURS} "),
+            beside=", ".join(others),
+            met=passed[f"{kind}: intervals hold"],
         )
-    ours, peer = (max(rows[name][kind]["cpu_s"] for kind in KINDS) for name in (OURS, PEER))
-    yield Claim("processor time a life", f"{number(ours)} s", beside=f"{PEER} {number(peer)} s")
+    cpu = {k: (max(row[kind]["cpu_s"] for kind in KINDS), 0.0) for k, row in rows.items()}
+    yield _claim("processor time a life", {k: cpu[k] for k in cpu if k != CONTROL}, " s", "")
+
+
+def _claim(what: str, found: Mapping[str, tuple[float, float]], unit: str, more: str) -> Claim:
+    """Claim a figure with its error, that none of the others has a smaller one."""
+    (own, error), others = found[OURS], {k: v for k, (v, _) in found.items() if k != OURS}
+    beside = ", ".join(f"{name} {number(value)}{unit}" for name, value in others.items())
+    interval = f"± {number(error)}{unit}" + f", {more}" if error else more
+    return Claim(what, f"{number(own)}{unit}", interval, beside, own <= min(others.values()))
 
 
 def _counts(row: Row) -> str:
-    return f"{row['left'][0]} of {row['left'][1]}, {number(row['left_width'])} km"
-
-
-def _health(row: Row) -> str:
-    return f"{row['health'][0]} of {row['health'][1]} with rms {number(row['health_rms'])} of ln"
+    return f"{row['held'][0]} of {row['held'][1]}, {number(row['width'])} km"
 
 
 if __name__ == "__main__":
