@@ -7,6 +7,7 @@ import json
 import sys
 from collections.abc import Callable
 from contextlib import chdir, redirect_stdout
+from dataclasses import replace
 from importlib import import_module
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,8 @@ import pytest
 
 import lmshealth
 from studies.cost.workers import judged
+from studies.life import peers as peers_of_lives
+from studies.life.kinds.worlds import life_of as lives_of_kinds
 from studies.robustness.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
 pytestmark = pytest.mark.study
@@ -317,10 +320,37 @@ def test_measured(root: Path, needs: Callable[[str], None]) -> None:
 
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 def test_peers_of_lives(root: Path) -> None:
-    """The particle filter of progpy predicts a linear loss better than a guess without logs."""
+    """Both particle filters predict an even loss better than no log; all are scored alike."""
     pytest.importorskip("progpy")
     answer = json.loads(run_study(root, "studies.life.peers"))
-    assert answer["passed"]["preload, linear: progpy predicts better than no log"]
+    programs = answer["programs"]
+    assert set(programs) == {"progpy", "plain particle filter", "straight line", "no log"}
+    for name in ("progpy", "plain particle filter"):
+        assert answer["passed"][f"preload, linear: {name} predicts better than no log"]
+    for name, kinds in programs.items():
+        for row in kinds.values():
+            assert row["left"]["held"][1] == len(row["left"]["crps"]) == row["n"] == 1
+            assert row["health"]["held"][1] == (name != "no log")
+
+
+def test_peers_of_lives_predict_what_their_models_have(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A line ends where an even drift reaches the limit, the plain filter where an even loss does.
+
+    Without errors, walk and wrong map; by the filter a loss that is not even ends elsewhere.
+    """
+    life = lives_of_kinds("preload, linear", 0)
+    share = life.share * life.travel / life.travel[-1]
+    even_drift = share[:, None] * peers_of_lives._drift(np.log([0.6]))
+    even_loss = peers_of_lives._drift(np.log1p(-0.4 * share))
+
+    def left(work: Callable[[str, int], Any], ln_f: np.ndarray) -> float:
+        monkeypatch.setattr(peers_of_lives, "life_of", lambda *_: replace(life, ln_f=ln_f))
+        return float(np.median(work("", 0)["left"]))
+
+    by_line, by_particles = peers_of_lives.by_line, peers_of_lives.by_particles
+    assert left(by_line, even_drift) == pytest.approx(life.left_km, rel=1e-3)
+    assert left(by_particles, even_loss) == pytest.approx(life.left_km, rel=0.1)
+    assert left(by_particles, even_drift) < 0.9 * life.left_km
 
 
 def test_sbc_life(root: Path) -> None:

@@ -2,7 +2,8 @@
 
 ``python -m studies.harness.summary`` writes what stands between `MARKS` in ``studies/README.md``,
 one line a record, and in the page of each group, all claims of its records, and the figure of each
-record with enough shares. ``FRONT_PAGE.md`` has the statements of the front page (`front_page`).
+record with enough shares. ``FRONT_PAGE.md`` has the statements of the front page (`front_page`), ``PEERS.md`` other programs
+(`peers`).
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from studies.harness import front_page
+from studies.harness import front_page, peers
 from studies.harness.claims import Claim
 from studies.harness.figures import draw, shown
 from studies.harness.study import STUDIES, record_of
@@ -190,6 +191,8 @@ def main() -> None:
         (HERE / group / "README.md").write_text(group_page(group), encoding="utf-8")
     (HERE / "README.md").write_text(overview(), encoding="utf-8")
     (HERE / "FRONT_PAGE.md").write_text(statements(), encoding="utf-8")
+    page = HERE / "PEERS.md"
+    page.write_text(between_marks(page, peers.lines(HERE)), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -332,10 +332,8 @@ def announced(rows: list[Row], letter: str, what: str, when: Any, pattern: str) 
 def claims(record: Row) -> Iterator[Claim]:
     """Yield the claims of a record."""
     passed, own, odds, other = (record[x] for x in ("passed", "sentences", "odds", "control"))
-    n, false = (
-        own["true"] + own["false"],
-        f"{other['false']:,} of {other['true'] + other['false']:,}",
-    )
+    n, wrong = own["true"] + own["false"], other["false"]
+    false = f"{wrong:,} of {other['true'] + wrong:,}"
     beside = f"{own['not judged']:,} not judged; by the truth of others {false} are false"
     what = "sentences that are true, of those judged"
     yield counted(what, own["true"], n, beside, met=passed["no sentence is false"])

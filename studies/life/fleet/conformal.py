@@ -76,10 +76,8 @@ def main() -> None:
         answer["ways"] = {way: judged(rows, way) for way in WAYS}
         answer["passed"] = verdicts(answer["ways"])
     for row in rows:  # quantiles of every draw would be a record of megabytes
-        row["running"] = [
-            {"left_km": own["left_km"], **{way: own[way]["place"] for way in WAYS}}
-            for own in row["running"]
-        ]
+        row["running"] = [{"left_km": own["left_km"], **{way: own[way]["place"] for way in WAYS}}
+                          for own in row["running"]]  # fmt: skip
     study.conclude(answer, details={"rows": rows})
 
 
@@ -177,11 +175,9 @@ def judged(rows: list[Row], way: str) -> Row:
         for row in fleets:
             for one in row["running"]:
                 left, cuts = one["left_km"], one[way]["km"]
-                travels = {
-                    "before": cuts[int(1000 * LEVEL)],
-                    "calibrated": travel_km(row["ended"][way], cuts),
-                    "other": travel_km(other, cuts),
-                }
+                travels = {"before": cuts[int(1000 * LEVEL)],
+                           "calibrated": travel_km(row["ended"][way], cuts),
+                           "other": travel_km(other, cuts)}  # fmt: skip
                 for name, km in travels.items():
                     kept[name].append((left >= km, km / left))
         n = len(kept["before"])

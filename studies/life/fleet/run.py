@@ -68,16 +68,13 @@ def main() -> None:
     kind, n = (LEAST, QUICK) if study.quick else (FLEET, FLEETS)
     rows = study.trials.collect(one, [(kind, number) for number in range(n)])
     answer: Row = {
-        "seed": SEED,
-        "fleets": n,
-        "teachers": N_TEACHERS[kind],
+        "seed": SEED, "fleets": n, "teachers": N_TEACHERS[kind],
         "young": sum(len(row["young"]) for row in rows),
         # A small fleet may have too few worn machines.
         "ways": {way: judged(rows, way) for way in WAYS
                  if any(way in young for row in rows for young in row["young"])},
-        "priors": [
-            {"true": row["true"]} | young["priors"] for row in rows for young in row["young"][:1]
-        ],
+        "priors": [{"true": row["true"]} | young["priors"]
+                   for row in rows for young in row["young"][:1]],
     }  # fmt: skip
     answer["passed"] = verdicts(answer["ways"], n)
     study.conclude(answer)
@@ -145,22 +142,16 @@ def learned_prior(
 
 
 def young_machine(
-    drawn: Life,
-    own: LifePosterior,
-    evidence: MachineEvidence,
-    fleet: Stage,
-    sources: Mapping[str, Mapping[str, MachineEvidence]],
-    number: int,
-) -> Row:
+    drawn: Life, own: LifePosterior, evidence: MachineEvidence, fleet: Stage,
+    sources: Mapping[str, Mapping[str, MachineEvidence]], number: int,
+) -> Row:  # fmt: skip
     """Score the prognoses of a young machine with every prior."""
     rng = np.random.default_rng([SEED, number, 2])
     limit = described().parameters[0].limit
     assert limit is not None
     truth = drawn.part.left(rng, drawn.now, limit.below, horizon())
-    predicted = {
-        DESCRIPTION: left(own, drawn.now),
-        KNOWN: left(posterior(drawn, fleet, number), drawn.now),
-    }
+    predicted = {DESCRIPTION: left(own, drawn.now),
+                 KNOWN: left(posterior(drawn, fleet, number), drawn.now)}  # fmt: skip
     priors = {}
     for way, mature in sources.items():
         if (prior := learned_prior(evidence, mature)) is None:
@@ -252,46 +243,32 @@ def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
         return found
     gain = ways[LEARNED]
     found["learned loses less than the description"] = surely(gain["lost_km_over_description"], -1)
-    found |= {
-        f"loses more: {way}": surely(ways[way]["lost_km_over_learned"], 1)
-        for way in (WORN, FOREIGN)
-    }
+    found |= {f"loses more: {way}": surely(ways[way]["lost_km_over_learned"], 1)
+              for way in (WORN, FOREIGN)}  # fmt: skip
     return found
 
 
 def claims(answer: Row) -> Iterator[Claim]:
     """Claim the gain by a fleet prior."""
-    ways = answer["ways"]
-    own, learned = ways["description"], ways["learned"]
-    gain = own["crps_km_over_learned"]
-    score = measured(learned["crps_km"], "km")
-    yield Claim(
-        f"score (CRPS) of the remaining life of {answer['young']} young machines of fleets "
-        "drawn from the estimator's own model",
-        *score,
-        f"{measured(own['crps_km'], 'km')[0]} by the description, "
-        f"{' '.join(measured(gain, 'km'))} more",
-        gain[0] > 0,
-    )
-    yield Claim(
-        "of it lost against the known fleet",
-        *measured(learned["lost_km"], "km"),
-        f"{' '.join(measured(own['lost_km'], 'km'))} by the description",
-        learned["lost_km"][0] < own["lost_km"][0],
-    )
-    yield covered(
-        "intervals of 90 % cover, by the estimated prior",
-        learned["coverage"][1:],
-        f"50 %: {percents([learned['coverage'][0]['share']])}",
-    )
+    own, learned = (answer["ways"][way] for way in (DESCRIPTION, LEARNED))
+    what = (f"score (CRPS) of the remaining life of {answer['young']} young machines of fleets "
+            "drawn from the estimator's own model")  # fmt: skip
+    gain, described = own["crps_km_over_learned"], measured(own["crps_km"], "km")[0]
+    beside = f"{described} by the description, {' '.join(measured(gain, 'km'))} more"
+    yield Claim(what, *measured(learned["crps_km"], "km"), beside, gain[0] > 0)
+    lost, by_description = learned["lost_km"], own["lost_km"]
+    beside = f"{' '.join(measured(by_description, 'km'))} by the description"
+    what, fine = "of it lost against the known fleet", lost[0] < by_description[0]
+    yield Claim(what, *measured(lost, "km"), beside, fine)
+    half, most = learned["coverage"]
+    beside = f"50 %: {percents([half['share']])}"
+    yield covered("intervals of 90 % cover, by the estimated prior", [most], beside)
     for way, source in ((WORN, "worn machines only"), (FOREIGN, "another fleet")):
-        wrong = ways[way]
-        yield Claim(
-            f"lost with the prior from {source} (control)",
-            *measured(wrong["lost_km"], "km"),
-            f"90 % intervals cover {percents([wrong['coverage'][1]['share']])}",
-            wrong["lost_km"][0] > learned["lost_km"][0],
-        )
+        wrong = answer["ways"][way]
+        what = f"lost with the prior from {source} (control)"
+        beside = f"90 % intervals cover {percents([wrong['coverage'][1]['share']])}"
+        fine = wrong["lost_km"][0] > lost[0]
+        yield Claim(what, *measured(wrong["lost_km"], "km"), beside, fine)
 
 
 if __name__ == "__main__":

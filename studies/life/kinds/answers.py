@@ -57,27 +57,16 @@ def readings_of(logs: Answer) -> list[lmshealth.LogEstimates]:
     for k, when in enumerate(logs["recorded_at"]):
         std = np.r_[logs["std"][k], np.full(m, 0.08)]
         metadata = Metadata(
-            stage="AX-1",
-            recorded_at=datetime.fromisoformat(when),
-            travel=logs["travel"][k],
+            stage="AX-1", recorded_at=datetime.fromisoformat(when), travel=logs["travel"][k],
             covariates={"temperature_c": logs["temperature_c"][k], "payload_kg": 20.0},
             servo_id=logs["servo_id"][k],
-        )
+        )  # fmt: skip
         modes = Modes(
-            names=tuple(logs["modes"]),
-            sources=("acc",) * m,
-            channels=("acc_feed",) * m,
-            ln_frequency=np.array(logs["ln_f"][k]),
-            ln_damping=np.array(logs["ln_zeta"][k]),
-            cov=np.diag(std**2),
-            snr=np.full(m, 200.0),
-            dispersion=np.ones(m),
-            flags=("",) * m,
-            shape_channels=(),
-            shapes=np.empty((m, 0)),
-            lines=(),
-            refused=(),
-        )
+            names=tuple(logs["modes"]), sources=("acc",) * m, channels=("acc_feed",) * m,
+            ln_frequency=np.array(logs["ln_f"][k]), ln_damping=np.array(logs["ln_zeta"][k]),
+            cov=np.diag(std**2), snr=np.full(m, 200.0), dispersion=np.ones(m), flags=("",) * m,
+            shape_channels=(), shapes=np.empty((m, 0)), lines=(), refused=(),
+        )  # fmt: skip
         found.append(lmshealth.LogEstimates(f"log-{k:03d}", f"{k:064d}", metadata, modes))
     return found
 
@@ -89,13 +78,9 @@ def answer(logs: Answer, map_table: str, seed: int, how: str = PUBLISHED) -> Ans
         made = lmshealth.assess(readings_of(logs), stage_of(map_table), seed=seed, **options)
     service, judged = made.service(), made.judgement
     found: Answer = {
-        "verdict": judged.verdict,
-        "probability": _number(judged.probability),
-        "why": judged.why,
-        "health": {},
-        "left_km": None,
-        "service": [service.kind, _number(service.wait)],
-    }
+        "verdict": judged.verdict, "probability": _number(judged.probability), "why": judged.why,
+        "health": {}, "left_km": None, "service": [service.kind, _number(service.wait)],
+    }  # fmt: skip
     if made.health is not None:
         fine = made.health.publishable_parameters()
         for j in np.flatnonzero(fine).tolist():

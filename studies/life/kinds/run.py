@@ -10,8 +10,7 @@ Method
     the preload that the description has (hertz) and has not, a mount that loosens, both, a mount
     that settles stiffer while the preload wears ("opposite"), one mode that moves by another cause,
     steps, a usage that doubles, a wander that all modes have in common, and machines that stay as
-    they are. `lmshealth.assess` answers, with the chains that it
-    publishes.
+    they are. `lmshealth.assess` answers, with the chains that it publishes.
     Each kind is judged by itself: a share over lives that wear and lives that do not hides both.
     Places of the truth among draws, ties at random, give the shares of 90 and 50 % intervals that
     hold; widths are compared with those of a posterior that knows the shape of every course, all
@@ -55,23 +54,17 @@ from studies.life.kinds.worlds import (
 REVISION = "1811c297"
 # Lives of each kind: rows that the requirements name have a hundred or more.
 LIVES = {
-    **dict.fromkeys(WEARING, 36),
-    **dict.fromkeys(LONE, 34),
-    **dict.fromkeys(HEALTHY, 34),
+    **dict.fromkeys(WEARING, 36), **dict.fromkeys(LONE, 34), **dict.fromkeys(HEALTHY, 34),
     **dict.fromkeys(("mount, loosening", "both", "opposite"), 100),
-}
+}  # fmt: skip
 FEW, QUICK_LIVES, QUICK = 30, 2, ("preload, late", "yaw alone, 2 %")
 ALL = "preload, all courses"
 # Lives of the control.
 EARLIER = {
-    **dict.fromkeys(WEARING, 12),
-    **dict.fromkeys(LONE, 8),
-    **dict.fromkeys(HEALTHY, 16),
-    "mount, loosening": 100,
-    "opposite": 32,
-    "preload, linear, short logs": 40,
-    "mount, loosening, short logs": 40,
-}
+    **dict.fromkeys(WEARING, 12), **dict.fromkeys(LONE, 8), **dict.fromkeys(HEALTHY, 16),
+    "mount, loosening": 100, "opposite": 32,
+    "preload, linear, short logs": 40, "mount, loosening, short logs": 40,
+}  # fmt: skip
 # Required: shares of intervals that hold, bias of ln, width over the ideal; of a lone mode named,
 # of opposite changes held; most alarms and most held of machines that stay; remaining life held,
 # its width over the truth at 90 % of life, services too late.
@@ -269,9 +262,8 @@ def claims(answered: Row) -> Iterator[Claim]:
             )
         if right := row["right"]:
             counts = ", ".join(f"{word} {n}" for word, n in sorted(row["verdicts"].items()))
-            beside = (
-                f"{number(row['expected'])} by their probabilities; {_sure(row)}; all: {counts}"
-            )
+            beside = (f"{number(row['expected'])} by their probabilities; {_sure(row)}; "
+                      f"all: {counts}")  # fmt: skip
             if old_right := was["right"]:
                 beside += f"; code before: {_share(old_right)} right, {_sure(was)}"
             what, n = f"verdicts that are right: {kind}", right["n"]
@@ -283,13 +275,8 @@ def claims(answered: Row) -> Iterator[Claim]:
             if old_left := was["left_90"]:
                 beside += f"; code before {_share(old_left)}, {number(was['left_width'])}, "
                 beside += f"{was['late']['hits']} late"
-            yield counted(
-                f"90 % intervals of the remaining life hold: {kind}",
-                left["hits"],
-                left["n"],
-                beside,
-                met=fine(*OF_LIFE),
-            )
+            yield counted(f"90 % intervals of the remaining life hold: {kind}", left["hits"],
+                          left["n"], beside, met=fine(*OF_LIFE))  # fmt: skip
 
 
 def _share(row: Row) -> str:
@@ -297,10 +284,8 @@ def _share(row: Row) -> str:
 
 
 def _sure(row: Row) -> str:
-    return (
-        f"degraded with p > 0.9 {row['surely_degraded']['hits']}, service within 90 days "
-        f"{row['soon']['hits']}"
-    )
+    return (f"degraded with p > 0.9 {row['surely_degraded']['hits']}, "
+            f"service within 90 days {row['soon']['hits']}")  # fmt: skip
 
 
 def _beside(own: Row) -> str:

@@ -27,26 +27,19 @@ def scored(kind: str, number: int, answer: Row) -> Row:
     right, word = life.right_verdicts, answer["verdict"]
     wait = _wait(answer["service"])
     row: Row = {
-        "share": life.share,
-        "verdict": word,
-        "probability": answer["probability"],
+        "share": life.share, "verdict": word, "probability": answer["probability"],
         "right": None if not right else word in right and _names(life, answer["why"]),
         "surely_degraded": word in _DEGRADED and (answer["probability"] or 0.0) > SURE,
         "soon": wait is not None and wait <= SOON_DAYS,
-        "late": wait is not None and life.left_days < wait,
-        "left": None,
-        "health": {
-            name: _health(np.array(draws), truth[name], rng)
-            for name, draws in answer["health"].items()
-        },
+        "late": wait is not None and life.left_days < wait, "left": None,
+        "health": {name: _health(np.array(draws), truth[name], rng)
+                   for name, draws in answer["health"].items()},
         "ideal": {
-            name: {
-                "place": place(own, truth[name]),
-                "width": quantile(own, 0.95) - quantile(own, 0.05),
-            }
+            name: {"place": place(own, truth[name]),
+                   "width": quantile(own, 0.95) - quantile(own, 0.05)}
             for name, own in marginals(life).items()
         },
-    }
+    }  # fmt: skip
     if answer["left_km"] is not None and np.isfinite(life.left_km):
         km = np.array(answer["left_km"])
         low, high = np.quantile(km, [0.05, 0.95])
@@ -93,12 +86,9 @@ def summarised(rows: Sequence[Row]) -> Row:
         "late": _share([row["late"] for row in rows if row["left"]]),
         "left_90": _share([abs(one["place"] - 0.5) < 0.45 for one in left]),
         "left_width": float(np.median(near)) if near else None,
-        "health": {
-            name: _summed([row for row in rows if name in row["health"]], name)
-            for name in PARAMETERS
-            if any(name in row["health"] for row in rows)
-        },
-    }
+        "health": {name: _summed([row for row in rows if name in row["health"]], name)
+                   for name in PARAMETERS if any(name in row["health"] for row in rows)},
+    }  # fmt: skip
 
 
 def _summed(rows: Sequence[Row], name: str) -> Row:

@@ -222,20 +222,11 @@ def life_of(name: str, number: int) -> Life:
     ln_f = np.log(FREQUENCY_HZ) + true + heated + _walks(rng, world, u)
     left = length_km * (1 - share) if np.any(size > 0) else np.inf
     return Life(
-        world=world,
-        share=share,
-        travel=1000 * length_km * u,
-        days=days,
-        temperature=temperature,
-        ln_f=ln_f + std * rng.standard_normal(std.shape),
-        std=std,
-        ln_zeta=LN_ZETA + STD_ZETA * rng.standard_normal(std.shape),
-        size=size,
-        course=lost,
-        left_km=left,
-        left_days=left / km_per_day,
-        retuned_at=retuned_at,
-    )
+        world=world, share=share, travel=1000 * length_km * u, days=days, temperature=temperature,
+        ln_f=ln_f + std * rng.standard_normal(std.shape), std=std,
+        ln_zeta=LN_ZETA + STD_ZETA * rng.standard_normal(std.shape), size=size, course=lost,
+        left_km=left, left_days=left / km_per_day, retuned_at=retuned_at,
+    )  # fmt: skip
 
 
 def _losses(rng: np.random.Generator, world: World, u: Array) -> tuple[Array, Array]:

@@ -97,22 +97,16 @@ def examine(family: str, seed: int, peers: bool = False) -> dict[str, Any]:
     ln_zeta = np.log(found.damping_ratio[estimate] / world.damping_ratio[mode])
     std = np.sqrt(np.diag(found.cov)).reshape(2, -1)[:, estimate]
     return {
-        "family": family,
-        "seed": seed,
-        "channels": world.samples.shape[1],
-        "wandering": len(world.wandering),
-        "there": world.frequency.size,
+        "family": family, "seed": seed, "channels": world.samples.shape[1],
+        "wandering": len(world.wandering), "there": world.frequency.size,
         **count(world, found.frequency),
         "missed_hz": np.delete(world.frequency, mode).tolist(),
         "false_hz": found.frequency[false].tolist(),
-        "scores_f": (ln_f / std[0]).tolist(),
-        "scores_zeta": (ln_zeta / std[1]).tolist(),
+        "scores_f": (ln_f / std[0]).tolist(), "scores_zeta": (ln_zeta / std[1]).tolist(),
         "seconds": seconds,
-        "others": {
-            name: {**count(world, f), "time_over_ours": spent / seconds}
-            for name, (f, spent) in others.items()
-        },
-    }
+        "others": {name: {**count(world, f), "time_over_ours": spent / seconds}
+                   for name, (f, spent) in others.items()},
+    }  # fmt: skip
 
 
 def count(world: World, f: np.ndarray) -> dict[str, int]:
@@ -155,13 +149,10 @@ def summarise(records: list[Mapping[str, Any]]) -> dict[str, Any]:
         "control_narrower": {q: judge_scores(NARROWER * z) for q, z in scores.items()},
         "largest_score_f": float(np.abs(scores["f"]).max()),
         "seconds": float(np.median([r["seconds"] for r in records])),
-        "imperfect": [
-            {key: r[key] for key in ("seed", "channels", "missed_hz", "false_hz")}
-            for r in records
-            if r["missed_hz"] or r["false_hz"]
-        ],
+        "imperfect": [{key: r[key] for key in ("seed", "channels", "missed_hz", "false_hz")}
+                      for r in records if r["missed_hz"] or r["false_hz"]],
         "others": others,
-    }
+    }  # fmt: skip
 
 
 def totals(rows: list[Mapping[str, Any]]) -> dict[str, Any]:
@@ -228,8 +219,8 @@ def claims(record: Mapping[str, Any]) -> Iterator[Claim]:
         record["passed"]["intervals of f cover"],
     )
     for program in PROGRAMS[:-1]:
-        rows = [o for one in families for k, o in one["others"].items() if k.startswith(program)]
-        ratios = [o["time_over_ours"] for o in rows]
+        others = [(k, o) for one in families for k, o in one["others"].items()]
+        ratios = [o["time_over_ours"] for k, o in others if k.startswith(program)]
         what = f"processor time of {program} over ours, all its presets"
         yield Claim(what, span(ratios), "", "at least 1 required", min(ratios) >= 1)
 

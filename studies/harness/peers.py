@@ -1,0 +1,149 @@
+"""Compare with other programs on the same records, series and lives: tables from the records.
+
+A figure is better where it differs by more than its Monte-Carlo error, as ``studies/PEERS.md`` has
+it; processor times by more than a factor of 1.15, as single turns of `cost/ratios` differ.
+"""
+
+from __future__ import annotations
+
+import json
+from collections import defaultdict
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.stats import binomtest, fisher_exact, sem
+
+from lmshealth.calibration.ranks import clopper_pearson
+from studies.harness.claims import number
+from studies.harness.study import STUDIES
+
+# Peer, world, our figures and theirs, intervals that hold, time over ours, who is better in what.
+Row = tuple[str, str, str, str, str, float | None, dict[str, str]]
+LEVEL, SURE, STATED, SAME_TIME, SAME_NUMBERS = 0.05, 2.0, 0.9, 1.15, 1e-6
+OURS, PEER, SAME = "lmshealth", "**peer**", "equal"
+CONTROL, STATES_STD = "peaks of single channels", "VarPLSCF"
+HEAD = ("peer", "world", OURS, "the peer", "intervals that hold", "time over ours", "better")
+TABLES = {
+    "Modes: those found, and all other estimates": ("pyOMA2", "pyoma-toolbox", "koma"),
+    "Tracking: differences of ln f, and of its std": ("filterpy", "simdkalman", "statsmodels"),
+    "Remaining life: score (CRPS, km), and root mean square error of ln preload now": (
+        "progpy", "plain particle filter", "straight line"),
+}  # fmt: skip
+
+
+def lines(studies: Path = STUDIES) -> list[str]:
+    """Return the tables of all peers, as far as the studies in a folder are recorded."""
+
+    def read(name: str) -> Any:
+        path = studies / f"{name}.json"
+        return json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+
+    drawn, known = read("modes/without_description/result"), read("modes/real/blind")
+    modes = [*drawn_modes(drawn), *known_modes(known)]
+    found, subjects = [], (modes, tracks(read("track/filter/result")), lives(read("life/peers")))
+    for (title, names), rows in zip(TABLES.items(), subjects, strict=True):
+        table: list[tuple[str, ...]] = []
+        for *cells, ratio, better in rows:
+            if ratio:
+                better["time"] = _who(float(np.log(ratio)), float(np.log(SAME_TIME)))
+            who = "; ".join(f"{what}: {one}" for what, one in better.items())
+            table.append((*cells, number(ratio) if ratio else "", who))
+        there, n = " ".join(row[0] for row in table), sum(PEER in row[-1] for row in table)
+        count = f"A peer is better by a figure in {n} of {len(table)} rows."
+        table += [(name, "not recorded", *[""] * 5) for name in names if name not in there]
+        found += [f"## {title}", "", count, ""]
+        found += [f"| {' | '.join(row)} |" for row in (HEAD, ["---"] * len(HEAD), *table)] + [""]
+    return found[:-1]
+
+
+def drawn_modes(record: Any) -> Iterator[Row]:
+    """Compare modes on drawn records that a peer searched, which are the first of ours."""
+    for family, one in record.get("families", {}).items():
+        held = "{hits} of {n}; ".format(**one["coverage"]["f"])
+        for name, row in one["others"].items():
+            short = [own for own in one["imperfect"] if own["seed"] < row["records"]]
+            missed, false = (sum(len(r[k]) for r in short) for k in ("missed_hz", "false_hz"))
+            n, world = row["there"], f"{family}, {row['records']} records"
+            *cells, better = _counted(n, (n - missed, row["found"]), (false, row["false"]))
+            theirs = "not recorded" if STATES_STD in name else "states none"
+            if name != CONTROL:
+                yield name, world, *cells, held + theirs, row["time_over_ours"], better
+
+
+def known_modes(record: Any) -> Iterator[Row]:
+    """Compare modes on records of others; measured structures may have more than are known."""
+    worlds = defaultdict(list)
+    for one in record.get("sets", ()):
+        made = "simulated" if one["complete"] else "measured"
+        worlds[f"{one['set'].split(',')[0]}, {made} by others"].append(one)
+    for world, sets in worlds.items():
+        n, many = sum(one["known"] for one in sets), f", {len(sets)} records" * (len(sets) > 1)
+        for name in sets[0].get("others", ()):
+            found, other = (
+                [sum(one[key] for one in sets), sum(one["others"][name][key] for one in sets)]
+                for key in ("found", "else")
+            )
+            *cells, better = _counted(n, found, other)
+            yield name, world + many, *cells, "not judged", None, better
+
+
+def _counted(n: int, found: Sequence[int], other: Sequence[int]) -> tuple[str, str, dict[str, str]]:
+    """Return, of ours and theirs, modes found of n and other estimates, and who is better."""
+    sure = fisher_exact(np.array([[one, n - one] for one in found])).pvalue < LEVEL
+    better = {"found": _who((found[0] - found[1]) * sure)}
+    sure = sum(other) > 0 and binomtest(other[0], sum(other)).pvalue < LEVEL
+    better["others"] = _who((other[1] - other[0]) * sure)
+    ours, theirs = (f"{one} of {n}, {more}" for one, more in zip(found, other, strict=True))
+    return ours, theirs, better
+
+
+def tracks(record: Any) -> Iterator[Row]:
+    """Compare filters with one given setting, and with the tracker that has to find it."""
+    speed = record.get("speed", {"programs": ()})
+    times = {row["program"]: row["times_filterpy"] for row in speed["programs"]}
+    for name, row in ((one["program"], one) for one in speed["programs"] if "deviation" in one):
+        world = f"{speed['epochs']:,} epochs of {speed['modes']} modes, setting known to "
+        off, ratio = (row["deviation"], row["deviation_of_std"]), row["times_filterpy"]
+        better = {"numbers": SAME if max(off) < SAME_NUMBERS else OURS}
+        numbers, given = f"{number(off[0])} σ, {number(100 * off[1])} %", times["bank, one setting"]
+        yield name, world + "both", "0", numbers, "the same", ratio / given, better
+        yield name, world + "the peer", "", "", "", ratio / times["track, all settings"], {}
+
+
+def lives(record: Any) -> Iterator[Row]:
+    """Compare predictions on the same lives; that without any log is among them."""
+    programs = dict(record.get("programs", {}))
+    ours = programs.pop(OURS, {})
+    for name, kind in ((name, kind) for name, kinds in programs.items() for kind in kinds):
+        both, better = (ours[kind], programs[name][kind]), dict[str, str]()
+        cells, held = ([list[str](), list[str]()] for _ in range(2))
+        for what, part, key in (("life", "left", "crps"), ("preload", "health", "square")):
+            rows = [one[part] for one in both]
+            if not rows[1]["held"][1]:
+                continue
+            pairs = zip(rows[0][key], rows[1][key], strict=True)
+            gain, error = mean([b - a for a, b in pairs if None not in (a, b)])
+            ends = (clopper_pearson(*row["held"]) for row in rows)
+            right, theirs = (float(low <= STATED <= high) for low, high in ends)
+            better |= {what: _who(gain, SURE * error), f"{what}, intervals": _who(right - theirs)}
+            for row, cell, counts in zip(rows, cells, held, strict=True):
+                value, error = mean(row[key])
+                root = number(value**0.5)
+                cell.append(f"{value:,.0f} ± {error:,.0f}" if what == "life" else root)
+                counts.append("{} of {}".format(*row["held"]))
+        texts = [*map(", ".join, cells), "; ".join(map(", ".join, held))]
+        ratio = both[1]["cpu_s"] / both[0]["cpu_s"] or None
+        yield name, f"{kind}, {both[0]['n']} lives", *texts, ratio, better
+
+
+def mean(values: Sequence[float | None]) -> tuple[float, float]:
+    """Return the mean of the values that there are, and its standard error."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)), float(sem(known)) if len(known) > 1 else 0.0
+
+
+def _who(gain: float, error: float = 0.0) -> str:
+    """Return who is better, by how much worse the peer is, and the error of this."""
+    return SAME if abs(gain) <= error else OURS if gain > 0 else PEER
