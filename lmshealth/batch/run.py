@@ -7,10 +7,11 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
+from difflib import get_close_matches
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
@@ -47,7 +48,7 @@ from lmshealth.report.pages import by_urgency, date_page, file_names, make_page,
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
-from lmshealth.tracking.maintenance import read_maintenance
+from lmshealth.tracking.maintenance import Maintenance, read_maintenance
 
 # Output of one machine
 
@@ -261,7 +262,7 @@ def run(
                 write_index(out, rows, refused, today=judging.today)
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
-        notes += store.notes
+        notes += (*store.notes, *_of_no_machine(work, ingested.machines))
     counts, lost = _count(ingested, refused, made)
     if not machines:
         raise NothingUsable(
@@ -280,6 +281,15 @@ def run(
         notes=(*misspelt, *notes),
         **counts,
     )
+
+
+def _of_no_machine(work: Maintenance, machines: Collection[str]) -> Iterator[str]:
+    """Yield a note on the work of each machine that has no log: its name may be misspelt."""
+    for name in dict.fromkeys(action.stage for action in work.actions):
+        if name not in machines:
+            near = get_close_matches(name, machines, 1)
+            hint = f"; is it {near[0]}?" if near else ""
+            yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
 def _count(

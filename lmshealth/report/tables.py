@@ -114,6 +114,7 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         "travel_km": None if metadata.travel is None else metadata.travel / _KM,
         "delta_e_below_40hz_um": None if error is None else error / _MICRO,
         "sample_rate_hz": reading.sample_rate,
+        "baseline": {None: "", True: "true", False: "false"}[metadata.baseline],
     }
     rows = [TABLES["modes"].read(metadata, **of_log, **own) for own in to_rows(modes.to_columns())]
     further = {key: value for key, value in of_log.items() if key not in TABLES["modes"].names}

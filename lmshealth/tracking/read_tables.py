@@ -38,6 +38,8 @@ _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, _RATE, "baseline")
 # Columns of text that may be missing, and what is assumed instead.
+_FLAGS: dict[str, bool | None] = {"": None, "true": True, "1": True, "yes": True}
+_FLAGS |= {"false": False, "0": False, "no": False}
 _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
 _SHAPE = "shape_"
@@ -302,14 +304,17 @@ def _log(
             raise BadTable(f"{path}: log {log} has {name} {values[0]} and {values[1]}; needed: one")
     first = rows.iloc[0]
     loop, travel = float(first[_LOOP]), float(first["travel_km"])
-    flag = str(first["baseline"]).strip().lower()
+    # Programs that know no empty flag write numbers.
+    flag = str(first["baseline"]).strip().lower().removesuffix(".0")
+    if flag not in _FLAGS:
+        raise BadTable(f"{path}: log {log} has baseline {first['baseline']}; needed: true or false")
     metadata = Metadata(
-        stage=str(first["stage"]),
+        stage=str(first["stage"]).strip(),
         recorded_at=first["recorded_at"],
         travel=None if np.isnan(travel) else travel * _KM,
         covariates={c: float(first[c]) for c in covariates if np.isfinite(first[c])},
         servo_id=str(first["servo_id"]) or None,
-        baseline=flag in ("true", "1", "yes") if flag else None,
+        baseline=_FLAGS[flag],
     )
     frequency = rows["frequency_hz"].to_numpy(float)
     damping = rows["damping_ratio"].to_numpy(float)

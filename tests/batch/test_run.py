@@ -62,6 +62,7 @@ from lmshealth.report.tables import machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
+from lmshealth.tracking.read_tables import read_estimates
 from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
 from studies.harness import servers
@@ -840,10 +841,13 @@ def test_a_manifest_overrides_and_is_part_of_the_key(tmp_path: Path, modes_only:
     """A new odometer in the manifest is used, not the remembered one; its log is done again."""
     logs = write_archive(tmp_path / "logs", 2)
     run(logs, [modes_only], tmp_path / "out")
-    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,777\n")
+    (logs / "manifest.csv").write_text("file,travel_km,baseline\nlog-01.h5,777,true\n")
     again = run(logs, [modes_only], tmp_path / "out")
     assert again.n_remembered == 1
-    assert {row["travel_km"] for row in rows(tmp_path / "out" / "modes.csv")} == {"0.0", "777.0"}
+    table = tmp_path / "out" / "modes.csv"
+    assert {row["travel_km"] for row in rows(table)} == {"0.0", "777.0"}
+    # Who goes on from the table has the same baseline.
+    assert [one.metadata.baseline for one in read_estimates(table)[0]] == [None, True]
 
 
 @pytest.mark.slow
@@ -882,6 +886,14 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     tables = ["maintenance.csv", "manifest.csv"]
     assert sorted(refused) == [(name, "bad-row") for name in ("log-01.h5", *tables)]
     assert "action &#39;repainted&#39; is unknown" in (out / "test-A.html").read_text()
+    (logs / "maintenance.csv").write_text(
+        "stage,recorded_at,travel_km,action\ntest-a,2026-01-05T00:00:00Z,1,regrease\n"
+    )
+    (logs / "manifest.csv").unlink()
+    (note,) = run(logs, [modes_only], out).notes
+    assert note == (
+        "maintenance.csv: work on test-a is not used: no usable log is of it; is it test-A?"
+    )
     (logs / "maintenance.csv").unlink()
     (logs / "manifest.csv").write_text("file,temperatur_c,operator\nlog-01.h5,20,me\n")
     misspelt = run(logs, [modes_only], out)

@@ -69,6 +69,23 @@ def test_the_sample_rate_of_a_log_is_read(tmp_path: Path) -> None:
     assert [log.sample_rate for log in read(tmp_path, HEAD + row())] == [None]
 
 
+@pytest.mark.parametrize(
+    ("flag", "means"),
+    [("true", True), ("TRUE", True), ("1.0", True), ("no", False), ("0", False), ("", None)],
+)
+def test_a_flag_of_the_baseline_is_read(tmp_path: Path, flag: str, means: bool | None) -> None:
+    """As people and programs write it; a column of 1 and nothing is one of numbers for pandas."""
+    text = HEAD.strip() + ",baseline\n" + row().strip() + f",{flag}\n"
+    assert [log.metadata.baseline for log in read(tmp_path, text)] == [means]
+
+
+def test_a_flag_that_is_none_is_refused(tmp_path: Path) -> None:
+    """It would else be taken for false, and percentages refer to another log."""
+    text = HEAD.strip() + ",baseline\n" + row().strip() + ",wahr\n"
+    with pytest.raises(BadTable, match="log a has baseline wahr; needed: true or false"):
+        read(tmp_path, text)
+
+
 def test_a_row_becomes_an_estimate_in_si_units(tmp_path: Path) -> None:
     """Hz become ln f with its relative standard deviation; km become m."""
     (reading,) = read(tmp_path, HEAD + row() + row(mode="pitch", f=136.6, std=0.2, rho=0))
