@@ -72,7 +72,7 @@ STATEMENTS = (
     Statement(
         "the same where all that is not known is drawn from the description", "life/calibration",
         ("90 % intervals hold the truth: health now, remaining life and lone modes, posterior",),
-        "lives of the program's own model: no evidence on machines", "nowhere that is known",
+        "lives of the program's own model", "machines that are not as the model: see the row above",
     ),
     Statement(
         "unbroken from raw samples to the service date", "robustness/drawn_machines",
@@ -84,7 +84,8 @@ STATEMENTS = (
         "no verdict of what the data do not determine", "health/measured",
         ("changes beyond the description", "unchanged machines judged healthy"),
         "three measured sets, of single machines and structures",
-        "small real changes that are no loss are called a step or outside the map",
+        "a resonance that lies in the search of a mode that has left it takes its name: one such "
+        "change is called healthy; small changes that are no loss are called a step",
     ),
     Statement(
         "a change of a measured machine is estimated right", "health/measured",
@@ -108,7 +109,8 @@ STATEMENTS = (
     ),
     Statement(
         "a damaged log is listed, and the others are analysed", "inputs/damaged",
-        ("damaged logs", "good logs"), "the kinds of damage in the study", "nowhere that is known",
+        ("damaged logs", "good logs"), "the kinds of damage in the study",
+        "damage that leaves a file readable and its values plausible",
     ),
     Statement(
         "a new log costs a part of the first run", "cost/new_log",

@@ -2,8 +2,8 @@
 
 ``python -m studies.harness.summary`` writes what stands between `MARKS` in ``studies/README.md``,
 one line a record, and in the page of each group, all claims of its records, and the figure of each
-record with enough shares. ``FRONT_PAGE.md`` has the statements of the front page (`front_page`), ``PEERS.md`` other programs
-(`peers`).
+record with enough shares. ``FRONT_PAGE.md`` has the statements of the front page (`front_page`),
+``PEERS.md`` other programs (`peers`).
 """
 
 from __future__ import annotations
