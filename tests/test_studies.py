@@ -20,6 +20,9 @@ import lmshealth
 from studies.cost.workers import judged
 from studies.life import peers as peers_of_lives
 from studies.life.kinds.worlds import life_of as lives_of_kinds
+from studies.paper.tables import tables
+from studies.paper.tables.changes import changed
+from studies.paper.tables.run import REASONS
 from studies.robustness.off_model.worlds import COURSES, LOST_AT_LIMIT, N_LOGS, WORLDS, life_of
 
 pytestmark = pytest.mark.study
@@ -138,6 +141,28 @@ def test_paper_tables(root: Path) -> None:
             assert found >= least * count, key
             assert hits(plant, "control_constant_velocity_only", key)[0] < found
         assert answer[plant]["summary"]["std_of_x_below_y"] == "7 of 7"
+
+
+def test_paper_reasons(root: Path) -> None:
+    """Rows outside their tolerance have a reason; a change acts on its cells and is undone."""
+    record = json.loads((root / "studies/paper/tables/result.json").read_text(encoding="utf-8"))
+    rows = {row["row"]: row for row in record["rows"] if row["plant"] == "full"}
+    assert all(row["why"] for row in rows.values() if row["outside"])
+    reasons = REASONS["rows"]
+    assert {name: rows[name]["why"] for name in reasons} == {
+        name: one["why"] for name, one in reasons.items()
+    }
+    named = {change for one in reasons.values() for change in one.get("changes", ())}
+    assert named == set(REASONS["changes"])
+
+    def magnitude() -> float:
+        found = tables.velocity_rows("y", "full", 1, columns=[0])
+        return next(row.simulated[0] for row in found if row.name == "y max_magnitude_um")
+
+    before = magnitude()
+    with changed(tables.stage_of("y", "full"), REASONS["changes"]["no cogging"]):
+        assert magnitude() < 0.9 * before
+    assert magnitude() == before
 
 
 def test_mislabelled_modes(root: Path) -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -35,10 +37,10 @@ MODE_ROWS = {
           140: "pitch", 160: "yaw", 380: "vertical"},
 }  # fmt: skip
 # Section 4 of the paper, from its Figure 18.
-PRINTED_GROWING = {
-    "x": [10, 50, 150],
-    "y": [10, 90, 110, 120, 140, 150, 160, 260, 290, 310, 380, 390],
-}
+PRINTED_GROWING = [
+    *("x 10 Hz", "x 50 Hz", "x 150 Hz", "y 10 Hz", "y 90 Hz", "y 110 Hz", "y 120 Hz", "y 140 Hz"),
+    *("y 150 Hz", "y 160 Hz", "y 260 Hz", "y 290 Hz", "y 310 Hz", "y 380 Hz", "y 390 Hz"),
+]
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,52 +120,47 @@ def bands_of(axis: str, plant: str) -> list[Array]:
     return [np.array(row) for row in bands]
 
 
-def moves(axis: str, plant: str, seed: int, constant: float | None = None) -> list[Recording]:
-    """Return the record of every velocity, or of so many s of its constant part alone."""
-    stage = stage_of(axis, plant)
-    records = []
-    for velocity in VELOCITIES:
-        rng = np.random.default_rng([seed, round(velocity * 1e6)])
-        move = full_stroke(stage, velocity)
-        if constant is None:
-            records.append(record_strokes(stage, profile=move, rng=rng))
-        else:
-            seconds = min(constant, move.constant_s)
-            records.append(record(stage, seconds=seconds, velocity=velocity, rng=rng))
-    return records
+def recorded(stage: Stage, velocity: float, seed: int, constant: float | None) -> Recording:
+    """Return the record of a full stroke, or of so many s of its constant part alone."""
+    rng = np.random.default_rng([seed, round(velocity * 1e6)])
+    move = full_stroke(stage, velocity)
+    if constant is None:
+        return record_strokes(stage, profile=move, rng=rng)
+    return record(stage, seconds=min(constant, move.constant_s), velocity=velocity, rng=rng)
 
 
 def velocity_rows(
-    axis: str, plant: str, seeds: int, constant: float | None = None
+    axis: str,
+    plant: str,
+    seeds: int,
+    constant: float | None = None,
+    columns: Sequence[int] = range(len(VELOCITIES)),
 ) -> list[TableRow]:
-    """Return the rows of Tables 3, 4 and 6 or 7 of one configuration; see `moves`."""
+    """Return the rows of Tables 3, 4 and 6 or 7 of one configuration, NaN beside the columns."""
     bands, number = bands_of(axis, plant), 6 if axis == "x" else 7
-    errors, accelerations = [], []
-    for seed in range(seeds):
-        records = moves(axis, plant, seed, constant)
-        errors.append([error_reading(record) for record in records])
-        accelerations.append([acceleration_reading(record, bands) for record in records])
-    cells = {**printed(3).to_dict("list"), **printed(4).to_dict("list")}
-    rows = []
-    for i, key in enumerate(errors[0][0]):
-        found = np.array([[one[key] for one in of_seed] for of_seed in errors])
-        name = f"{axis} {key}"
-        rows.append(_row("Table 3" if i < 4 else "Table 4", name, cells[f"{axis}_{key}"], found))
-    levels = np.moveaxis(np.array(accelerations), 2, 0)
-    for line, found in zip(printed(number).to_numpy(), levels, strict=True):
-        hertz = int(line[1])
-        mode = MODE_ROWS[axis].get(hertz)
-        rows.append(_row(f"Table {number}", f"{axis} {hertz} Hz", line[2:], found, mode))
-    return rows
-
-
-def _row(
-    table: str, name: str, cells: Iterable[float], found: Array, mode: str | None = None
-) -> TableRow:
-    """Make a row of the mean over seeds ``(n_seeds, n_velocities)`` and its scatter."""
-    spread = found.std(axis=0, ddof=1) if len(found) > 1 else np.full(found.shape[1], np.nan)
-    return TableRow(table, name, tuple(map(float, cells)), tuple(found.mean(axis=0).tolist()),
-                    tuple(spread.tolist()), mode)  # fmt: skip
+    readings = []
+    for seed, column in product(range(seeds), columns):
+        one = recorded(stage_of(axis, plant), VELOCITIES[column], seed, constant)
+        readings.append([*error_reading(one).values(), *acceleration_reading(one, bands)])
+    found = np.array(readings).reshape(seeds, len(columns), -1)
+    mean, spread = np.full((2, len(VELOCITIES), found.shape[2]), np.nan)
+    mean[columns] = found.mean(axis=0)
+    if seeds > 1:
+        spread[columns] = found.std(axis=0, ddof=1)
+    # The tables have the error's columns in the order of its reading.
+    rows: list[tuple[str, str, Any, str | None]] = [
+        (f"Table {n}", f"{axis} {key[2:]}", printed(n)[key], None)
+        for n in (3, 4) for key in map(str, printed(n)) if key.startswith(axis)
+    ]  # fmt: skip
+    for _, hertz, *cells in printed(number).to_numpy().tolist():
+        mode = MODE_ROWS[axis].get(int(hertz))
+        rows.append((f"Table {number}", f"{axis} {hertz:g} Hz", cells, mode))
+    return [
+        TableRow(table, name, tuple(map(float, cells)), tuple(simulated), tuple(scatter), mode)
+        for (table, name, cells, mode), simulated, scatter in zip(
+            rows, mean.T.tolist(), spread.T.tolist(), strict=True
+        )
+    ]
 
 
 def loop_rows(plant: str) -> list[TableRow]:
