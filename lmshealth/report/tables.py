@@ -114,8 +114,9 @@ def modes_rows(reading: LogEstimates) -> list[Row]:
         "travel_km": None if metadata.travel is None else metadata.travel / _KM,
         "delta_e_below_40hz_um": None if error is None else error / _MICRO,
         "sample_rate_hz": reading.sample_rate,
-        "baseline": {None: "", True: "true", False: "false"}[metadata.baseline],
     }
+    if metadata.baseline is not None:  # a further column, as some covariates are
+        of_log["baseline"] = str(metadata.baseline).lower()
     rows = [TABLES["modes"].read(metadata, **of_log, **own) for own in to_rows(modes.to_columns())]
     further = {key: value for key, value in of_log.items() if key not in TABLES["modes"].names}
     for row, shape in zip(rows, modes.shapes.tolist(), strict=True):
