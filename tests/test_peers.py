@@ -41,7 +41,7 @@ def test_peers_without_records_are_named(tmp_path: Path) -> None:
     assert {row[1] for row in found} == {"not recorded"}
 
 
-def test_pages_follow_the_records() -> None:
+def test_the_page_has_marks_for_the_tables() -> None:
     """The page of the peers has marks for the tables."""
     page = (STUDIES / "PEERS.md").read_text(encoding="utf-8")
     assert page.count("<!-- claims -->") == page.count("<!-- end of claims -->") == 1

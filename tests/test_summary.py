@@ -28,7 +28,13 @@ def copied(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 def test_pages_are_up_to_date() -> None:
     """The pages of the studies are those that `python -m studies.harness.summary` writes."""
-    assert (summary.HERE / "README.md").read_text(encoding="utf-8") == summary.overview()
+    pages = {
+        "README.md": summary.overview,
+        "FRONT_PAGE.md": summary.statements,
+        "PEERS.md": summary.other_programs,
+    }
+    for name, page_of in pages.items():
+        assert (summary.HERE / name).read_text(encoding="utf-8") == page_of(), name
     for group in summary.GROUPS:
         page = (summary.HERE / group / "README.md").read_text(encoding="utf-8")
         assert page == summary.group_page(group), group

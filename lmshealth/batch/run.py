@@ -48,7 +48,7 @@ from lmshealth.report.pages import by_urgency, date_page, file_names, make_page,
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
-from lmshealth.tracking.maintenance import Maintenance, read_maintenance
+from lmshealth.tracking.maintenance import Maintenance, read_maintenance, without_logs
 
 # Output of one machine
 
@@ -285,11 +285,10 @@ def run(
 
 def _of_no_machine(work: Maintenance, machines: Collection[str]) -> Iterator[str]:
     """Yield a note on the work of each machine that has no log: its name may be misspelt."""
-    for name in dict.fromkeys(action.stage for action in work.actions):
-        if name not in machines:
-            near = get_close_matches(name, machines, 1)
-            hint = f"; is it {near[0]}?" if near else ""
-            yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
+    for name in without_logs(work.actions, machines):
+        near = get_close_matches(name, machines, 1)
+        hint = f"; is it {near[0]}?" if near else ""
+        yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
 def _count(

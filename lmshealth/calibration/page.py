@@ -109,11 +109,11 @@ def share_plot(ax: Axes, rows: Sequence[Share]) -> Axes:
 
 
 def histogram_picture(
-    title: str, places: ArrayLike, note: str, *, salt: str, good: str = _FLAT
+    title: str, places: ArrayLike, note: str, *, salt: str, expected: str = _FLAT
 ) -> Picture:
-    """Draw a histogram of ranks with a caption, which says what is good of it."""
+    """Draw a histogram of ranks; its caption has the expected form of the bars, and a note."""
     text = svg(lambda ax: rank_histogram(ax, places), salt=salt)
-    return Picture(title, text, f"{good} {note}".strip())
+    return Picture(title, text, f"{expected} {note}")
 
 
 def share_picture(

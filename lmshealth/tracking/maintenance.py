@@ -1,6 +1,6 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Container, Iterable, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from pathlib import Path
@@ -58,6 +58,11 @@ class Maintenance:
 
 NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""
+
+
+def without_logs(actions: Iterable[Action], machines: Container[str]) -> list[str]:
+    """Return the machines of actions that are none of these, each once."""
+    return list(dict.fromkeys(one.stage for one in actions if one.stage not in machines))
 
 
 def read_maintenance(

@@ -24,7 +24,7 @@ from lmshealth.modal.modes import Modes
 from lmshealth.stage.description import Stage
 from lmshealth.tracking import constants
 from lmshealth.tracking.history import History, build_history
-from lmshealth.tracking.maintenance import read_actions
+from lmshealth.tracking.maintenance import read_actions, without_logs
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -37,9 +37,9 @@ _RATE = "sample_rate_hz"
 _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, _RATE, "baseline")
+# What a log says of the baseline, as people and programs write it.
+_FLAGS = {"": None, "true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
 # Columns of text that may be missing, and what is assumed instead.
-_FLAGS: dict[str, bool | None] = {"": None, "true": True, "1": True, "yes": True}
-_FLAGS |= {"false": False, "0": False, "no": False}
 _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
 _SHAPE = "shape_"
@@ -140,7 +140,7 @@ def read_machines(
         own.setdefault(str(one.metadata.stage), []).append(one)
     notes += [
         f"maintenance of {name} is not used: the table has {', '.join(own)}"
-        for name in dict.fromkeys(action.stage for action in actions if action.stage not in own)
+        for name in without_logs(actions, own)
     ]
     machines = [
         build_history(estimates, stage, [action for action in actions if action.stage == name])

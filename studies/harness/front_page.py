@@ -46,7 +46,7 @@ STATEMENTS = (
     Statement(
         "the servo's following error is a sensor of modes", "paper/three_methods",
         ("lms-y: methods that show",),
-        "the simulated stages X and Y, without friction",
+        "the simulated stage Y, without friction",
         "a mode that Δe hardly moves is missing there: roll is seen by accelerometers only",
     ),
     Statement(
@@ -98,7 +98,8 @@ STATEMENTS = (
         "with the map's error, and another parameter free, the power is much lower",
     ),
     Statement(
-        "pages and alerts of a fleet say what is true", "life/year", ("sentences that are true",),
+        "sentences on pages and in alerts of a fleet are true",
+        "life/year", ("sentences that are true",),
         "a simulated year of monthly runs", "sentences that need what no log states are not judged",
     ),
     Statement(

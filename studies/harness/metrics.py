@@ -13,8 +13,11 @@ Gneiting2007 and Gneiting2011 for the score, Susto2015 for services.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.stats import sem
 
 from lmshealth._private.arrays import BoolArray, FloatArray
 
@@ -46,3 +49,9 @@ def service_at(draws: FloatArray, risk: float, *, horizon: ArrayLike = np.inf) -
 def unexpected_breaks(service: FloatArray, truth: ArrayLike) -> BoolArray:
     """Return which lives end before their service."""
     return np.asarray(np.asarray(truth) < service)
+
+
+def mean(values: Sequence[float | None]) -> tuple[float, float]:
+    """Return the mean of the values that there are, and its standard error."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)), float(sem(known)) if len(known) > 1 else 0.0

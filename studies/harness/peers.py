@@ -13,10 +13,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.stats import binomtest, fisher_exact, sem
+from scipy.stats import binomtest, fisher_exact
 
 from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import number
+from studies.harness.metrics import mean
 from studies.harness.study import STUDIES
 
 # Peer, world, our figures and theirs, intervals that hold, time over ours, who is better in what.
@@ -136,12 +137,6 @@ def lives(record: Any) -> Iterator[Row]:
         texts = [*map(", ".join, cells), "; ".join(map(", ".join, held))]
         ratio = both[1]["cpu_s"] / both[0]["cpu_s"] or None
         yield name, f"{kind}, {both[0]['n']} lives", *texts, ratio, better
-
-
-def mean(values: Sequence[float | None]) -> tuple[float, float]:
-    """Return the mean of the values that there are, and its standard error."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)), float(sem(known)) if len(known) > 1 else 0.0
 
 
 def _who(gain: float, error: float = 0.0) -> str:

@@ -120,6 +120,11 @@ def statements() -> str:
     return between_marks(HERE / "FRONT_PAGE.md", list(front_page.lines(found)))
 
 
+def other_programs() -> str:
+    """Return the page of other programs on the same records, series and lives."""
+    return between_marks(HERE / "PEERS.md", peers.lines(HERE))
+
+
 def group_page(group: str) -> str:
     """Return the page of a group: all claims of its records."""
     lines: list[str] = []
@@ -191,8 +196,7 @@ def main() -> None:
         (HERE / group / "README.md").write_text(group_page(group), encoding="utf-8")
     (HERE / "README.md").write_text(overview(), encoding="utf-8")
     (HERE / "FRONT_PAGE.md").write_text(statements(), encoding="utf-8")
-    page = HERE / "PEERS.md"
-    page.write_text(between_marks(page, peers.lines(HERE)), encoding="utf-8")
+    (HERE / "PEERS.md").write_text(other_programs(), encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -32,8 +32,7 @@ import numpy as np
 
 from lmshealth.calibration.ranks import clopper_pearson
 from studies.harness.claims import Claim, number
-from studies.harness.metrics import crps
-from studies.harness.peers import mean
+from studies.harness.metrics import crps, mean
 from studies.harness.study import Row, Study
 from studies.life.kinds.answers import IMPORTANCE, answer
 from studies.life.kinds.plant import LIMITS, MODES, Array, drift, map_table

@@ -105,8 +105,8 @@ def _block(
         figures.append(
             histogram_picture(
                 f"Control: {name}, wrong on purpose", control["wrong"]["places"],
-                f"p {_probability(control['control'])}.", salt=f"c{number}",
-                good="This one must not look good: its bars must not be of equal height.",
+                f"p: {_probability(control['control'])}.", salt=f"c{number}",
+                expected="This one must not look good: its bars must not be of equal height.",
             )
         )  # fmt: skip
     table = [
@@ -116,7 +116,7 @@ def _block(
             "measured (95 % Monte-Carlo interval)": "; ".join(map(_measured, row["shares"])) or "–",
             "p": f"{row['p']:.2g}",
             "rejected below": f"{level:.1g}",
-            "p of the control": _probability(row["control"]).removeprefix("= "),
+            "p of the control": _probability(row["control"]),
             "": "REJECTED" if out else "holds",
         }
         for row, (level, out) in own
@@ -127,7 +127,7 @@ def _block(
 
 def _probability(p: float) -> str:
     """Format a p value that may be too small for a number of the machine."""
-    return f"= {p:.1g}" if p > 0 else "below 1e-300"
+    return f"{p:.1g}" if p > 0 else "below 1e-300"
 
 
 def _measured(share: Sequence[Any]) -> str:

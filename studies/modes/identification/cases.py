@@ -15,7 +15,7 @@ from studies.modes.identification.records import Array, Truth
 
 # A fit reaches that many damping ratios beyond its modes: the bound is that of the same band.
 REACH = 8.0
-# Records of a kind; the first is nearest to its limit, which fewer would not tell from met.
+# Records of a kind: most of the first, whose error is nearest to what is asked.
 FIRST, HEADLINE, OTHERS = 2000, 600, 200
 SHAPES = ((1.0, 0.6, -0.4), (0.5, -1.0, 0.7), (-0.3, 0.8, 1.0))
 

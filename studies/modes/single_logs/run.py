@@ -40,8 +40,8 @@ UNSTEADY = "bursts", "log-normal", "ramp"
 MILD = "steady", "delayed"
 NOT_MET = {
     "no flag where the model holds": "flags are of a probability of 0.99: a log of 150 has one",
-    "95 % intervals hold 90 %, hump": "a hump as wide as a mode is told from the mode's flank "
-    "by the colour of the force only, and no colour that is averaged has one",
+    "95 % intervals hold 90 %, hump": "only the colour of the force distinguishes a hump as wide "
+    "as a mode from the mode's flank, and no colour that is averaged has one",
 }
 
 

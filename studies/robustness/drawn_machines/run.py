@@ -76,8 +76,8 @@ CALM, IN_TIME = (
 MODES_FOUND = "raw logs: modes are covered"
 NAMES = "names are not in doubt on a drawn machine"
 NOT_MET = {
-    NAMES: "modes of a drawn machine lie several percent off the shipped description, where only "
-    "other evidence than their frequency would tell which is which",
+    NAMES: "modes of a drawn machine lie several percent off the shipped description, where "
+    "frequency alone does not identify them",
     MODES_FOUND: "with the description corrected, roll and pitch of one machine are 0.6 % apart, "
     "less than half of a bandwidth, and are refused as too close in both of its logs",
     HOLDS["now"]: "intervals of the mount are too wide: they are averaged over all parts and laws "
