@@ -11,6 +11,10 @@ attempt would refuse a sound log whose process is killed twice from outside."""
 START_ATTEMPTS = 3
 """How often worker processes are started when one of them is killed as it starts."""
 
+FEEDER_END_S = 5
+"""Seconds (s) that the thread that feeds a pool's queue has to end with the pool: it has nothing
+to send any more, but one that waits for a pipe must not hold up the end of the program."""
+
 SCHEDULER_TIMEOUT_S = 20
 """Seconds (s) within which a Dask scheduler has to answer, and to have a first worker."""
 

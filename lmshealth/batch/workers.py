@@ -92,6 +92,7 @@ class _ProcessPool(Pool):
 
     def __init__(self, size: int) -> None:
         self.size, self._n_started = size, 0
+        self._others: set[threading.Thread] = set()  # that feed the queues of pools opened before
 
     def start(self, n: int) -> None:
         """Start processes in place of fewer; where one is killed meanwhile, try again."""
@@ -107,6 +108,7 @@ class _ProcessPool(Pool):
                     n, initializer=_initialise, initargs=(parent_exit,), env=_ENVIRONMENT
                 )
             self._n_started = n
+            self._others = _feeders()
             try:
                 with _interrupts_blocked():
                     first = self.executor.submit(os.getpid)
@@ -125,6 +127,10 @@ class _ProcessPool(Pool):
         if self._n_started:
             self._n_started = 0
             self.executor.shutdown(kill_workers=kill)
+            # loky does not wait for the thread that feeds its queue. Where Python ends between the
+            # removal of a semaphore by this thread and its report, loky warns of a lost one.
+            for thread in _feeders() - self._others:
+                thread.join(constants.FEEDER_END_S)
             self._open_end.close()
 
     def map_unordered(
@@ -168,6 +174,11 @@ class _ProcessPool(Pool):
                 self.close(kill=True)
         ended = f"the process that worked on it alone ended {constants.ATTEMPTS_ALONE} times"
         return on_crash(item, ended)
+
+
+def _feeders() -> set[threading.Thread]:
+    """Return the threads that feed the queues of loky's pools."""
+    return {one for one in threading.enumerate() if one.name == "QueueFeederThread"}
 
 
 def _completed(

@@ -53,6 +53,27 @@ def lost(number: int, why: str) -> int:
     return -number
 
 
+@pytest.mark.parametrize("killed", [False, True])
+def test_no_thread_outlives_a_pool(monkeypatch: pytest.MonkeyPatch, killed: bool) -> None:
+    """A slow end of the thread that feeds the queue is awaited: it removes semaphores."""
+    from loky.backend.queues import Queue
+
+    feed = Queue._feed
+
+    def slow(*arguments: object) -> None:
+        feed(*arguments)
+        time.sleep(0.3)
+
+    monkeypatch.setattr(Queue, "_feed", staticmethod(slow))
+    before = set(threading.enumerate())
+    with suppress(KeyboardInterrupt), processes(2) as pool:
+        assert dict(pool.map_unordered(double, range(4), lost)) == {n: 2 * n for n in range(4)}
+        assert set(threading.enumerate()) > before
+        if killed:
+            raise KeyboardInterrupt
+    assert set(threading.enumerate()) <= before
+
+
 @pytest.mark.parametrize("size", [1, 2])
 def test_everything_is_done_once(size: int) -> None:
     """Each item comes back with its own result, also when there are more than fit in a window."""
