@@ -418,12 +418,13 @@ def _usage(
                 stage=history.stage,
             )
         )
-    whole, spread = steps.sum() / days.sum(), constants.USAGE_SCATTER
+    whole = steps.sum() / days.sum()
+    typical = (constants.USAGE_SCATTER * whole) ** 2 * days.mean()  # scatter per day, squared
     travel = np.clip(remaining, days.mean() * whole, horizon)
-    probability, rest = _phases(days, steps)
+    probability, rest = _phases(days, steps, typical)
     phase = rng.choice(days.size, remaining.size, p=probability)
     # Two phases of few increments each show little of their scatter.
-    known = constants.USAGE_KNOWN, constants.USAGE_KNOWN * (spread * whole) ** 2 * days.mean()
+    known = constants.USAGE_KNOWN, constants.USAGE_KNOWN * typical
     # Days and travel of the increments from each one on.
     lasted, moved = (np.cumsum(own[::-1])[::-1] for own in (days, steps))
 
@@ -447,19 +448,19 @@ def _usage(
     return travel / (lasting + (travel - lasting * now) / later), now
 
 
-def _phases(days: FloatArray, steps: FloatArray) -> tuple[FloatArray, FloatArray]:
+def _phases(days: FloatArray, steps: FloatArray, typical: float) -> tuple[FloatArray, FloatArray]:
     """Return how probably each increment is the first of the present usage, ``(n,)``.
 
     That of increment 0 is that the usage has not changed. And the sums of squares per day about the
-    rates before and since, ``(n,)``. README.md has the model.
+    rates before and since, ``(n,)``. ``typical`` is the square of the scatter per day in m that is
+    expected. README.md has the model.
     """
-    n, rate, spread = days.size, steps.sum() / days.sum(), constants.USAGE_SCATTER
+    n, rate = days.size, steps.sum() / days.sum()
     total, moved = np.cumsum(days), np.cumsum(steps)
     before, past = total[:-1], moved[:-1]
     since, present = total[-1] - before, moved[-1] - past
     explained = np.append(moved[-1] ** 2 / total[-1], past**2 / before + present**2 / since)
     rest = np.maximum(np.sum(steps**2 / days) - explained, 0.0)
-    typical = (spread * rate) ** 2 * days.mean()
     known, freedom = constants.USAGE_KNOWN * typical, n - 1 + constants.USAGE_KNOWN
     variance, wide = 1 / before + 1 / since, rate**2 / typical
     apart = (past / before - present / since) ** 2 / (variance + wide)

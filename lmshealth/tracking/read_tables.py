@@ -16,7 +16,7 @@ import numpy as np
 
 from lmshealth._private.arrays import BoolArray, FloatArray, freeze
 from lmshealth.errors import BadTable
-from lmshealth.io.log import Metadata, Refusal
+from lmshealth.io.log import BOOLEANS, Metadata, Refusal
 from lmshealth.io.log import covariates as known_covariates
 from lmshealth.io.manifest import lines, name_machine, read_rows, to_moments, to_numbers
 from lmshealth.modal.log_estimates import LogEstimates
@@ -37,8 +37,6 @@ _RATE = "sample_rate_hz"
 _LOOP = "delta_e_below_40hz_um"
 # Columns that have one value per log.
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, _RATE, "baseline")
-# What a log says of the baseline, as people and programs write it.
-_FLAGS = {"": None, "true": True, "1": True, "yes": True, "false": False, "0": False, "no": False}
 # Columns of text that may be missing, and what is assumed instead.
 _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
@@ -306,7 +304,7 @@ def _log(
     loop, travel = float(first[_LOOP]), float(first["travel_km"])
     # Programs that know no empty flag write numbers.
     flag = str(first["baseline"]).strip().lower().removesuffix(".0")
-    if flag not in _FLAGS:
+    if flag and flag not in BOOLEANS:
         raise BadTable(f"{path}: log {log} has baseline {first['baseline']}; needed: true or false")
     metadata = Metadata(
         stage=str(first["stage"]).strip(),
@@ -314,7 +312,7 @@ def _log(
         travel=None if np.isnan(travel) else travel * _KM,
         covariates={c: float(first[c]) for c in covariates if np.isfinite(first[c])},
         servo_id=str(first["servo_id"]) or None,
-        baseline=_FLAGS[flag],
+        baseline=BOOLEANS.get(flag),
     )
     frequency = rows["frequency_hz"].to_numpy(float)
     damping = rows["damping_ratio"].to_numpy(float)

@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from scipy.special import chdtrc, softmax
-from threadpoolctl import threadpool_limits
 
-from lmshealth._private.arrays import FloatArray, freeze
+from lmshealth._private.arrays import FloatArray, freeze, one_thread
 from lmshealth._private.serialize import stream
 from lmshealth.errors import NotConverged
 from lmshealth.life import constants
@@ -236,6 +235,7 @@ class LifePosterior:
         return names
 
 
+@one_thread
 def fit_life(
     history: History,
     stage: Stage,
@@ -291,28 +291,26 @@ def fit_life(
     guide_preload: 71%
     mount_stiffness: 89%
     """
-    # Arrays are small: threads inside linear algebra would only wait for one another.
-    with threadpool_limits(1, user_api="blas"):
-        likelihood = LifeLikelihood.of(history, stage, min_logs)
-        # Updates one after the other must not repeat their random numbers.
-        steps = () if before is None else (len(history.logs),)
-        *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
-        try:
-            update = before is not None and not chains
-            weighted, start = explore(likelihood, seeds[0], before, update=update)
-        except NotConverged:
-            if before is None:
-                raise
-            return fit_life(history, stage, seed, chains=chains, min_logs=min_logs)
-        scenarios = _sampled_scenarios(weighted, seeds[1], by_chains=False)
-        judge, now = np.full((2, len(stage.parameters)), np.nan), np.array([likelihood.data.now])
-        if chains:  # importance sampling is only compared with them
-            drawn, scenarios = scenarios, _sampled_scenarios(weighted, seeds[1], by_chains=True)
-            judge = _change(drawn, scenarios, now)
-        rng = np.random.default_rng(off_seed)
-        draws = [_drawn_now(one, now, rng) for one in scenarios]
-        settings = [one.density.settings(one.some_draws) for one in scenarios]
-        lone_modes = _lone_modes(likelihood, scenarios)
+    likelihood = LifeLikelihood.of(history, stage, min_logs)
+    # Updates one after the other must not repeat their random numbers.
+    steps = () if before is None else (len(history.logs),)
+    *seeds, off_seed = stream(seed, _STEP, *steps).spawn(3)
+    try:
+        update = before is not None and not chains
+        weighted, start = explore(likelihood, seeds[0], before, update=update)
+    except NotConverged:
+        if before is None:
+            raise
+        return fit_life(history, stage, seed, chains=chains, min_logs=min_logs)
+    scenarios = _sampled_scenarios(weighted, seeds[1], by_chains=False)
+    judge, now = np.full((2, len(stage.parameters)), np.nan), np.array([likelihood.data.now])
+    if chains:  # importance sampling is only compared with them
+        drawn, scenarios = scenarios, _sampled_scenarios(weighted, seeds[1], by_chains=True)
+        judge = _change(drawn, scenarios, now)
+    rng = np.random.default_rng(off_seed)
+    draws = [_drawn_now(one, now, rng) for one in scenarios]
+    settings = [one.density.settings(one.some_draws) for one in scenarios]
+    lone_modes = _lone_modes(likelihood, scenarios)
     health, off, rate, lone = (np.concatenate(part, axis=1) for part in zip(*draws, strict=True))
     share = np.array([one.n_mixture_draws for one in scenarios]) / _N_KEPT
     means = (float(value) for value in share @ np.array(settings))

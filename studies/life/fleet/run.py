@@ -19,13 +19,12 @@ Run time
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import sem
 
 from lmshealth.calibration.ranks import judge_places, place
 from lmshealth.life.fleet_prior import (
@@ -41,7 +40,7 @@ from lmshealth.stage.degradation_laws import HertzWear
 from lmshealth.stage.description import Stage
 from lmshealth.stage.priors import Lognormal, Prior
 from studies.harness.claims import Claim, covered, measured, percents
-from studies.harness.metrics import crps
+from studies.harness.metrics import crps, mean
 from studies.harness.study import Row, Study
 from studies.life.fleet.lives import MATURE, YOUNG, Life, draw, draw_fleet, longer_lived, machine
 
@@ -221,12 +220,6 @@ def judged(rows: list[Row], way: str) -> Row:
                 for young in fleets
             ])  # fmt: skip
     return answer
-
-
-def mean(values: Sequence[float | np.floating]) -> list[float]:
-    """Return a mean over fleets and its standard error; 0 for a single fleet."""
-    error = sem(values) if len(values) > 1 else 0.0
-    return [round(float(np.mean(np.asarray(values))), 4), round(float(error), 4)]
 
 
 def verdicts(ways: Mapping[str, Row], n: int) -> dict[str, bool]:
