@@ -241,6 +241,9 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     late = status.inspect_by is not None and status.inspect_by < today
     judged = verdict not in NO_HEALTH
     serious = {code for code, severity in status.warnings.items() if severity == "serious"}
+    # Without parameters too few logs are no fault; what makes later ones useless too is one.
+    unusable = verdict == "not-enough-data" and bool(serious - {"large-drift"})
+    no_verdict = not judged and (status.infers_health or unusable)
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
     soon = today + timedelta(days=constants.SERVICE_LEAD_DAYS)
     found: list[tuple[DeviceHealth, str, object]] = [
@@ -252,7 +255,7 @@ def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
         ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
         ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
         ("MAINTENANCE_REQUIRED", "service-due", judged and by is not None and by <= soon),
-        ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
+        ("CHECK_FUNCTION", "no-verdict", no_verdict),
         ("CHECK_FUNCTION", "unconfirmed-jump", _UNCONFIRMED & status.warnings.keys()),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
         ("CHECK_FUNCTION", "inspection-overdue", late and status.service != "now"),

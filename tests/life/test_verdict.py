@@ -338,3 +338,23 @@ def test_modes_that_have_left_their_searches_withhold_health(stage: Stage) -> No
     assert doubt_of_names(stage, stray, track) == ""
     outliers = replace(track, outliers=tuple((9, mode) for mode in track.modes))
     assert doubt_of_names(stage, stray, outliers)
+
+
+def test_dead_sensors_are_no_missing_alarm(tmp_path: Path) -> None:
+    """Without a map all tracked modes count: none found in as many logs as a baseline has."""
+    stage, n = make_stage(tmp_path, ()), 12
+    assert not stage.informative
+    track, history = make_track(np.zeros((n, 2)), np.tile(1e-8 * np.eye(2), (n, 1, 1))), logs(n)
+    serviced = replace(history, baselines=(0, 7))  # and none is found since
+    for own, last, word in (
+        (history, 8, "no-alarm"),
+        (history, 7, "not-enough-data"),
+        (serviced, 7, "not-enough-data"),
+    ):
+        there = np.arange(n)[:, None] < last
+        seen = replace(own, ln_frequency=np.where(there, own.ln_frequency, np.nan))
+        doubt = doubt_of_names(stage, seen, track)
+        found = judge(stage, seen, None, track, doubt=doubt)
+        assert found.verdict == word
+        names = ", ".join(history.modes)
+        assert (f"None of the modes {names} was found in the last 5" in found.why) == bool(doubt)
