@@ -130,16 +130,16 @@ def judge(
 
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
-    if not stage.parameters:
-        return fact(
-            "The stage description has no [[parameter]]: the modes are tracked, and no health "
-            "parameter is inferred."
-        )
     values = {"n": n_logs, "needed": needed}
     if 1 == n_logs < needed:
         return fact("1 usable log since the baseline began; it needs {needed}.", **values)
     if n_logs < needed:
         return fact("{n} usable logs since the baseline began; it needs {needed}.", **values)
+    if not stage.parameters:
+        return fact(
+            "The stage description has no [[parameter]]: the modes are tracked, and no health "
+            "parameter is inferred."
+        )
     if health is None:
         return fact("The logs do not contain enough information for the health parameters.")
     if not health.explained:
