@@ -351,6 +351,8 @@ def headline(summary: Summary) -> str:
 def service_on_day(summary: Summary) -> str:
     """Return when to service a machine, as of the day of its summary, in a few words."""
     by = summary.service.by
+    if summary.step.kind == "see-effect":
+        return tr("unknown without a log")
     if summary.service.kind == "by" and by and summary.today and by < summary.today:
         words = tr("overdue since {day}", day=day(by))
     else:

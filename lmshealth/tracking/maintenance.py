@@ -17,6 +17,8 @@ _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
 # Work on guide or mount opens a new baseline.
 RESETS = ("preload-adjust", "guide-replaced", "mount-tightened")
+# Those that restore a parameter, by its word in verdicts; of any other all may.
+RESTORING = {"preload": ("preload-adjust", "guide-replaced"), "mount": ("mount-tightened",)}
 # Steps without wear: of dampings, of the closed loop, of one source.
 STEPS = ("regrease", "servo", "sensor")
 
@@ -153,7 +155,8 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
         done = {"work": action.action, "day": action.recorded_at.date().isoformat()}
         if before == len(moments):
             what = fact("{work} on {day}: no log since, so nothing is known after it.", **done)
-            notices.append(Notice("no-log-since", "caution", "", what, fact("Record a log.")))
+            to_do = fact("Record a log.")
+            notices.append(Notice("no-log-since", "caution", action.action, what, to_do))
         elif before:
             what = fact(
                 "{work} on {day} opened a new baseline: fractions are relative to the state after "
