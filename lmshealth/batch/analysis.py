@@ -15,7 +15,7 @@ from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
 from lmshealth.stage.description import Stage
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
+from lmshealth.tracking.maintenance import NO_MAINTENANCE, baseline_notices, read_maintenance
 
 
 def analyse(
@@ -86,9 +86,12 @@ def analyse(
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
-            refused.append(Refusal(error.log, error.reason, error.detail))
+            is_declared = isinstance(one, Path) and manifest.is_baseline(one)
+            refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
+            refused.append(refusal)
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")
     made = assess(found, stage, work=work, epochs=epochs, seed=seed)
-    return replace(made, refused=(*refused, *made.refused))
+    instead = baseline_notices(refused, made.history.logs[made.history.baseline])
+    return replace(made, refused=(*refused, *made.refused), notices=(*made.notices, *instead))

@@ -151,6 +151,7 @@ def ingest(
     lost: list[Refusal] = []
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
+    declared = {name_of(path, folder) for path in manifest.rows if manifest.is_baseline(path)}
 
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
     limit = settings.seconds_per_log
@@ -175,10 +176,13 @@ def ingest(
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
-    every = (*archive.refused, *refused, *lost)
+    every = (
+        replace(one, machine=owners.get(one.log) or "", baseline=one.log in declared)
+        for one in (*archive.refused, *refused, *lost)
+    )
     return Ingested(
         machines=machines,
-        refused=tuple(replace(one, machine=owners.get(one.log) or "") for one in every),
+        refused=tuple(every),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,
     )

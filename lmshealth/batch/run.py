@@ -48,7 +48,12 @@ from lmshealth.report.pages import by_urgency, date_page, file_names, make_page,
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
 from lmshealth.stage.description import Stage
 from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
-from lmshealth.tracking.maintenance import Maintenance, read_maintenance, without_logs
+from lmshealth.tracking.maintenance import (
+    Maintenance,
+    baseline_notices,
+    read_maintenance,
+    without_logs,
+)
 
 # Output of one machine
 
@@ -92,7 +97,8 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     logs = unpack_logs(record.logs or ())
     if found is None or (record.logs is not None and not logs):
         return None
-    found = replace(found, lost=record.lost)
+    instead = baseline_notices(record.lost, found.history.logs[found.history.baseline])
+    found = replace(found, lost=record.lost, notices=(*found.notices, *instead))
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):

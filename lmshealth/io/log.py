@@ -114,6 +114,8 @@ class Refusal:
     frequency: float | None = field(default=None, compare=False, kw_only=True)
     # Of a log as a whole in an archive, as far as it is known.
     machine: str = field(default="", compare=False, kw_only=True)
+    # Whether the log was declared as baseline.
+    baseline: bool = field(default=False, compare=False, kw_only=True)
 
 
 # Reasons of warnings among the refusals of a log, which name a channel: it is used nevertheless.
@@ -243,7 +245,7 @@ INVISIBLE = (
     "\u2028-\u202e\u2060-\u206f\u3164\ufe00-\ufe0f\ufeff\uffa0\ufff0-\ufffb\ufffe\uffff"
     "\U000e0000-\U000e0fff\U000f0000-\U0010ffff"
 )
-_BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
+BOOLEANS = {"true": True, "1": True, "false": False, "0": False}
 
 
 def parse_metadata(
@@ -256,7 +258,7 @@ def parse_metadata(
     """
     given = {key: text[key].strip() for key in metadata_keys() if text.get(key, "").strip()}
     travel, velocity = _number(given, "travel_km"), _number(given, "velocity_mm_s")
-    if (flag := given.get("baseline", "").lower()) and flag not in _BOOLEANS:
+    if (flag := given.get("baseline", "").lower()) and flag not in BOOLEANS:
         raise _bad(given, "baseline", "true or false")
     return Metadata(
         stage=parse_name(given, "stage"),
@@ -266,7 +268,7 @@ def parse_metadata(
             key: value for key in covariates() if (value := _number(given, key)) is not None
         },
         servo_id=parse_name(given, "servo_id"),
-        baseline=_BOOLEANS.get(flag),
+        baseline=BOOLEANS.get(flag),
         description=parse_name(given, "description"),
         velocity=None if velocity is None else 1e-3 * velocity,
     ), _number(given, "sample_rate_hz")

@@ -10,7 +10,7 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from difflib import get_close_matches
@@ -23,7 +23,7 @@ from lmshealth._private.files import escapes, read_table
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log
-from lmshealth.io.log import Refusal, low_high, metadata_keys, parse_moment, possible
+from lmshealth.io.log import BOOLEANS, Refusal, low_high, metadata_keys, parse_moment, possible
 from lmshealth.io.refusal import Unusable, listed, repeated, shown
 
 if TYPE_CHECKING:
@@ -194,6 +194,10 @@ class Manifest:
         """Return whether this log has a row."""
         return _absolute(log) in self.rows
 
+    def is_baseline(self, log: Path) -> bool:
+        """Return whether the row of this log declares it as baseline."""
+        return _declares_baseline(self.rows.get(_absolute(log), {}))
+
     def omits(self, log: Path) -> bool:
         """Return whether this log has no row in a manifest that lists the logs of its folder."""
         path = _absolute(log)
@@ -357,7 +361,8 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         if trouble:
             manifest.bad[log] = f"{place}: {trouble}"
         if not os.path.isfile(log):
-            yield Refusal(name_of(log, _absolute(root)), "missing-file", f"{place} names no file")
+            name, detail = name_of(log, _absolute(root)), f"{place} names no file"
+            yield Refusal(name, "missing-file", detail, baseline=_declares_baseline(row))
     if any(row.keys() >= {"stage", "recorded_at"} for row in own.values()):
         manifest.registers.add(_absolute(path.parent))
     for name, key in _misspelt(names):
@@ -365,6 +370,10 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         yield Refusal(name_of(path, root), MISSPELT, detail)
     for log, row in own.items():
         manifest.rows[log] = manifest.rows.get(log, {}) | row
+
+
+def _declares_baseline(row: Mapping[str, str]) -> bool:
+    return BOOLEANS.get(row.get("baseline", "").lower(), False)
 
 
 def _misspelt(names: set[str]) -> Iterator[tuple[str, str]]:

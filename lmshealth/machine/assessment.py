@@ -43,7 +43,12 @@ from lmshealth.tracking.history import (
     doubt_of_clock,
     missing_mode_notices,
 )
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
+from lmshealth.tracking.maintenance import (
+    NO_MAINTENANCE,
+    Maintenance,
+    baseline_notices,
+    maintenance_notices,
+)
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
 _NAMELESS = ("ambiguous", "unconfirmed")  # reasons of estimates whose name is not certain
@@ -292,6 +297,7 @@ def _before_tracking(
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
     notices += contradiction_notices(history, refused)
+    notices += baseline_notices(refused, history.logs[history.baseline])
     notices += covariate_notices(history.covariates, stage)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}

@@ -128,6 +128,31 @@ def _machine(row: Row) -> str:
         return ""
 
 
+def baseline_notices(refused: Iterable[Refusal], used: str) -> list[Notice]:
+    """Return notices of refused logs that were declared as baseline.
+
+    `used` is the log with which the baseline begins instead.
+    """
+    return [
+        Notice(
+            "baseline-refused",
+            "caution",
+            one.log,
+            fact(
+                "{log} is declared as baseline (baseline = true), and was refused ({reason}: "
+                "{detail}): the present baseline begins with {used} instead.",
+                log=one.log,
+                reason=one.reason,
+                detail=one.detail,
+                used=used,
+            ),
+            fact("Correct that log or its row, or declare another one in manifest.csv."),
+        )
+        for one in refused
+        if one.baseline
+    ]
+
+
 def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -> list[Notice]:
     """Return notices for a report: rows that cannot be read, and new baselines.
 

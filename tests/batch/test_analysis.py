@@ -52,6 +52,19 @@ def test_a_copy_of_a_log_is_refused(logs: Path, tmp_path: Path) -> None:
     assert (Path(row.log).name, row.detail[:15]) == ("copy.csv", "same content as")
 
 
+def test_a_refused_log_that_was_declared_as_baseline_is_named(logs: Path, tmp_path: Path) -> None:
+    """A log that cannot be read, and one that is not there: what is used instead is stated."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    (folder / "a.csv").write_text("no log\n")
+    rows = "a.csv,true\ngone.csv,TRUE\n0.csv,false\n"
+    (folder / "manifest.csv").write_text(f"file,baseline\n{rows}")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    named = [one for one in found.notices if one.code == "baseline-refused"]
+    assert sorted(Path(one.where).name for one in named) == ["a.csv", "gone.csv"]
+    assert all("0.csv instead" in one.what for one in named)
+
+
 def test_a_map_is_a_mapping_or_a_file(logs: Path, tmp_path: Path) -> None:
     """Both read the same channels; a mapping with unknown keys is refused as a file is."""
     path = tmp_path / "map.toml"
