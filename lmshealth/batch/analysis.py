@@ -8,7 +8,13 @@ from pathlib import Path
 from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnsGiven, column_map
 from lmshealth.io.log import Log, Refusal
-from lmshealth.io.manifest import Manifest, find_logs, read_manifest, read_manifest_beside
+from lmshealth.io.manifest import (
+    Manifest,
+    copy_error,
+    find_logs,
+    read_manifest,
+    read_manifest_beside,
+)
 from lmshealth.io.reading import read_log
 from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
@@ -72,16 +78,18 @@ def analyse(
         manifests = dict.fromkeys(listed.logs, manifest)
     else:
         given = [one if isinstance(one, Log) else Path(one) for one in logs]
-    seen: dict[str, str] = {}
+    seen: dict[str, tuple[str, dict[str, str]]] = {}
     for one in given:
+        overrides: dict[str, str] = {}
         try:
             log = one
             if isinstance(log, Path):
                 manifest = manifests[log] if log in manifests else read_manifest_beside(log)
                 overrides = manifest.overrides(log)
                 log = read_log(log, columns=used, overrides=overrides, latest=latest)
-            if (other := seen.setdefault(log.digest, log.name)) != log.name:
-                raise BadLog(log.name, "duplicate", f"same content as {other}")
+            if log.digest in seen:
+                raise copy_error(log.name, overrides, *seen[log.digest])
+            seen[log.digest] = log.name, overrides
             modes = identify(log, stage)
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))

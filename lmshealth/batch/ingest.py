@@ -22,9 +22,9 @@ from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
-from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
+from lmshealth.io.manifest import NOT_LOGS, Manifest, copy_error, find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
-from lmshealth.io.refusal import listed, visible
+from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import Language
 from lmshealth.stage.description import Stage
@@ -234,25 +234,13 @@ def _tasks(
         try:
             overrides = manifest.overrides(path)
             if content in seen:
-                raise BadLog(name, "duplicate", _copy_of(seen[content], overrides))
+                task = seen[content]
+                raise copy_error(name, overrides, task.name, task.overrides)
         except BadLog as error:
             refused.append(Refusal(name, error.reason, error.detail))
             continue
         seen[content] = _Task(path, name, overrides, digest, columns)
     return [*seen.values()], refused
-
-
-def _copy_of(task: _Task, overrides: Mapping[str, str]) -> str:
-    """Describe a copy of a log, and what its row of the manifest states otherwise."""
-    other = {
-        key: f"{key} {visible(value)} (there {visible(task.overrides[key])})"
-        for key, value in overrides.items()
-        if task.overrides.get(key, value) != value
-    }
-    if not other:
-        return f"same content as {task.name}, which is analysed for both"
-    found = f"same content as {task.name}, but manifest.csv states {listed(other.values())}"
-    return f"{found}; only {task.name} is analysed: correct the row, or delete one of the files"
 
 
 def _file_key(path: Path, folder: Path) -> tuple[str, bool]:

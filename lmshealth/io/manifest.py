@@ -23,8 +23,16 @@ from lmshealth._private.files import escapes, read_table
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log
-from lmshealth.io.log import BOOLEANS, Refusal, low_high, metadata_keys, parse_moment, possible
-from lmshealth.io.refusal import Unusable, listed, repeated, shown
+from lmshealth.io.log import (
+    BOOLEANS,
+    Refusal,
+    low_high,
+    metadata_keys,
+    parse_metadata,
+    parse_moment,
+    possible,
+)
+from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -212,6 +220,35 @@ class Manifest:
         if path in self.bad:
             raise BadLog(shown(log), "bad-row", self.bad[path])
         return dict(self.rows.get(path, {}))
+
+
+def copy_error(
+    name: str, stated: Mapping[str, str], other: str, there: Mapping[str, str]
+) -> BadLog:
+    """Return the refusal of a copy of a log; both have metadata by their rows of the manifest.
+
+    It is ``bad-row`` where these contradict each other, which is no harmless copy, else
+    ``duplicate``.
+    """
+    contradicting = [
+        f"{key} {visible(value[:80])} (there {visible(there[key][:80])})"
+        for key, value in stated.items()
+        if key in there and _parsed(key, value) != _parsed(key, there[key])
+    ]
+    same = f"same content as {other}"
+    if not contradicting:
+        return BadLog(name, "duplicate", f"{same}, which is analysed for both")
+    found = f"{same}, but manifest.csv states {', '.join(contradicting)}"
+    next_step = "correct the row, or delete one of the files"
+    return BadLog(name, "bad-row", f"{found}; only {other} is analysed: {next_step}")
+
+
+def _parsed(key: str, value: str) -> object:
+    """Return what a cell states: one moment or number may be written in several ways."""
+    try:
+        return parse_metadata({key: value})
+    except Unusable:
+        return value
 
 
 def find_logs(

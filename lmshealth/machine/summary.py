@@ -27,11 +27,12 @@ Step = Literal[
 ]  # fmt: skip
 """What to do; the sentence of each is in `[steps]` of ``_private/tables.toml``."""
 
-# First case that applies to verdict, kind of service, age and day. A verdict is ``worked`` (the work
-# that the step would be about was entered after the last log), ``alarm`` (or a step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
-# left out, without a loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open``
-# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
-# where a log is. "" is any.
+# First case that applies to verdict, kind of service, age and day. A verdict is ``worked`` (the
+# work that the step would order was entered after the last log), ``alarm`` (or a step), ``outside``
+# (or a step of modes that moved alone), ``drift`` (large, or a last log that is left out, without a
+# loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open`` (none), ``healthy``
+# or ``loss``. A day is ``overdue`` after that of the service, else ``late`` where a log is. "" is
+# any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
     ("see-effect", "worked", "", "", ""),
     ("inspect", "alarm", "", "", ""),

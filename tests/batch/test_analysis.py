@@ -50,6 +50,10 @@ def test_a_copy_of_a_log_is_refused(logs: Path, tmp_path: Path) -> None:
     assert [Path(log).name for log in found.history.logs] == ["0.csv", "1.csv"]
     (row,) = (one for one in found.refused if one.reason == "duplicate")
     assert (Path(row.log).name, row.detail[:15]) == ("copy.csv", "same content as")
+    (folder / "manifest.csv").write_text("file,travel_km\n0.csv,5\ncopy.csv,7\n")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    (row,) = (one for one in found.refused if one.reason == "bad-row")
+    assert "travel_km 7 (there 5)" in row.detail
 
 
 def test_a_refused_log_that_was_declared_as_baseline_is_named(logs: Path, tmp_path: Path) -> None:

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _copy_of, _identified, _Outcome, _Task, _within, identify_log
+from lmshealth.batch.ingest import _identified, _Outcome, _Task, _within, identify_log
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
 from lmshealth.errors import BadLog
 from lmshealth.io.log import Refusal
+from lmshealth.io.manifest import copy_error
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import load_stage
 from tests.signals import Mode, accelerations
@@ -109,9 +110,13 @@ def test_the_time_of_a_log_is_its_own() -> None:
 
 
 def test_a_copy_that_its_row_contradicts_names_the_contradiction() -> None:
-    """The same samples are of one machine; without a contradiction they count for both names."""
-    task = _Task(Path("a.csv"), "a.csv", {"stage": "A", "travel_km": "1"}, "0" * 64, None)
-    assert "analysed for both" in _copy_of(task, {"stage": "A"})
-    text = _copy_of(task, {"stage": "B", "travel_km": "1"})
-    assert "stage B (there A); only a.csv is analysed" in text
-    assert "travel_km" not in text
+    """Samples are of one machine and moment: another one is a bad row, in full; a copy is none."""
+    moment = "2026-09-01T08:00:00+00:00"
+    there = {"stage": "A", "travel_km": "1", "recorded_at": "2026-04-04T22:25:26+00:00"}
+    for same in ({"stage": "A"}, {"travel_km": "1.0", "recorded_at": "2026-04-04T22:25:26Z"}):
+        error = copy_error("b.csv", same, "a.csv", there)
+        assert error.reason == "duplicate" and "analysed for both" in error.detail
+    error = copy_error("b.csv", {**there, "stage": "B", "recorded_at": moment}, "a.csv", there)
+    assert (error.log, error.reason) == ("b.csv", "bad-row")
+    assert f"recorded_at {moment} (there {there['recorded_at']}); only a.csv" in error.detail
+    assert "stage B (there A), " in error.detail and "travel_km" not in error.detail

@@ -900,6 +900,11 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     assert (misspelt.n_logs, misspelt.n_refused, misspelt.n_unread) == (2, 0, 0)
     (note,) = misspelt.notes
     assert note.startswith("manifest.csv: column temperatur_c is not read, unlike temperature_c")
+    # Rows that contradict each other lose a log, though its content is analysed.
+    shutil.copy(logs / "log-01.h5", logs / "log-02.h5")
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,7\nlog-02.h5,8\n")
+    copied = run(logs, [modes_only], out)
+    assert (copied.n_logs, copied.n_refused) == (3, 1)
 
 
 @pytest.mark.slow

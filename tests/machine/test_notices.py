@@ -281,7 +281,7 @@ def test_a_flag_of_the_last_log_is_noticed_with_its_meaning(make: Maker) -> None
 
 
 def test_a_declared_baseline_that_is_left_out_is_named() -> None:
-    """It is not replaced in silence: the notice has the declaration, the reason and the log used."""
+    """It is not replaced in silence: a notice has declaration, reason and the log that is used."""
     readings = [
         make_reading(f"{k}.csv", k, 1e8 if k == 1 else 1e5 * k, {"roll": 4.8}, baseline=k == 1)
         for k in range(4)
