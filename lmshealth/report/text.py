@@ -433,7 +433,10 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
     if more:
         logs = tr("{logs} more", logs=logs) if more > 0 else tr("{logs} fewer", logs=logs)
     elif before.recorded_at == now.recorded_at and before.service.by != now.service.by:
-        logs = tr("No further log: this follows from the fleet, or from work that was entered")
+        logs = tr(
+            "No further log: this follows from the fleet, from maintenance that was entered, or "
+            "from another description, settings or version"
+        )
     else:
         logs = tr("Same number of logs")
     yield logs + (tr(", {distance} further.", distance=km(travel)) if travel > 0 else ".")
