@@ -7,7 +7,7 @@ from pathlib import Path
 
 from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnsGiven, column_map
-from lmshealth.io.log import Log, Refusal
+from lmshealth.io.log import Log, Notice, Refusal
 from lmshealth.io.manifest import (
     Manifest,
     copy_error,
@@ -20,8 +20,13 @@ from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
-from lmshealth.stage.description import Stage
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, baseline_notices, read_maintenance
+from lmshealth.stage.description import Stage, expect_stage
+from lmshealth.tracking.maintenance import (
+    NO_MAINTENANCE,
+    baseline_notices,
+    read_maintenance,
+    without_logs,
+)
 
 
 def analyse(
@@ -55,6 +60,8 @@ def analyse(
 
     Raises
     ------
+    BadStage
+        If the stage is no result of `load_stage`.
     NotEnoughData
         If no log can be used, or they are of several machines.
 
@@ -65,6 +72,7 @@ def analyse(
     Traceback (most recent call last):
     lmshealth.errors.NotEnoughData: no log can be used: none is given
     """
+    expect_stage(stage)
     work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
     given: list[Path | Log]
     manifests: dict[Path, Manifest] = {}
@@ -102,4 +110,6 @@ def analyse(
         raise NotEnoughData(f"no log can be used: {why}")
     made = assess(found, stage, work=work, epochs=epochs, seed=seed)
     instead = baseline_notices(refused, made.history.logs[made.history.baseline])
+    for note in without_logs(work.actions, [made.history.stage]):
+        instead.append(Notice("maintenance-unused", "caution", "maintenance.csv", note))
     return replace(made, refused=(*refused, *made.refused), notices=(*made.notices, *instead))

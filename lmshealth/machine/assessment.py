@@ -34,7 +34,7 @@ from lmshealth.machine.constants import DRIFT_SIGMA
 from lmshealth.machine.service import Service, decide
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, expect_stage
 from lmshealth.tracking.covariates import covariate_notices
 from lmshealth.tracking.history import (
     History,
@@ -220,6 +220,8 @@ def assess(
 
     Raises
     ------
+    BadStage
+        If the stage is no result of `load_stage`.
     NotEnoughData
         If the logs are of several machines.
 
@@ -236,6 +238,7 @@ def assess(
     >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
+    expect_stage(stage)
     machines = sorted({one.metadata.stage or "" for one in logs})
     if len(machines) > 1:
         named = ", ".join(machines)

@@ -1,8 +1,9 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Self
 
@@ -62,9 +63,12 @@ NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""
 
 
-def without_logs(actions: Iterable[Action], machines: Container[str]) -> list[str]:
-    """Return the machines of actions that are none of these, each once."""
-    return list(dict.fromkeys(one.stage for one in actions if one.stage not in machines))
+def without_logs(actions: Iterable[Action], machines: Collection[str]) -> Iterator[str]:
+    """Yield a sentence on each machine of actions that is none of these: it may be misspelt."""
+    for name in dict.fromkeys(one.stage for one in actions if one.stage not in machines):
+        near = get_close_matches(name, machines, 1)
+        hint = f"; is it {near[0]}?" if near else ""
+        yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
 def read_maintenance(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lmshealth
-from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.errors import BadStage, BadTable, NotEnoughData
 from lmshealth.io.column_map import column_map
 
 EXPORT = {"columns": {"acc_pitch_m_s2": "a2"}}
@@ -87,3 +87,35 @@ def test_without_a_usable_log_the_reason_is_named(logs: Path) -> None:
     """Each log that was refused is in the error, by the name that was given."""
     with pytest.raises(NotEnoughData, match=r"0\.csv: "):
         lmshealth.analyse([logs / "0.csv"], lmshealth.load_stage("lms-y"))
+
+
+def test_a_name_is_no_stage(logs: Path, tmp_path: Path) -> None:
+    """The error names what loads one; a run asks for several."""
+    name: Any = "lms-y"
+    stage = lmshealth.load_stage(name)
+    log = lmshealth.read_log(logs / "0.csv", columns=EXPORT)
+    for call in (
+        lambda: lmshealth.analyse(logs, name),
+        lambda: lmshealth.assess([], name),
+        lambda: lmshealth.identify(log, name),
+        lambda: lmshealth.run(logs, [name], tmp_path / "out"),
+    ):
+        with pytest.raises(BadStage, match=r"'lms-y' of type str; needed load_stage\('lms-y'\)"):
+            call()
+    lone: Any = stage
+    for one in (name, lone):
+        with pytest.raises(BadStage, match="needed a list of results of load_stage"):
+            lmshealth.run(logs, one, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_work_on_a_machine_without_logs_is_noticed(logs: Path, tmp_path: Path) -> None:
+    """Its name may be misspelt: the command notes it, too."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    (folder / "maintenance.csv").write_text(
+        "stage,recorded_at,action\nAX-3Y,2026-07-10T12:00:00Z,regrease\n"
+    )
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    (notice,) = (one for one in found.notices if one.code == "maintenance-unused")
+    assert "work on AX-3Y is not used" in notice.what and "is it AX-3-Y?" in notice.what

@@ -2,19 +2,22 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
 from threading import Thread
 from time import process_time
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _identified, _Outcome, _Task, _within, identify_log
+from lmshealth.batch.alerts import Alerts
+from lmshealth.batch.ingest import Settings, _identified, _Outcome, _Task, _within, identify_log
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import copy_error
 from lmshealth.modal.log_estimates import LogEstimates
@@ -120,3 +123,26 @@ def test_a_copy_that_its_row_contradicts_names_the_contradiction() -> None:
     assert (error.log, error.reason) == ("b.csv", "bad-row")
     assert f"recorded_at {moment} (there {there['recorded_at']}); only a.csv" in error.detail
     assert "stage B (there A), " in error.detail and "travel_km" not in error.detail
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"workers": 0}, "workers is 0; needed a whole number of at least 1"),
+        ({"workers": "2"}, "workers is '2'; needed a whole number"),
+        ({"epochs": -3}, "epochs is -3"),
+        ({"epochs": 2.5}, "epochs is 2.5"),
+        ({"seed": -1}, "seed is -1; needed a whole number of at least 0"),
+        ({"max_memory": -1.0}, "max_memory is -1.0; needed a number above 0"),
+        ({"seconds_per_log": float("nan")}, "seconds_per_log is nan"),
+        ({"alerts": Alerts(silent_days=-7)}, "silent_days is -7"),
+        ({"latest": datetime(2026, 1, 1)}, "latest is .*; needed a moment with a time zone"),
+        ({"today": "2026-01-01"}, "today is '2026-01-01'; needed a day"),
+        ({"language": "fr"}, "language is 'fr'; needed one of"),
+        ({"columns": {"columns": {}}}, "columns is .*; needed a result of column_map"),
+    ],
+)
+def test_impossible_settings_are_refused(given: dict[str, Any], text: str) -> None:
+    """Each is named with its value, and what is needed."""
+    with pytest.raises(LmshealthError, match=f"^Settings: {text}"):
+        Settings(**given)
