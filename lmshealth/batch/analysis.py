@@ -7,15 +7,26 @@ from pathlib import Path
 
 from lmshealth.errors import BadLog, NotEnoughData
 from lmshealth.io.column_map import ColumnsGiven, column_map
-from lmshealth.io.log import Log, Refusal
-from lmshealth.io.manifest import Manifest, find_logs, read_manifest, read_manifest_beside
+from lmshealth.io.log import Log, Notice, Refusal
+from lmshealth.io.manifest import (
+    Manifest,
+    copy_error,
+    find_logs,
+    read_manifest,
+    read_manifest_beside,
+)
 from lmshealth.io.reading import read_log
 from lmshealth.machine.assessment import Assessment, assess
 from lmshealth.modal.identification import identify
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.signal.readings import loop_error
-from lmshealth.stage.description import Stage
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, read_maintenance
+from lmshealth.stage.description import Stage, expect_stage
+from lmshealth.tracking.maintenance import (
+    NO_MAINTENANCE,
+    baseline_notices,
+    read_maintenance,
+    without_logs,
+)
 
 
 def analyse(
@@ -49,6 +60,8 @@ def analyse(
 
     Raises
     ------
+    BadStage
+        If the stage is no result of `load_stage`.
     NotEnoughData
         If no log can be used, or they are of several machines.
 
@@ -59,6 +72,7 @@ def analyse(
     Traceback (most recent call last):
     lmshealth.errors.NotEnoughData: no log can be used: none is given
     """
+    expect_stage(stage)
     work, refused, found = NO_MAINTENANCE, list[Refusal](), list[LogEstimates]()
     given: list[Path | Log]
     manifests: dict[Path, Manifest] = {}
@@ -72,23 +86,30 @@ def analyse(
         manifests = dict.fromkeys(listed.logs, manifest)
     else:
         given = [one if isinstance(one, Log) else Path(one) for one in logs]
-    seen: dict[str, str] = {}
+    seen: dict[str, tuple[str, dict[str, str]]] = {}
     for one in given:
+        overrides: dict[str, str] = {}
         try:
             log = one
             if isinstance(log, Path):
                 manifest = manifests[log] if log in manifests else read_manifest_beside(log)
                 overrides = manifest.overrides(log)
                 log = read_log(log, columns=used, overrides=overrides, latest=latest)
-            if (other := seen.setdefault(log.digest, log.name)) != log.name:
-                raise BadLog(log.name, "duplicate", f"same content as {other}")
+            if log.digest in seen:
+                raise copy_error(log.name, overrides, *seen[log.digest])
+            seen[log.digest] = log.name, overrides
             modes = identify(log, stage)
             own = log.name, log.digest, log.metadata, modes, loop_error(log)
             found.append(LogEstimates(*own, sample_rate=log.sample_rate))
         except BadLog as error:
-            refused.append(Refusal(error.log, error.reason, error.detail))
+            is_declared = isinstance(one, Path) and manifest.is_baseline(one)
+            refusal = Refusal(error.log, error.reason, error.detail, baseline=is_declared)
+            refused.append(refusal)
     if not found:
         why = "; ".join(f"{one.log}: {one.detail}" for one in refused[:3]) or "none is given"
         raise NotEnoughData(f"no log can be used: {why}")
     made = assess(found, stage, work=work, epochs=epochs, seed=seed)
-    return replace(made, refused=(*refused, *made.refused))
+    instead = baseline_notices(refused, made.history.logs[made.history.baseline])
+    for note in without_logs(work.actions, [made.history.stage]):
+        instead.append(Notice("maintenance-unused", "caution", "maintenance.csv", note))
+    return replace(made, refused=(*refused, *made.refused), notices=(*made.notices, *instead))

@@ -9,6 +9,7 @@ from contextlib import AbstractContextManager
 from dataclasses import dataclass, field, replace
 from datetime import date, datetime
 from functools import partial
+from numbers import Integral, Real
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple, Self
 
@@ -17,16 +18,16 @@ from lmshealth.batch import constants
 from lmshealth.batch.alerts import Alerts
 from lmshealth.batch.store import Identified, Resources, Store, cached, unpack_or_none
 from lmshealth.batch.workers import Pool, Threads, cluster, processes
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.column_map import ColumnMap
 from lmshealth.io.constants import MAX_MEMORY
 from lmshealth.io.formats.registry import format_name
 from lmshealth.io.log import SHIPPED, Metadata, Refusal, covariates, is_future
-from lmshealth.io.manifest import NOT_LOGS, Manifest, find_logs, name_of, read_manifest
+from lmshealth.io.manifest import NOT_LOGS, Manifest, copy_error, find_logs, name_of, read_manifest
 from lmshealth.io.reading import content_digest, read_log, require_identity
-from lmshealth.io.refusal import listed, visible
+from lmshealth.io.refusal import visible
 from lmshealth.modal.log_estimates import LogEstimates
-from lmshealth.report.language import Language
+from lmshealth.report.language import LANGUAGES, Language
 from lmshealth.stage.description import Stage
 
 NOT_LISTED = "not-listed"
@@ -40,7 +41,7 @@ _logger = logging.getLogger(__name__)
 
 @dataclass(frozen=True, slots=True)
 class Settings:
-    """Settings of a run.
+    """Settings of a run; an impossible one raises `LmshealthError`.
 
     Examples
     --------
@@ -69,6 +70,29 @@ class Settings:
     today: date | None = None
     language: Language = "en"  # of the pages; tables, status files and messages are English
     growing: frozenset[Path] = frozenset()  # files that are left to a later run
+
+    def __post_init__(self) -> None:
+        def check(name: str, value: object, holds: bool, needed: str) -> None:
+            if not holds:
+                raise LmshealthError(f"Settings: {name} is {value!r:.80}; needed {needed}")
+
+        for name, least in (("workers", 1), ("epochs", 1), ("seed", 0)):
+            value = getattr(self, name)
+            is_whole = isinstance(value, Integral) and not isinstance(value, bool)
+            needed = f"a whole number of at least {least}"
+            check(name, value, is_whole and least <= value < 1 << 63, needed)
+        silent = self.alerts.silent_days
+        positive = {"max_memory": self.max_memory, "seconds_per_log": self.seconds_per_log}
+        for name, value in (positive | {"silent_days": 1 if silent is None else silent}).items():
+            is_positive = isinstance(value, Real) and value > 0
+            check(name, value, is_positive, "a number above 0")
+        latest, today, is_map = self.latest, self.today, isinstance(self.columns, ColumnMap | None)
+        is_zoned = latest is None or (isinstance(latest, datetime) and latest.tzinfo is not None)
+        check("latest", latest, is_zoned, "a moment with a time zone")
+        is_day = isinstance(today, date | None) and not isinstance(today, datetime)
+        check("today", today, is_day, "a day (datetime.date)")
+        check("language", self.language, self.language in LANGUAGES, f"one of {LANGUAGES}")
+        check("columns", self.columns, is_map, "a result of column_map")
 
     def pool(self) -> AbstractContextManager[Pool]:
         """Open the workers."""
@@ -151,6 +175,7 @@ def ingest(
     lost: list[Refusal] = []
     # Machine of each log, by the manifest or its own metadata.
     owners = {name_of(path, folder): row.get("stage") for path, row in manifest.rows.items()}
+    declared = {name_of(path, folder) for path in manifest.rows if manifest.is_baseline(path)}
 
     how = {"max_memory": settings.max_memory, "latest": settings.latest}
     limit = settings.seconds_per_log
@@ -175,10 +200,13 @@ def ingest(
     names |= {one.log for one in (*archive.refused, *manifest.refused)}
     machines, others = _grouped(groups, stages)
     lost = sorted([*lost, *others], key=lambda refusal: refusal.log)
-    every = (*archive.refused, *refused, *lost)
+    every = (
+        replace(one, machine=owners.get(one.log) or "", baseline=one.log in declared)
+        for one in (*archive.refused, *refused, *lost)
+    )
     return Ingested(
         machines=machines,
-        refused=tuple(replace(one, machine=owners.get(one.log) or "") for one in every),
+        refused=tuple(every),
         logs=frozenset(name for name in names if PurePosixPath(name).name not in NOT_LOGS),
         n_cached=n_cached,
     )
@@ -230,25 +258,13 @@ def _tasks(
         try:
             overrides = manifest.overrides(path)
             if content in seen:
-                raise BadLog(name, "duplicate", _copy_of(seen[content], overrides))
+                task = seen[content]
+                raise copy_error(name, overrides, task.name, task.overrides)
         except BadLog as error:
             refused.append(Refusal(name, error.reason, error.detail))
             continue
         seen[content] = _Task(path, name, overrides, digest, columns)
     return [*seen.values()], refused
-
-
-def _copy_of(task: _Task, overrides: Mapping[str, str]) -> str:
-    """Describe a copy of a log, and what its row of the manifest states otherwise."""
-    other = {
-        key: f"{key} {visible(value)} (there {visible(task.overrides[key])})"
-        for key, value in overrides.items()
-        if task.overrides.get(key, value) != value
-    }
-    if not other:
-        return f"same content as {task.name}, which is analysed for both"
-    found = f"same content as {task.name}, but manifest.csv states {listed(other.values())}"
-    return f"{found}; only {task.name} is analysed: correct the row, or delete one of the files"
 
 
 def _file_key(path: Path, folder: Path) -> tuple[str, bool]:

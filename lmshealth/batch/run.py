@@ -7,11 +7,10 @@ import os
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, closing
 from dataclasses import dataclass, field, replace
 from datetime import UTC, date, datetime
-from difflib import get_close_matches
 from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
@@ -46,9 +45,13 @@ from lmshealth.machine.summary import Summary, summarise
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, expect_stages
 from lmshealth.tracking.contradictions import LEFT_OUT, sort_by_time
-from lmshealth.tracking.maintenance import Maintenance, read_maintenance, without_logs
+from lmshealth.tracking.maintenance import (
+    baseline_notices,
+    read_maintenance,
+    without_logs,
+)
 
 # Output of one machine
 
@@ -92,7 +95,8 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     logs = unpack_logs(record.logs or ())
     if found is None or (record.logs is not None and not logs):
         return None
-    found = replace(found, lost=record.lost)
+    instead = baseline_notices(record.lost, found.history.logs[found.history.baseline])
+    found = replace(found, lost=record.lost, notices=(*found.notices, *instead))
     summary = summarise(found, found.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
@@ -203,6 +207,8 @@ def run(
 
     Raises
     ------
+    BadStage
+        If the stages are no results of `load_stage`.
     NothingUsable
         If there is no log, or every log was refused; ``refused.csv`` is written nevertheless.
 
@@ -233,6 +239,7 @@ def run(
         raise LmshealthError(
             f"{out}: contains the logs, and no file of the output is a log; {step}"
         )
+    expect_stages(stages)
     _prepare(out)
     work = read_maintenance(folder, follow_links=settings.follow_links, latest=settings.latest)
     with settings.pool() as pool, closing(Store(settings.store or default_url(out))) as store:
@@ -262,7 +269,7 @@ def run(
                 write_index(out, rows, refused, today=judging.today)
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
-        notes += (*store.notes, *_of_no_machine(work, ingested.machines))
+        notes += (*store.notes, *without_logs(work.actions, ingested.machines))
     counts, lost = _count(ingested, refused, made)
     if not machines:
         raise NothingUsable(
@@ -281,14 +288,6 @@ def run(
         notes=(*misspelt, *notes),
         **counts,
     )
-
-
-def _of_no_machine(work: Maintenance, machines: Collection[str]) -> Iterator[str]:
-    """Yield a note on the work of each machine that has no log: its name may be misspelt."""
-    for name in without_logs(work.actions, machines):
-        near = get_close_matches(name, machines, 1)
-        hint = f"; is it {near[0]}?" if near else ""
-        yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
 def _count(
@@ -331,7 +330,7 @@ def report(
     refused = store.refused(one.refused for one in present)
     record = _records(store, refused, settings.language)
     # A process takes longer to start than a page to write.
-    few = replace(settings, workers=min(settings.workers, len(present)))
+    few = replace(settings, workers=max(1, min(settings.workers, len(present))))
     with few.pool() as pool:
         records = (record(one.machine, one.key, files[one.machine]) for one in present)
         made: Iterator[tuple[MachineRecord, list[MachineOutput | str | None]]]

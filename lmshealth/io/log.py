@@ -114,6 +114,8 @@ class Refusal:
     frequency: float | None = field(default=None, compare=False, kw_only=True)
     # Of a log as a whole in an archive, as far as it is known.
     machine: str = field(default="", compare=False, kw_only=True)
+    # Whether the log was declared as baseline.
+    baseline: bool = field(default=False, compare=False, kw_only=True)
 
 
 # Reasons of warnings among the refusals of a log, which name a channel: it is used nevertheless.

@@ -10,7 +10,7 @@ import os
 import re
 import stat
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from difflib import get_close_matches
@@ -23,8 +23,16 @@ from lmshealth._private.files import escapes, read_table
 from lmshealth.errors import BadLog, BadTable
 from lmshealth.io import constants
 from lmshealth.io.formats.registry import format_of, holds_samples, is_log
-from lmshealth.io.log import Refusal, low_high, metadata_keys, parse_moment, possible
-from lmshealth.io.refusal import Unusable, listed, repeated, shown
+from lmshealth.io.log import (
+    BOOLEANS,
+    Refusal,
+    low_high,
+    metadata_keys,
+    parse_metadata,
+    parse_moment,
+    possible,
+)
+from lmshealth.io.refusal import Unusable, listed, repeated, shown, visible
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -194,6 +202,10 @@ class Manifest:
         """Return whether this log has a row."""
         return _absolute(log) in self.rows
 
+    def is_baseline(self, log: Path) -> bool:
+        """Return whether the row of this log declares it as baseline."""
+        return _declares_baseline(self.rows.get(_absolute(log), {}))
+
     def omits(self, log: Path) -> bool:
         """Return whether this log has no row in a manifest that lists the logs of its folder."""
         path = _absolute(log)
@@ -208,6 +220,35 @@ class Manifest:
         if path in self.bad:
             raise BadLog(shown(log), "bad-row", self.bad[path])
         return dict(self.rows.get(path, {}))
+
+
+def copy_error(
+    name: str, stated: Mapping[str, str], other: str, there: Mapping[str, str]
+) -> BadLog:
+    """Return the refusal of a copy of a log; both have metadata by their rows of the manifest.
+
+    It is ``bad-row`` where these contradict each other, which is no harmless copy, else
+    ``duplicate``.
+    """
+    contradicting = [
+        f"{key} {visible(value[:80])} (there {visible(there[key][:80])})"
+        for key, value in stated.items()
+        if key in there and _parsed(key, value) != _parsed(key, there[key])
+    ]
+    same = f"same content as {other}"
+    if not contradicting:
+        return BadLog(name, "duplicate", f"{same}, which is analysed for both")
+    found = f"{same}, but manifest.csv states {', '.join(contradicting)}"
+    next_step = "correct the row, or delete one of the files"
+    return BadLog(name, "bad-row", f"{found}; only {other} is analysed: {next_step}")
+
+
+def _parsed(key: str, value: str) -> object:
+    """Return what a cell states: one moment or number may be written in several ways."""
+    try:
+        return parse_metadata({key: value})
+    except Unusable:
+        return value
 
 
 def find_logs(
@@ -357,7 +398,8 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         if trouble:
             manifest.bad[log] = f"{place}: {trouble}"
         if not os.path.isfile(log):
-            yield Refusal(name_of(log, _absolute(root)), "missing-file", f"{place} names no file")
+            name, detail = name_of(log, _absolute(root)), f"{place} names no file"
+            yield Refusal(name, "missing-file", detail, baseline=_declares_baseline(row))
     if any(row.keys() >= {"stage", "recorded_at"} for row in own.values()):
         manifest.registers.add(_absolute(path.parent))
     for name, key in _misspelt(names):
@@ -365,6 +407,10 @@ def _add(manifest: Manifest, path: Path, root: Path, *, follow_links: bool) -> I
         yield Refusal(name_of(path, root), MISSPELT, detail)
     for log, row in own.items():
         manifest.rows[log] = manifest.rows.get(log, {}) | row
+
+
+def _declares_baseline(row: Mapping[str, str]) -> bool:
+    return BOOLEANS.get(row.get("baseline", "").lower(), False)
 
 
 def _misspelt(names: set[str]) -> Iterator[tuple[str, str]]:

@@ -122,7 +122,7 @@ def judge(
         alarms = [*_alarm_sentences(track, history.baseline)]
         word, why = "not-enough-data", " ".join((*alarms, reason))
         enough = len(history.logs) - history.baseline >= stage.description.baseline.logs
-        if track is not None and not stage.parameters and (alarms or enough):
+        if track is not None and not stage.parameters and (alarms or (enough and not doubt)):
             word = "alarm" if alarms else "no-alarm"
         return Verdict(history.stage, history.recorded_at[-1], word, float("nan"), why)
     return _judge_posterior(stage, history, health)
@@ -130,16 +130,16 @@ def judge(
 
 def _reason_for_no_verdict(stage: Stage, history: History, health: Health | None) -> str:
     n_logs, needed = len(history.logs) - history.baseline, stage.description.baseline.logs
-    if not stage.parameters:
-        return fact(
-            "The stage description has no [[parameter]]: the modes are tracked, and no health "
-            "parameter is inferred."
-        )
     values = {"n": n_logs, "needed": needed}
     if 1 == n_logs < needed:
         return fact("1 usable log since the baseline began; it needs {needed}.", **values)
     if n_logs < needed:
         return fact("{n} usable logs since the baseline began; it needs {needed}.", **values)
+    if not stage.parameters:
+        return fact(
+            "The stage description has no [[parameter]]: the modes are tracked, and no health "
+            "parameter is inferred."
+        )
     if health is None:
         return fact("The logs do not contain enough information for the health parameters.")
     if not health.explained:
@@ -219,18 +219,20 @@ def doubt_of_names(
 def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
     """Return that no mode of the map is where it is searched for any more; empty if one is.
 
-    A mode that has left its search is not found, so that the logs before would give the health.
+    Without a map all tracked modes count. A mode that has left its search, or whose sensor is dead,
+    is not found, so that the logs before would give the state.
     """
-    columns = [k for name in stage.informative for k in history.columns(name)]
+    columns = [k for name in stage.informative or history.modes for k in history.columns(name)]
     found = np.isfinite(accepted_estimates(history, track).ln_frequency[history.baseline :])
-    least, missed = stage.description.baseline.logs, int(found[::-1, columns].any(axis=1).argmax())
-    if not columns or missed < least:
+    last = int(np.flatnonzero(found[:, columns].any(axis=1)).max(initial=-1))
+    missed = len(found) - 1 - last
+    if not columns or missed < stage.description.baseline.logs:
         return ""
     names = ", ".join(dict.fromkeys(history.series[k].mode for k in columns))
     return fact(
-        "None of the modes of the map ({names}) was found in the last {missed} logs, or none "
-        "agreed with the logs before, so that no health is published: look into their spectra for "
-        "where the modes are now; search there, or excite more.",
+        "None of the modes {names} was found in the last {missed} logs, or none agreed with the "
+        "logs before, so that the present state is unknown: check the sensors, and look into the "
+        "spectra for where the modes are now; search there, or excite more.",
         names=names,
         missed=missed,
     )

@@ -34,7 +34,7 @@ from lmshealth.machine.constants import DRIFT_SIGMA
 from lmshealth.machine.service import Service, decide
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.spectra_summary import Waterfall
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, expect_stage
 from lmshealth.tracking.covariates import covariate_notices
 from lmshealth.tracking.history import (
     History,
@@ -43,7 +43,12 @@ from lmshealth.tracking.history import (
     doubt_of_clock,
     missing_mode_notices,
 )
-from lmshealth.tracking.maintenance import NO_MAINTENANCE, Maintenance, maintenance_notices
+from lmshealth.tracking.maintenance import (
+    NO_MAINTENANCE,
+    Maintenance,
+    baseline_notices,
+    maintenance_notices,
+)
 from lmshealth.tracking.track import Track, accepted_estimates, outlier_refusals, track
 
 _NAMELESS = ("ambiguous", "unconfirmed")  # reasons of estimates whose name is not certain
@@ -215,6 +220,8 @@ def assess(
 
     Raises
     ------
+    BadStage
+        If the stage is no result of `load_stage`.
     NotEnoughData
         If the logs are of several machines.
 
@@ -231,6 +238,7 @@ def assess(
     >>> found.notices[0].what.split("; ")[1]
     'a life needs at least 3 logs and some travel'
     """
+    expect_stage(stage)
     machines = sorted({one.metadata.stage or "" for one in logs})
     if len(machines) > 1:
         named = ", ".join(machines)
@@ -292,6 +300,7 @@ def _before_tracking(
     notices = maintenance_notices(work, [reading.metadata.recorded_at for reading in readings])
     notices += missing_mode_notices(history, refused)
     notices += contradiction_notices(history, refused)
+    notices += baseline_notices(refused, history.logs[history.baseline])
     notices += covariate_notices(history.covariates, stage)
     not_excited = [refusal for reading in readings for refusal in reading.modes.refused]
     by_log = {reading.log: reading for reading in readings}

@@ -214,6 +214,8 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     # Modes whose alarm, and conditions whose begin was a change since the baseline;
     # ``silent`` since the last log.
     announced: tuple[str, ...] = ()
+    # Whether the work that its next step would be about was entered after the last log.
+    worked: bool = False
     works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed
     infers_health: bool  # whether the description has a parameter
@@ -235,24 +237,29 @@ class Fleet(msgspec.Struct, frozen=True):
 def conditions(status: Status, today: date) -> dict[str, DeviceHealth]:
     """Return what keeps a machine from the state ``NORMAL``, by code; the first is its state.
 
-    Evidence of damage comes before missing logs, which must not hide it.
+    Evidence of damage comes before missing logs, which must not hide it; of what work was entered
+    for since then, the next log is the evidence.
     """
     verdict, by = _at_last_log(status), status.service_by
     late = status.inspect_by is not None and status.inspect_by < today
     judged = verdict not in NO_HEALTH
     serious = {code for code, severity in status.warnings.items() if severity == "serious"}
+    # Without parameters too few logs are no fault; what makes later ones useless too is one.
+    unusable = verdict == "not-enough-data" and bool(serious - {"large-drift"})
+    no_verdict = not judged and (status.infers_health or unusable)
     reached = (status.probability_limit_reached or 0.0) >= constants.FAILURE_PROBABILITY
     soon = today + timedelta(days=constants.SERVICE_LEAD_DAYS)
+    is_due = judged and by is not None and by <= soon
     found: list[tuple[DeviceHealth, str, object]] = [
-        ("FAILURE", "limit-reached", reached),
+        ("FAILURE", "limit-reached", reached and not status.worked),
         ("OFF_SPEC", "alarm", status.alarms and not judged),
         ("OFF_SPEC", "step", verdict == "step"),
         ("OFF_SPEC", OUTSIDE_MAP, verdict == OUTSIDE_MAP),
         ("OFF_SPEC", "large-drift", "large-drift" in serious),
         ("OFF_SPEC", "unreliable", serious and (judged or "unexplained-drifts" in serious)),
-        ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict)),
-        ("MAINTENANCE_REQUIRED", "service-due", judged and by is not None and by <= soon),
-        ("CHECK_FUNCTION", "no-verdict", status.infers_health and not judged),
+        ("MAINTENANCE_REQUIRED", "loss", degraded_words(verdict) and not status.worked),
+        ("MAINTENANCE_REQUIRED", "service-due", is_due and not status.worked),
+        ("CHECK_FUNCTION", "no-verdict", no_verdict),
         ("CHECK_FUNCTION", "unconfirmed-jump", _UNCONFIRMED & status.warnings.keys()),
         ("CHECK_FUNCTION", "no-log-since-maintenance", "no-log-since" in status.warnings),
         ("CHECK_FUNCTION", "inspection-overdue", late and status.service != "now"),
@@ -321,6 +328,7 @@ def make_status(assessment: Assessment, summary: Summary) -> Status:
         probability=finite_or_none(summary.probability),
         why=summary.why,
         alarms={one.mode: track.recorded_at[one.epoch] for one in alarms} if track else {},
+        worked=summary.step.kind == "see-effect",
         works=len(assessment.history.steps)
         + sum(one.code == "no-log-since" for one in assessment.notices),
         warnings={one.code: one.severity for one in reversed(notices(assessment))},

@@ -19,19 +19,22 @@ from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import Service, day_after, days_to, remaining_days, risk_before
 from lmshealth.stage.description import ParameterSpec, Stage
+from lmshealth.tracking.maintenance import RESETS, RESTORING
 
 Step = Literal[
-    "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
+    "see-effect", "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
     "service-now", "overdue", "confirm", "schedule", "plan", "later",
 ]  # fmt: skip
 """What to do; the sentence of each is in `[steps]` of ``_private/tables.toml``."""
 
-# First case that applies to verdict, kind of service, age and day. A verdict is ``alarm`` (or a
-# step), ``outside`` (or a step of modes that moved alone), ``drift`` (large, or a last log that is
-# left out, without a loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open``
-# (none), ``healthy`` or ``loss``. A day is ``overdue`` after that of the service, else ``late``
-# where a log is. "" is any.
+# First case that applies to verdict, kind of service, age and day. A verdict is ``worked`` (the
+# work that the step would order was entered after the last log), ``alarm`` (or a step), ``outside``
+# (or a step of modes that moved alone), ``drift`` (large, or a last log that is left out, without a
+# loss), ``repair`` (perhaps: a loss, and a last log that is left out), ``open`` (none), ``healthy``
+# or ``loss``. A day is ``overdue`` after that of the service, else ``late`` where a log is. "" is
+# any.
 CASES: tuple[tuple[Step, str, str, str, str], ...] = (
+    ("see-effect", "worked", "", "", ""),
     ("inspect", "alarm", "", "", ""),
     ("find-cause", "outside", "", "", ""),
     ("check-drift", "drift", "", "", ""),
@@ -79,13 +82,14 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     kind = "unknown" if prognosis is None else service.kind
     n_logs = len(assessment.history.logs) - assessment.history.baseline
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
-    case = _class_of(assessment), kind, age
+    first, words = first_limit(prognosis), {x.name: x.word for x in assessment.stage.parameters}
+    name = first[0] if first else "" if prognosis is None else prognosis.parameters[0]
+    works = set(RESTORING.get(words.get(name, ""), RESETS))
+    is_worked = any(x.code == "no-log-since" and x.where in works for x in assessment.notices)
+    case = "worked" if is_worked else _class_of(assessment), kind, age
     step = step_of(*case)
     if prognosis is None:
         return NextStep(step, case=case)
-    first = first_limit(prognosis)
-    name = first[0] if first else prognosis.parameters[0]
-    words = {spec.name: spec.word for spec in assessment.stage.parameters}
     every = days_to(prognosis, service.inspect_every)
     return NextStep(
         kind=step,

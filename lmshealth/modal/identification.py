@@ -65,7 +65,7 @@ from lmshealth.signal.spectra import (
 )
 from lmshealth.signal.spectral_lines import Line, find_lines, name_lines
 from lmshealth.stage.constants import BAND_HALF_WIDTH, LEAST_RESOLUTION
-from lmshealth.stage.description import Stage
+from lmshealth.stage.description import Stage, expect_stage
 
 # Spectra reach up to this multiple of the band: further than flanks do.
 _CEILING = 4.0
@@ -139,7 +139,7 @@ def identify(
     BadLog
         If no channel is left, or the record is too short or its sample rate too low.
     BadStage
-        If the stage has no mode in the band.
+        If the stage has no mode in the band, or is no result of `load_stage`.
 
     Examples
     --------
@@ -161,6 +161,8 @@ def identify(
     ...     print(f"{f:.1f} ± {f_std:.1f} Hz, {zeta:.1%} ± {zeta_std:.1%}")
     126.3 ± 0.2 Hz, 1.6% ± 0.1%
     """
+    if stage is not None:
+        expect_stage(stage)
     return read_modes(log, stage, channels=channels, band=band).modes
 
 

@@ -351,6 +351,8 @@ def headline(summary: Summary) -> str:
 def service_on_day(summary: Summary) -> str:
     """Return when to service a machine, as of the day of its summary, in a few words."""
     by = summary.service.by
+    if summary.step.kind == "see-effect":
+        return tr("unknown without a log")
     if summary.service.kind == "by" and by and summary.today and by < summary.today:
         words = tr("overdue since {day}", day=day(by))
     else:
@@ -431,7 +433,10 @@ def changes(before: Summary, now: Summary) -> Iterator[str]:
     if more:
         logs = tr("{logs} more", logs=logs) if more > 0 else tr("{logs} fewer", logs=logs)
     elif before.recorded_at == now.recorded_at and before.service.by != now.service.by:
-        logs = tr("No further log: this follows from the fleet, or from work that was entered")
+        logs = tr(
+            "No further log: this follows from the fleet, from maintenance that was entered, or "
+            "from another description, settings or version"
+        )
     else:
         logs = tr("Same number of logs")
     yield logs + (tr(", {distance} further.", distance=km(travel)) if travel > 0 else ".")

@@ -2,7 +2,7 @@
 
 import hashlib
 import os
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import date
 from difflib import get_close_matches
@@ -408,6 +408,26 @@ class Stage:
 def shipped() -> tuple[str, ...]:
     """List the names of the shipped descriptions."""
     return tuple(sorted(path.stem for path in _SHIPPED.glob("*.toml")))
+
+
+def expect_stages(given: object) -> None:
+    """Require a sequence of stage descriptions, or raise `BadStage`: a name is none."""
+    if not isinstance(given, Sequence) or isinstance(given, str):
+        raise BadStage(f"stages is {_what(given)}; needed a list of results of load_stage")
+    for one in given:
+        expect_stage(one)
+
+
+def expect_stage(given: object) -> None:
+    """Require a stage description, or raise `BadStage`."""
+    if not isinstance(given, Stage):
+        named = isinstance(given, str | Path)
+        needed = f"load_stage({str(given)!r})" if named else "a result of load_stage"
+        raise BadStage(f"stage is {_what(given)}; needed {needed}")
+
+
+def _what(given: object) -> str:
+    return f"{given!r:.80} of type {type(given).__name__}"
 
 
 def load_stage(reference: str | Path, *, follow_links: bool = False) -> Stage:

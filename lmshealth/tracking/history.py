@@ -249,6 +249,8 @@ def build_history(
         name = "" if stage is None else f"{stage.name}: "
         raise NotEnoughData(f"{name}no usable log")
     ordered, refused, in_a_row = without_contradictions(readings)
+    declared = {reading.log for reading in readings if reading.metadata.baseline}
+    refused = [replace(one, baseline=one.log in declared) for one in refused]
     # Missing values are None here and NaN in arrays.
     travel = np.array([r.metadata.travel for r in ordered], dtype=float)
     moments = tuple(r.metadata.recorded_at or NO_MOMENT for r in ordered)

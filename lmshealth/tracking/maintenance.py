@@ -1,8 +1,9 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
+from difflib import get_close_matches
 from pathlib import Path
 from typing import Self
 
@@ -17,6 +18,8 @@ _FILE = "maintenance.csv"
 _NEEDED = ("stage", "recorded_at", "action")
 # Work on guide or mount opens a new baseline.
 RESETS = ("preload-adjust", "guide-replaced", "mount-tightened")
+# Those that restore a parameter, by its word in verdicts; of any other all may.
+RESTORING = {"preload": ("preload-adjust", "guide-replaced"), "mount": ("mount-tightened",)}
 # Steps without wear: of dampings, of the closed loop, of one source.
 STEPS = ("regrease", "servo", "sensor")
 
@@ -60,9 +63,12 @@ NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""
 
 
-def without_logs(actions: Iterable[Action], machines: Container[str]) -> list[str]:
-    """Return the machines of actions that are none of these, each once."""
-    return list(dict.fromkeys(one.stage for one in actions if one.stage not in machines))
+def without_logs(actions: Iterable[Action], machines: Collection[str]) -> Iterator[str]:
+    """Yield a sentence on each machine of actions that is none of these: it may be misspelt."""
+    for name in dict.fromkeys(one.stage for one in actions if one.stage not in machines):
+        near = get_close_matches(name, machines, 1)
+        hint = f"; is it {near[0]}?" if near else ""
+        yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
 
 
 def read_maintenance(
@@ -126,6 +132,31 @@ def _machine(row: Row) -> str:
         return ""
 
 
+def baseline_notices(refused: Iterable[Refusal], used: str) -> list[Notice]:
+    """Return notices of refused logs that were declared as baseline.
+
+    `used` is the log with which the baseline begins instead.
+    """
+    return [
+        Notice(
+            "baseline-refused",
+            "caution",
+            one.log,
+            fact(
+                "{log} is declared as baseline (baseline = true), and was refused ({reason}: "
+                "{detail}): the present baseline begins with {used} instead.",
+                log=one.log,
+                reason=one.reason,
+                detail=one.detail,
+                used=used,
+            ),
+            fact("Correct that log or its row, or declare another one in manifest.csv."),
+        )
+        for one in refused
+        if one.baseline
+    ]
+
+
 def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -> list[Notice]:
     """Return notices for a report: rows that cannot be read, and new baselines.
 
@@ -153,7 +184,8 @@ def maintenance_notices(work: Maintenance, moments: Sequence[datetime | None]) -
         done = {"work": action.action, "day": action.recorded_at.date().isoformat()}
         if before == len(moments):
             what = fact("{work} on {day}: no log since, so nothing is known after it.", **done)
-            notices.append(Notice("no-log-since", "caution", "", what, fact("Record a log.")))
+            to_do = fact("Record a log.")
+            notices.append(Notice("no-log-since", "caution", action.action, what, to_do))
         elif before:
             what = fact(
                 "{work} on {day} opened a new baseline: fractions are relative to the state after "

@@ -136,10 +136,7 @@ def read_machines(
     own: dict[str, list[LogEstimates]] = {}
     for one in logs:
         own.setdefault(str(one.metadata.stage), []).append(one)
-    notes += [
-        f"maintenance of {name} is not used: the table has {', '.join(own)}"
-        for name in without_logs(actions, own)
-    ]
+    notes += without_logs(actions, own)
     machines = [
         build_history(estimates, stage, [action for action in actions if action.stage == name])
         for name, estimates in own.items()

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lmshealth
-from lmshealth.errors import BadTable, NotEnoughData
+from lmshealth.errors import BadStage, BadTable, NotEnoughData
 from lmshealth.io.column_map import column_map
 
 EXPORT = {"columns": {"acc_pitch_m_s2": "a2"}}
@@ -50,6 +50,23 @@ def test_a_copy_of_a_log_is_refused(logs: Path, tmp_path: Path) -> None:
     assert [Path(log).name for log in found.history.logs] == ["0.csv", "1.csv"]
     (row,) = (one for one in found.refused if one.reason == "duplicate")
     assert (Path(row.log).name, row.detail[:15]) == ("copy.csv", "same content as")
+    (folder / "manifest.csv").write_text("file,travel_km\n0.csv,5\ncopy.csv,7\n")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    (row,) = (one for one in found.refused if one.reason == "bad-row")
+    assert "travel_km 7 (there 5)" in row.detail
+
+
+def test_a_refused_log_that_was_declared_as_baseline_is_named(logs: Path, tmp_path: Path) -> None:
+    """A log that cannot be read, and one that is not there: what is used instead is stated."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    (folder / "a.csv").write_text("no log\n")
+    rows = "a.csv,true\ngone.csv,TRUE\n0.csv,false\n"
+    (folder / "manifest.csv").write_text(f"file,baseline\n{rows}")
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    named = [one for one in found.notices if one.code == "baseline-refused"]
+    assert sorted(Path(one.where).name for one in named) == ["a.csv", "gone.csv"]
+    assert all("0.csv instead" in one.what for one in named)
 
 
 def test_a_map_is_a_mapping_or_a_file(logs: Path, tmp_path: Path) -> None:
@@ -70,3 +87,35 @@ def test_without_a_usable_log_the_reason_is_named(logs: Path) -> None:
     """Each log that was refused is in the error, by the name that was given."""
     with pytest.raises(NotEnoughData, match=r"0\.csv: "):
         lmshealth.analyse([logs / "0.csv"], lmshealth.load_stage("lms-y"))
+
+
+def test_a_name_is_no_stage(logs: Path, tmp_path: Path) -> None:
+    """The error names what loads one; a run asks for several."""
+    name: Any = "lms-y"
+    stage = lmshealth.load_stage(name)
+    log = lmshealth.read_log(logs / "0.csv", columns=EXPORT)
+    for call in (
+        lambda: lmshealth.analyse(logs, name),
+        lambda: lmshealth.assess([], name),
+        lambda: lmshealth.identify(log, name),
+        lambda: lmshealth.run(logs, [name], tmp_path / "out"),
+    ):
+        with pytest.raises(BadStage, match=r"'lms-y' of type str; needed load_stage\('lms-y'\)"):
+            call()
+    lone: Any = stage
+    for one in (name, lone):
+        with pytest.raises(BadStage, match="needed a list of results of load_stage"):
+            lmshealth.run(logs, one, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_work_on_a_machine_without_logs_is_noticed(logs: Path, tmp_path: Path) -> None:
+    """Its name may be misspelt: the command notes it, too."""
+    folder = tmp_path / "logs"
+    shutil.copytree(logs, folder)
+    (folder / "maintenance.csv").write_text(
+        "stage,recorded_at,action\nAX-3Y,2026-07-10T12:00:00Z,regrease\n"
+    )
+    found = lmshealth.analyse(folder, lmshealth.load_stage("lms-y"), columns=EXPORT)
+    (notice,) = (one for one in found.notices if one.code == "maintenance-unused")
+    assert "work on AX-3Y is not used" in notice.what and "is it AX-3-Y?" in notice.what

@@ -2,20 +2,24 @@
 
 from collections.abc import Iterable, Iterator
 from contextlib import closing
+from datetime import datetime
 from hashlib import sha256
 from pathlib import Path
 from threading import Thread
 from time import process_time
+from typing import Any
 
 import numpy as np
 import pytest
 
 from lmshealth.batch import constants
-from lmshealth.batch.ingest import _copy_of, _identified, _Outcome, _Task, _within, identify_log
+from lmshealth.batch.alerts import Alerts
+from lmshealth.batch.ingest import Settings, _identified, _Outcome, _Task, _within, identify_log
 from lmshealth.batch.store import Resources, Store
 from lmshealth.batch.workers import Item, OnCrash, Pool, Result, Task
-from lmshealth.errors import BadLog
+from lmshealth.errors import BadLog, LmshealthError
 from lmshealth.io.log import Refusal
+from lmshealth.io.manifest import copy_error
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.stage.description import load_stage
 from tests.signals import Mode, accelerations
@@ -109,9 +113,36 @@ def test_the_time_of_a_log_is_its_own() -> None:
 
 
 def test_a_copy_that_its_row_contradicts_names_the_contradiction() -> None:
-    """The same samples are of one machine; without a contradiction they count for both names."""
-    task = _Task(Path("a.csv"), "a.csv", {"stage": "A", "travel_km": "1"}, "0" * 64, None)
-    assert "analysed for both" in _copy_of(task, {"stage": "A"})
-    text = _copy_of(task, {"stage": "B", "travel_km": "1"})
-    assert "stage B (there A); only a.csv is analysed" in text
-    assert "travel_km" not in text
+    """Samples are of one machine and moment: another one is a bad row, in full; a copy is none."""
+    moment = "2026-09-01T08:00:00+00:00"
+    there = {"stage": "A", "travel_km": "1", "recorded_at": "2026-04-04T22:25:26+00:00"}
+    for same in ({"stage": "A"}, {"travel_km": "1.0", "recorded_at": "2026-04-04T22:25:26Z"}):
+        error = copy_error("b.csv", same, "a.csv", there)
+        assert error.reason == "duplicate" and "analysed for both" in error.detail
+    error = copy_error("b.csv", {**there, "stage": "B", "recorded_at": moment}, "a.csv", there)
+    assert (error.log, error.reason) == ("b.csv", "bad-row")
+    assert f"recorded_at {moment} (there {there['recorded_at']}); only a.csv" in error.detail
+    assert "stage B (there A), " in error.detail and "travel_km" not in error.detail
+
+
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [
+        ({"workers": 0}, "workers is 0; needed a whole number of at least 1"),
+        ({"workers": "2"}, "workers is '2'; needed a whole number"),
+        ({"epochs": -3}, "epochs is -3"),
+        ({"epochs": 2.5}, "epochs is 2.5"),
+        ({"seed": -1}, "seed is -1; needed a whole number of at least 0"),
+        ({"max_memory": -1.0}, "max_memory is -1.0; needed a number above 0"),
+        ({"seconds_per_log": float("nan")}, "seconds_per_log is nan"),
+        ({"alerts": Alerts(silent_days=-7)}, "silent_days is -7"),
+        ({"latest": datetime(2026, 1, 1)}, "latest is .*; needed a moment with a time zone"),
+        ({"today": "2026-01-01"}, "today is '2026-01-01'; needed a day"),
+        ({"language": "fr"}, "language is 'fr'; needed one of"),
+        ({"columns": {"columns": {}}}, "columns is .*; needed a result of column_map"),
+    ],
+)
+def test_impossible_settings_are_refused(given: dict[str, Any], text: str) -> None:
+    """Each is named with its value, and what is needed."""
+    with pytest.raises(LmshealthError, match=f"^Settings: {text}"):
+        Settings(**given)

@@ -900,6 +900,11 @@ def test_bad_rows_of_tables_are_listed_and_stop_nothing(tmp_path: Path, modes_on
     assert (misspelt.n_logs, misspelt.n_refused, misspelt.n_unread) == (2, 0, 0)
     (note,) = misspelt.notes
     assert note.startswith("manifest.csv: column temperatur_c is not read, unlike temperature_c")
+    # Rows that contradict each other lose a log, though its content is analysed.
+    shutil.copy(logs / "log-01.h5", logs / "log-02.h5")
+    (logs / "manifest.csv").write_text("file,travel_km\nlog-01.h5,7\nlog-02.h5,8\n")
+    copied = run(logs, [modes_only], out)
+    assert (copied.n_logs, copied.n_refused) == (3, 1)
 
 
 @pytest.mark.slow
@@ -917,12 +922,17 @@ def test_a_page_counts_the_logs_of_its_machine_that_were_refused(
     (logs / "of-whom.h5").write_bytes(b"nothing")
     with h5py.File(logs / "log-02.h5", "r+") as file:
         file.attrs["recorded_at"] = "2999-01-01T00:00:00Z"
-    listed = "".join(f"{name}.h5,test-A\n" for name in ("log-01", "log-02", "gone"))
-    (logs / "manifest.csv").write_text("file,stage\n" + listed)
+    rows_of = (("log-01", "true"), ("log-02", ""), ("gone", ""))
+    listed = "".join(f"{name}.h5,test-A,{flag}\n" for name, flag in rows_of)
+    (logs / "manifest.csv").write_text("file,stage,baseline\n" + listed)
     run(logs, [modes_only], out)
     (notice,) = (row for row in rows(out / "warnings.csv") if row["code"] == "logs-refused")
     assert notice["what"].startswith("Of 5 logs of this machine, refused as a whole: 3 (")
     assert notice["severity"] == "caution"
+    (instead,) = (row for row in rows(out / "warnings.csv") if row["code"] == "baseline-refused")
+    assert instead["where"] == "log-01.h5"
+    assert "begins with log-00.h5 instead" in instead["what"]
+    assert "begins with log-00.h5 instead" in (out / "test-A.html").read_text()
     assert "3 parts refused" in (out / "test-A.html").read_text()
     refused = sorted(row["log"] for row in rows(out / "refused.csv"))
     assert refused == ["gone.h5", "log-01.h5", "log-02.h5", "of-whom.h5"]

@@ -135,7 +135,7 @@ def test_maintenance_of_other_machines_is_noted(estimates: Path, tmp_path: Path)
     actions.write_text("stage,recorded_at,action\nAX-9,2026-03-02T00:00:00Z,servo\n")
     result = run(estimates, "--out", tmp_path / "track.csv", "--maintenance", actions)
     assert result.exit_code == 0, result.output
-    assert "maintenance of AX-9 is not used" in result.stderr
+    assert "work on AX-9 is not used" in result.stderr
 
 
 def test_too_few_logs_for_track_initiation_are_noted(estimates: Path, tmp_path: Path) -> None:

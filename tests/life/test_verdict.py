@@ -238,16 +238,16 @@ def test_without_health_there_is_no_verdict(stage: Stage) -> None:
 
 
 def test_without_parameters_the_description_is_the_reason(tmp_path: Path) -> None:
-    """Where the description asks for no part, it is not the logs that lack something."""
+    """Where the description asks for no part, enough logs lack nothing; too few are the reason."""
     path = tmp_path / "modes.toml"
     path.write_text(
         'name = "m"\n[match]\nstage = "M"\n'
         '[[mode]]\nname = "roll"\nfrequency_hz = 120.0\ndamping_ratio = 0.01\n'
     )
-    for n in (1, 8):
+    for n, why in ((1, "1 usable log since"), (3, "3 usable logs since"), (8, "no [[parameter]]")):
         found = judge(load_stage(str(path)), logs(n), None)
         assert found.verdict == "not-enough-data"
-        assert "no [[parameter]]" in found.why
+        assert why in found.why
 
 
 @pytest.mark.parametrize(("n_logs", "alarm", "word"), [
@@ -338,3 +338,23 @@ def test_modes_that_have_left_their_searches_withhold_health(stage: Stage) -> No
     assert doubt_of_names(stage, stray, track) == ""
     outliers = replace(track, outliers=tuple((9, mode) for mode in track.modes))
     assert doubt_of_names(stage, stray, outliers)
+
+
+def test_dead_sensors_are_no_missing_alarm(tmp_path: Path) -> None:
+    """Without a map all tracked modes count: none found in as many logs as a baseline has."""
+    stage, n = make_stage(tmp_path, ()), 12
+    assert not stage.informative
+    track, history = make_track(np.zeros((n, 2)), np.tile(1e-8 * np.eye(2), (n, 1, 1))), logs(n)
+    serviced = replace(history, baselines=(0, 7))  # and none is found since
+    for own, last, word in (
+        (history, 8, "no-alarm"),
+        (history, 7, "not-enough-data"),
+        (serviced, 7, "not-enough-data"),
+    ):
+        there = np.arange(n)[:, None] < last
+        seen = replace(own, ln_frequency=np.where(there, own.ln_frequency, np.nan))
+        doubt = doubt_of_names(stage, seen, track)
+        found = judge(stage, seen, None, track, doubt=doubt)
+        assert found.verdict == word
+        names = ", ".join(history.modes)
+        assert (f"None of the modes {names} was found in the last 5" in found.why) == bool(doubt)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import date
+from datetime import date, timedelta
 from itertools import product
 from typing import get_args
 
@@ -13,10 +13,11 @@ import pytest
 
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine import constants
-from lmshealth.machine.status import make_status, on_day
+from lmshealth.machine.status import judge_on, make_status, on_day
 from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
 from lmshealth.report import text
 from lmshealth.tracking.filters.track_state import Event
+from lmshealth.tracking.maintenance import Action, Maintenance, maintenance_notices
 from tests.assessments import Maker, make
 
 __all__ = ["make"]
@@ -27,6 +28,7 @@ EVENT = Event("step", 12, "yaw", "", 0.02, 0.001, 9.0, declared=False, found_at=
 @pytest.mark.parametrize(
     ("verdict", "service", "age", "day", "expected"),
     [
+        ("worked", "by", "old", "overdue", "see-effect"),
         ("drift", "unknown", "young", "", "check-drift"),
         ("drift", "unknown", "young", "late", "check-drift"),
         ("healthy", "unknown", "old", "late", "log-now"),
@@ -68,7 +70,7 @@ def test_the_step_follows_from_verdict_service_and_age(
 
 def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
     """No combination is without a case, and no step without words."""
-    verdicts = ("alarm", "outside", "drift", "repair", "open", "healthy", "loss")
+    verdicts = ("worked", "alarm", "outside", "drift", "repair", "open", "healthy", "loss")
     services, ages, days = (
         ("now", "by", "later", "unknown"),
         ("young", "old"),
@@ -113,6 +115,41 @@ def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
         track, health = replace(track, events=events), replace(health, lone_modes=known)
         one = replace(made, track=track, health=health)
         assert next_step(one, one.service()).kind == step
+
+
+@pytest.mark.parametrize(
+    ("action", "limit", "is_worked"),
+    [
+        ("preload-adjust", 0, True),
+        ("guide-replaced", 0, True),
+        ("mount-tightened", 0, False),
+        ("mount-tightened", 1, True),
+        ("regrease", 0, False),
+    ],
+)
+def test_work_that_was_entered_is_not_ordered_again(
+    make: Maker, action: str, limit: int, is_worked: bool
+) -> None:
+    """The effect of work after the last log is seen in the next; other work is still ordered."""
+    made = make()
+    assert made.prognosis is not None
+    remaining = np.array(made.prognosis.remaining)
+    remaining[:, 1 - limit] = np.inf
+    remaining[:, 2] = remaining[:, limit]
+    moments = made.history.recorded_at
+    work = Maintenance((Action("M7-Y", moments[-1] + timedelta(days=1), action),))
+    notices = (*made.notices, *maintenance_notices(work, moments))
+    prognosis = replace(made.prognosis, remaining=remaining)
+    found = replace(made, prognosis=prognosis, notices=notices)
+    summary = summarise(found, found.service())
+    status, later = make_status(found, summary), moments[-1].date() + timedelta(days=900)
+    summary = on_day(summary, status, later)
+    codes = judge_on(status, later, None).conditions
+    assert (summary.step.kind == "see-effect") == is_worked
+    assert ("record logs now, to see its effect" in text.next_step(summary.step)) == is_worked
+    assert (text.service_on_day(summary) == "unknown without a log") == is_worked
+    assert {"loss", "service-due"}.isdisjoint(codes) == is_worked
+    assert ("no-log-since-maintenance" in codes) == (action != "regrease")
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:

@@ -278,3 +278,16 @@ def test_a_flag_of_the_last_log_is_noticed_with_its_meaning(make: Maker) -> None
     assert notice.what == f"The last log has the flag unsteady at {names}: {FLAGS['unsteady']}"
     with in_language("de"):
         assert sentence(notice.what).endswith("was die Standardabweichungen enthalten.")
+
+
+def test_a_declared_baseline_that_is_left_out_is_named() -> None:
+    """It is not replaced in silence: a notice has declaration, reason and the log that is used."""
+    readings = [
+        make_reading(f"{k}.csv", k, 1e8 if k == 1 else 1e5 * k, {"roll": 4.8}, baseline=k == 1)
+        for k in range(4)
+    ]
+    found = assess(readings, load_stage("lms-y"), epochs=1)
+    (notice,) = (one for one in found.notices if one.code == "baseline-refused")
+    assert (notice.where, found.history.baseline) == ("1.csv", 0)
+    assert "baseline = true" in notice.what and "travel_km 100000 contradicts" in notice.what
+    assert "begins with 0.csv instead" in notice.what and "manifest.csv" in notice.to_do

@@ -70,6 +70,11 @@ def status(**given: Any) -> Status:
         ({"verdict": "step"}, "OFF_SPEC", "step"),
         (OPEN, "CHECK_FUNCTION", "no-verdict"),
         (OPEN | {"infers_health": False}, "NORMAL", ""),
+        (
+            OPEN | {"infers_health": False, "warnings": {"names-in-doubt": "serious"}},
+            "CHECK_FUNCTION",
+            "no-verdict",
+        ),
         (OPEN | {"alarms": ALARM}, "OFF_SPEC", "alarm no-verdict"),
         (OPEN | {"verdict": "alarm", "alarms": ALARM, "infers_health": False}, "OFF_SPEC", "alarm"),
         ({"alarms": ALARM}, "NORMAL", ""),

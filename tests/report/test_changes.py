@@ -107,6 +107,9 @@ def test_unchanged_values_are_marked_as_such() -> None:
     # The prior of the fleet moves a date without a log of the machine.
     of_fleet = sentences(THEN | {"service_by": date(2027, 9, 3)})
     assert of_fleet[-1].startswith("No further log: this follows from the fleet")
+    # So do a changed description and changed settings, which no summary has.
+    redone = sentences(THEN | {"service_by": date(2027, 9, 3), "description": "d2"})
+    assert "another description, settings or version" in redone[-1]
     coupling = THEN | {"verdict": "mount+coupling_stiffness"}
     loss = "Verdict: healthy (93 %) → loss of mount stiffness and coupling stiffness (93 %)."
     assert sentences(coupling)[0] == loss
