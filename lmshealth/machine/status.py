@@ -77,6 +77,10 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         names = _listed(mode for mode, own in left.items() if own == n)
         key = "last-logs-left-out, more" if n > 1 else "last-logs-left-out, one"
         yield _noticed(key, names, n=n, names=names)
+    first = assessment.history.baseline
+    if track is not None and (modes := [mode for k, mode in track.outliers if k == first]):
+        names, day = _listed(modes), track.recorded_at[first].date().isoformat()
+        yield _noticed("baseline-left-out", names, names=names, day=day)
     if track is not None and track.suspected is not None:
         day = track.recorded_at[track.suspected.first].date().isoformat()
         yield _noticed("step-suspected", day=day)

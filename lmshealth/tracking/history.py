@@ -195,6 +195,24 @@ class History(Result):
             steps=tuple(steps),
         )
 
+    def backwards(self, first: int, last: int) -> Self:
+        """Return the logs from the last back to the first, without steps."""
+        own = slice(first, last + 1)
+        ends = self.recorded_at[first], self.recorded_at[last]
+        return replace(
+            self,
+            logs=self.logs[own][::-1],
+            recorded_at=tuple(ends[0] + (ends[1] - at) for at in self.recorded_at[own][::-1]),
+            travel=self.travel[last] - self.travel[own][::-1],
+            covariates={name: values[own][::-1] for name, values in self.covariates.items()},
+            ln_frequency=self.ln_frequency[own][::-1],
+            ln_damping=self.ln_damping[own][::-1],
+            cov=self.cov[own][::-1],
+            loop_error=self.loop_error[own][::-1],
+            baselines=(0,),
+            steps=(),
+        )
+
     def mode_of(self) -> np.ndarray:
         """Return the index of the mode of each series, shape ``(n_series,)``."""
         return np.array([self.modes.index(one.mode) for one in self.series], dtype=int)

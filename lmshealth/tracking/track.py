@@ -430,14 +430,16 @@ def accepted_estimates(history: History, track: Track) -> History:
 
 def outlier_refusals(history: History, track: Track) -> list[Refusal]:
     """List the outliers of a track as refusals."""
-    refused = []
+    refused, works = [], {0, *(one.first for one in history.steps if one.kind == "reset")}
     for k, mode in track.outliers:
         i, own = track.modes.index(mode), history.columns(mode)
         found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
-        before = float(np.exp(track.ln_frequency[max(k - 1, 0), i]))
+        # The first log is judged by two or more after it.
+        side, near, which = ("after", k + 2, "second") if k in works else ("before", k - 1, "next")
+        other = float(np.exp(track.ln_frequency[near, i]))
         detail = (
-            f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
-            f"({before:.5g} Hz): a jump is accepted once the next log confirms it"
+            f"{found:.5g} Hz, or its damping, is far from the estimates of all logs {side} "
+            f"({other:.5g} Hz): a jump is accepted once the {which} log confirms it"
         )
         refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
     return refused

@@ -42,7 +42,7 @@ def test_a_machine_that_its_model_fits_has_no_notices(make: Maker) -> None:
 @pytest.mark.parametrize("code", [
     "names-in-doubt", "filter-inconsistent", "unexplained-drifts", "end-of-map",
     "limit-not-included", "laws-do-not-fit", "last-logs-left-out", "step-suspected",
-    "above-baseline",
+    "above-baseline", "baseline-left-out",
 ])  # fmt: skip
 def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     """What is wrong is noticed by its code, in words, and with the place."""
@@ -61,6 +61,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
         },
         "laws-do-not-fit": {"prognosis": replace(prognosis, chi_square=1e4)},
         "step-suspected": {"track": replace(track, suspected=Step.found("step", 4, 9))},
+        "baseline-left-out": {"track": replace(track, outliers=((good.history.baseline, "roll"),))},
         "last-logs-left-out": {"track": replace(track, outliers=((len(track.logs) - 1, "roll"),))},
     }
     bad = replace(good, **wrong[code])

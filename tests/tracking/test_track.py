@@ -20,7 +20,15 @@ from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filters import state_space
 from lmshealth.tracking.filters.track_state import Event, loop_evidence
 from lmshealth.tracking.history import History, StepKind
-from lmshealth.tracking.track import Consistency, Track, accepted_estimates, consistency, track
+from lmshealth.tracking.track import (
+    Consistency,
+    Track,
+    accepted_estimates,
+    consistency,
+    outlier_refusals,
+    smooth,
+    track,
+)
 from studies.robustness.off_model.run import of_world
 from tests.lives import (
     DAMPING,
@@ -451,6 +459,86 @@ def test_one_log_that_is_far_off_is_an_outlier(stage: Stage, rows: tuple[int, ..
         assert mean - 2 * std < before < mean + 2 * std
         assert mean - 2 * std < before + far < mean + 2 * std
         assert getattr(found, f"{name}_std")[22, i] < std / 3
+
+
+def with_first_off(rng: np.random.Generator, off: float, n: int = 17, logs: int = 1) -> History:
+    """Make a life without changes whose first logs are off by so much in ln f of both modes."""
+    history = quiet(rng, n)
+    ln_f = np.array(history.ln_frequency)
+    ln_f[:logs] += off
+    return replace(history, ln_frequency=ln_f)
+
+
+@pytest.mark.parametrize("n", [5, 17])
+@pytest.mark.parametrize("off", [0.03, -0.03])
+def test_a_first_log_that_is_far_off_is_an_outlier(stage: Stage, off: float, n: int) -> None:
+    """It was the reference of all drifts: running-in within one log explained it."""
+    history = with_first_off(np.random.default_rng(31), off, n)
+    found = track(history, stage)
+    missing = np.array(history.ln_frequency)
+    missing[0] = np.nan
+    without = track(make_history(missing, ln_damping=history.ln_damping, std=5e-4), stage)
+    assert found.outliers == ((0, "roll"), (0, "pitch"))
+    assert found.events == ()
+    assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
+    assert np.abs((found.drift - without.drift)[-1] / std_of(without)[-1]).max() < 0.5
+    smoothed = smooth(history, found, stage)
+    assert np.abs(smoothed.ln_frequency[0] - history.ln_frequency[1:].mean(axis=0)).max() < 0.01
+    assert np.isnan(accepted_estimates(history, found).ln_frequency[0]).all()
+    assert all("logs after" in one.detail for one in outlier_refusals(history, found))
+
+
+def test_first_logs_that_agree_or_wear_or_deviate_together_are_no_outliers(stage: Stage) -> None:
+    """Negative control: neither an early wear nor a step after the second log leaves logs out."""
+    rng = np.random.default_rng(32)
+    early = quiet(rng, 17)
+    worn = early.ln_frequency - 0.03 * (1 - np.exp(-np.arange(17) / 3))[:, None]
+    for history in (
+        with_first_off(rng, 0.0),
+        with_first_off(rng, 0.03, logs=2),
+        replace(early, ln_frequency=worn),
+    ):
+        assert [k for k, _ in track(history, stage).outliers if k == 0] == []
+
+
+def test_the_first_log_after_work_is_judged_and_one_before_work_is_not(stage: Stage) -> None:
+    """Work explains a deviation of the only log before it, and opens a baseline of its own."""
+    rng, n = np.random.default_rng(33), 17
+    at_once = replace(with_first_off(rng, 0.03), steps=(since("reset", 1, n),), baselines=(0, 1))
+    assert track(at_once, stage).outliers == ()
+    later = quiet(rng, n)
+    ln_f = np.array(later.ln_frequency)
+    ln_f[8:] += 0.02
+    ln_f[8] -= 0.03
+    worked = replace(later, ln_frequency=ln_f, steps=(since("reset", 8, n),), baselines=(0, 8))
+    found = track(worked, stage)
+    assert found.outliers == ((8, "roll"), (8, "pitch"))
+    assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
+
+
+def test_a_first_log_is_left_out_from_the_log_on_that_shows_it(stage: Stage) -> None:
+    """Appended logs change no epoch that is published, although they judge the first log."""
+    history = with_first_off(np.random.default_rng(34), 0.03)
+    whole, first = track(history, stage), []
+    for n in (2, 3, 4, 6, 9):
+        part = track(cut(history, n), stage)
+        first.append(bool(part.outliers))
+        for name in PUBLISHED:
+            own, all_logs = getattr(part, name), getattr(whole, name)[:n]
+            np.testing.assert_allclose(own, all_logs, rtol=1e-9, atol=1e-12, err_msg=name)
+    assert first[0] is False
+    assert first[-1] is True
+
+
+def test_a_gap_after_the_first_log_may_have_any_drift(stage: Stage) -> None:
+    """A new machine that is monitored after years has worn: its first log is no outlier."""
+    rng, n = np.random.default_rng(35), 13
+    travel = np.r_[0.0, np.linspace(1.6e6, 2e6, n - 1)]
+    history = quiet(rng, n)
+    ln_f = history.ln_frequency - 0.04 * (travel / 2e6)[:, None]
+    found = track(replace(history, ln_frequency=ln_f, travel=travel), stage)
+    assert found.outliers == ()
+    assert (np.abs(found.drift[-1] + 0.04) < 4 * std_of(found)[-1]).all()
 
 
 def test_outliers_two_logs_in_a_row_are_no_step(stage: Stage) -> None:

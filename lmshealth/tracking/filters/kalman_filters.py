@@ -26,7 +26,7 @@ from lmshealth.tracking.filters.state_space import Hyperparameters, Observation,
 # Sets with less than this share of their group's best are pruned (a test bounds the error).
 _NEGLIGIBLE = float(np.log(1e-7))
 # Least weight of an estimate: an outlier for certain.
-_LEAST_WEIGHT = 1e-10
+LEAST_WEIGHT = 1e-10
 # Least value of a nuisance that matters, and the factor by which it may differ; the first two do
 # not change once a machine has run in. The last is the factor of scales.
 _TOLERANCES = (
@@ -367,7 +367,7 @@ def select_nuisances(space: StateSpace, bank: FilterBank, found: Innovation, k: 
         tick = space.ticks[k]
         moved = decays @ rates.mean(axis=1) / max(running_in, 1e-300) * tick**2
     weight = np.ones(space.mode_of.size)
-    weight[found.rows] = np.maximum(1 - found.outlying, _LEAST_WEIGHT)
+    weight[found.rows] = np.maximum(1 - found.outlying, LEAST_WEIGHT)
     return Nuisances(
         level_walk=walk,
         rate_walk=odds @ own.rate_walk[changing] ** 2 / (odds.sum() or 1.0),

@@ -134,7 +134,7 @@ class StateSpace:
     """
 
     def __init__(self, history: History, stage: Stage | None, steps: tuple[Step, ...] = ()) -> None:
-        self.history, self.steps = history, steps
+        self.history, self.stage, self.steps = history, stage, steps
         regressed = self.regressed = regressors(history.covariates, stage, history.recorded_at)
         m = self.n_modes = len(history.modes)
         self.level, self.rate, self.damping, self.base, self.wander = (
@@ -186,6 +186,25 @@ class StateSpace:
         longer.size = self.size + 2 * self.n_modes
         longer._jumps = [*self._jumps, (step, self._jump_matrix(step))]
         return longer
+
+    def without(self, k: int, outlying: BoolArray) -> Self:
+        """Return the state space without some estimates of log k, ``(2 n_series,)``."""
+        other, given = copy(self), self._observations()[k]
+        kept = np.flatnonzero(~outlying[given.rows])
+        extra = None if given.extra is None else given.extra[kept]
+        own = given.rows[kept], given.values[kept], given.cov[kept[:, None], kept]
+        left = Observation(*own, given.source[kept], extra)
+        other.observations = [*self.observations[:k], left, *self.observations[k + 1 :]]
+        return other
+
+    def backwards(self, first: int, last: int) -> Self:
+        """Return the state space of the logs from the last back to the first, without steps."""
+        other = type(self)(self.history.backwards(first, last), self.stage)
+        # Their distances are all known: a gap before the first log is as long as it was.
+        ticks = np.diff(other.history.clock(), prepend=0.0)
+        other.ticks = ticks * (last - first) / (max(ticks.sum(), 1e-300) * constants.LOGS_PER_LIFE)
+        other.noise, other.noise_shares = other._process_noise()
+        return other
 
     @property
     def effects(self) -> list[tuple[str, str, int]]:

@@ -11,6 +11,7 @@ alarm.
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 from typing import Literal
 
 import numpy as np
@@ -21,6 +22,7 @@ from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.modal.credibility import dependence
 from lmshealth.tracking import constants
 from lmshealth.tracking.filters.kalman_filters import (
+    LEAST_WEIGHT,
     FilterBank,
     Gaussian,
     Nuisances,
@@ -181,10 +183,12 @@ def step(state: TrackState, k: int) -> TrackState:
         bank = restart(state.space, state.bank, anew=True)
         state = replace(state, bank=bank, start=k, first=k, alarmed=False)
     state = _filter(state, k)
-    window, size = _worst_window(state)
-    detected = _detect(state, k, window, size)
-    if detected.checkpoints is not state.checkpoints:
-        window, size = _worst_window(detected)
+    detected = _detect(state, k)
+    news = len(detected.alarms) > len(state.alarms) or len(detected.changes) > len(state.changes)
+    judged = _first_judged(state, k, news=news)
+    if judged is not state:
+        detected = _detect(judged, k)
+    window, size = _worst_window(detected)
     # An older rate may hold no more, unless it is an outlier that deviates.
     if size > constants.BEGUN_GATE:
         detected = _reopened(detected, window)
@@ -224,6 +228,65 @@ def _filter(state: TrackState, k: int) -> TrackState:
         settled=settled,
         credit=credit,
     )
+
+
+def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
+    """Judge the first log of a machine, or after work on it, by those up to log k.
+
+    No log before it shows whether it is an outlier: the filters are run from log k back to it, at
+    the length of a window, and where a step or an alarm is new.
+    """
+    space, first, baselines = state.space, state.start, state.space.history.baselines
+    works = {0, *(one.first for one in space.steps if one.kind == "reset")}
+    steps = [one.first for one in space.steps if first < one.first <= k]
+    due = k - first in _WINDOWS or (news and k - first >= _WINDOWS[0])
+    if not due or k - first > _WINDOWS[-1] or first not in works.intersection(baselines) or steps:
+        return state
+    at = first - state.checkpoints[0].index
+    left_out = state.checkpoints[at].epoch.outlying
+    drift, std = _drift(_row(state, state.published))
+    if not left_out.any() and not (np.abs(drift) > constants.OUTLIER_GATE * std).any():
+        return state  # the others agree with it
+    outlying, standardised = _judged_backwards(space.backwards(first, k))
+    if (outlying == left_out).all():
+        return state
+    bank = restart(space, state.checkpoints[at - 1].bank, anew=True) if first else initial(space)
+    again = replace(
+        state,
+        space=space.without(first, outlying),
+        bank=bank,
+        published=state.checkpoints[at].before,
+        checkpoints=state.checkpoints[:at],
+        widening=widening(state)[:k],  # of earlier logs, as published
+        weighed=(-1, -1),
+        open=None,
+    )
+    again = _filter(again, first)
+    last = again.checkpoints[-1]
+    weight = np.where(outlying, LEAST_WEIGHT, last.epoch.nuisances.weight)
+    epoch = replace(
+        last.epoch,
+        nuisances=replace(last.epoch.nuisances, weight=weight),
+        standardised=np.where(outlying, standardised, last.epoch.standardised),
+        outlying=outlying,
+    )
+    again = replace(again, checkpoints=(*again.checkpoints[:-1], replace(last, epoch=epoch)))
+    return reduce(_filter, range(first + 1, k + 1), again)
+
+
+def _judged_backwards(space: StateSpace) -> tuple[BoolArray, FloatArray]:
+    """Return which estimates of the last log are outliers, and their standardised innovations.
+
+    Those of a mode that deviated in its log before as well are not, ``(2 n_series,)`` each.
+    """
+    bank, size = initial(space), space.mode_of.size
+    outlying, before, standardised = np.zeros(size, bool), np.zeros(size, bool), np.zeros(size)
+    for k in range(len(space.observations)):
+        bank, found = update(space, predict(space, bank, k), k)
+        bank, before = bank.pruned(), outlying.copy()
+        outlying[found.rows], standardised[found.rows] = found.is_outlier, found.standardised
+    last = np.isin(np.arange(size), found.rows)
+    return outlying & ~before & last, standardised
 
 
 def _with_nuisances(
@@ -280,11 +343,9 @@ def _worst_window(state: TrackState) -> tuple[int, float]:
     return window + offset, size
 
 
-def _detect(state: TrackState, k: int, window: int, size: float) -> TrackState:
-    """Weigh a suspected change and adopt it, and raise the alarm of a drift.
-
-    The mean innovation is largest since the log `window`.
-    """
+def _detect(state: TrackState, k: int) -> TrackState:
+    """Weigh a suspected change and adopt it, and raise the alarm of a drift."""
+    window, size = _worst_window(state)
     suspected = recent_loop_change(state.loop_changes, state.first, k)
     if suspected is None and size > constants.SUSPICION_GATE:
         suspected = window
@@ -357,10 +418,7 @@ def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
     """Raise an alarm, once since a baseline or reset, of a drift from a baseline."""
     if state.alarmed or k < state.space.history.baselines[0]:
         return state
-    row = _row(state, state.published)
-    m = row.drift_cov.shape[0]
-    drift = row.mean[:m] - row.mean[3 * m :]
-    std = np.sqrt(np.maximum(row.drift_cov.diagonal(), 0.0))
+    drift, std = _drift(_row(state, state.published))
     i = int(np.argmax(np.abs(drift) / np.maximum(std, 1e-12)))
     mode = state.space.history.modes[i]
     alarm = Event("alarm", k, mode, "", float(drift[i]), float(std[i]), evidence, False, k)
@@ -379,13 +437,20 @@ def _row(state: TrackState, own: Gaussian) -> Published:
     )
 
 
+def _drift(row: Published) -> tuple[FloatArray, FloatArray]:
+    """Return the drift of each mode and its standard deviation, ``(m,)`` each."""
+    m = row.drift_cov.shape[0]
+    std = np.sqrt(np.maximum(row.drift_cov.diagonal(), 0.0))
+    return row.mean[:m] - row.mean[3 * m :], std
+
+
 def degrees_of_freedom(space: StateSpace, innovations: FloatArray) -> FloatArray:
     """Count the innovations of each log; the first estimate of a mode has none."""
     history = space.history
     there: BoolArray = np.isfinite(innovations)
     for mode in history.modes:
         own = np.array(history.columns(mode), dtype=int)
-        found = np.isfinite(history.ln_frequency[: len(there), own]).any(axis=1)
+        found = there[:, own].any(axis=1)
         there[:, np.r_[own, own + len(history.series)]] &= (np.cumsum(found) > 1)[:, None]
     return np.asarray(there.sum(axis=1), dtype=float)
 
