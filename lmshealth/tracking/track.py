@@ -439,7 +439,7 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
             f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
             f"({before:.5g} Hz): a jump is accepted once the next log confirms it"
         )
-        if k in works:  # judged by two logs or more after it
+        if k in works and k + 2 < len(track.logs):  # judged by those after it
             after = float(np.exp(track.ln_frequency[k + 2, i]))
             detail = (
                 f"{found:.5g} Hz, or its damping, is far from the estimates of all logs after "
