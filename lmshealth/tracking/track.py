@@ -434,13 +434,17 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
     for k, mode in track.outliers:
         i, own = track.modes.index(mode), history.columns(mode)
         found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
-        # The first log is judged by two or more after it.
-        side, near, which = ("after", k + 2, "second") if k in works else ("before", k - 1, "next")
-        other = float(np.exp(track.ln_frequency[near, i]))
+        before = float(np.exp(track.ln_frequency[k - 1, i]))
         detail = (
-            f"{found:.5g} Hz, or its damping, is far from the estimates of all logs {side} "
-            f"({other:.5g} Hz): a jump is accepted once the {which} log confirms it"
+            f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
+            f"({before:.5g} Hz): a jump is accepted once the next log confirms it"
         )
+        if k in works and k + 2 < len(track.logs):  # judged by those after it
+            after = float(np.exp(track.ln_frequency[k + 2, i]))
+            detail = (
+                f"{found:.5g} Hz, or its damping, is far from the estimates of all logs after "
+                f"({after:.5g} Hz): a jump is accepted once the second log confirms it"
+            )
         refused.append(Refusal(log=history.logs[k], mode=mode, reason="jump", detail=detail))
     return refused
 

@@ -514,6 +514,10 @@ def test_the_first_log_after_work_is_judged_and_one_before_work_is_not(stage: St
     found = track(worked, stage)
     assert found.outliers == ((8, "roll"), (8, "pitch"))
     assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
+    # Without two logs after it, only those before judge it.
+    shortest = track(cut(worked, 9), stage)
+    (refused,) = outlier_refusals(cut(worked, 9), replace(shortest, outliers=((8, "roll"),)))
+    assert "logs before" in refused.detail
 
 
 def test_a_first_log_is_left_out_from_the_log_on_that_shows_it(stage: Stage) -> None:
