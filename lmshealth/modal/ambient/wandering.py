@@ -191,7 +191,7 @@ def _test(model: JointModel, i: int, recording: CrossSpectrum) -> tuple[float, H
     level = np.convolve(np.abs(z) ** 2, np.ones(width) / width, "same")
     within = _around(level > _STANDS_OUT * noise, int(np.argmin(np.abs(frequency - f0))))
     wide, power = frequency[within], np.abs(z[within]) ** 2
-    if wide.size < 2:
+    if np.count_nonzero(power) < 2:  # lines are masked there
         return None
     windows = [slice(*np.searchsorted(frequency, [f0 * (1 - w), f0 * (1 + w)])) for w in _WIDTHS]
     sigmas = min(_constancy(z[w], level[w]) for w in (within, *windows))
