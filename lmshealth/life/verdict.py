@@ -219,10 +219,14 @@ def doubt_of_names(
 def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
     """Return that no mode of the map is where it is searched for any more; empty if one is.
 
-    A mode that has left its search is not found, so that the logs before would give the health.
+    A mode that has left its search is not found, so that the logs before would give the health, or
+    other resonances that take its name after a gap: they jump.
     """
     columns = [k for name in stage.informative for k in history.columns(name)]
-    found = np.isfinite(accepted_estimates(history, track).ln_frequency[history.baseline :])
+    found = np.isfinite(accepted_estimates(history, track).ln_frequency)
+    for k, mode in track.unconfirmed:
+        found[k, [*history.columns(mode)]] = False
+    found = found[history.baseline :]
     least, missed = stage.description.baseline.logs, int(found[::-1, columns].any(axis=1).argmax())
     if not columns or missed < least:
         return ""
