@@ -220,10 +220,14 @@ def _nothing_seen(stage: Stage, history: History, track: Track) -> str:
     """Return that no mode of the map is where it is searched for any more; empty if one is.
 
     Without a map all tracked modes count. A mode that has left its search, or whose sensor is dead,
-    is not found, so that the logs before would give the state.
+    is not found, so that the logs before would give the state, or other resonances that take its
+    name after a gap: they jump.
     """
     columns = [k for name in stage.informative or history.modes for k in history.columns(name)]
-    found = np.isfinite(accepted_estimates(history, track).ln_frequency[history.baseline :])
+    found = np.isfinite(accepted_estimates(history, track).ln_frequency)
+    for k, mode in track.unconfirmed:
+        found[k, [*history.columns(mode)]] = False
+    found = found[history.baseline :]
     last = int(np.flatnonzero(found[:, columns].any(axis=1)).max(initial=-1))
     missed = len(found) - 1 - last
     if not columns or missed < stage.description.baseline.logs:

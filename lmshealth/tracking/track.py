@@ -118,6 +118,7 @@ class Track(Result):
     nuisances: Nuisances | None = None
     # Step that the last logs may show, by less evidence than an event needs; None without.
     suspected: Step | None = None
+    unconfirmed: tuple[tuple[int, str], ...] = ()  # its epochs and modes
 
     def __post_init__(self) -> None:
         n, m = len(self.logs), len(self.modes)
@@ -266,7 +267,8 @@ def _published(state: TrackState) -> Track:
     undetected = _undetected(history)
     mean[undetected], std[undetected] = np.nan, np.nan
     innovations = np.array([epoch.innovations for epoch in epochs])
-    outliers, suspected = _outliers(history, epochs, space.steps)
+    outliers, unconfirmed = _outliers(history, epochs, space.steps)
+    begun = min(unconfirmed, default=None)
     events = sorted([*state.alarms, *_step_events(state)], key=lambda event: event.epoch)
     return Track(
         stage=history.stage,
@@ -285,7 +287,8 @@ def _published(state: TrackState) -> Track:
         events=tuple(events),
         steps=space.steps,
         outliers=tuple(outliers),
-        suspected=suspected,
+        suspected=Step.found("step", begun[0], len(epochs)) if begun else None,
+        unconfirmed=tuple(unconfirmed),
         nis=np.array([epoch.nis for epoch in epochs]),
         nis_dof=degrees_of_freedom(state.space, innovations),
         innovations=innovations,
@@ -297,8 +300,8 @@ def _published(state: TrackState) -> Track:
 
 def _outliers(
     history: History, epochs: Sequence[Epoch], steps: Sequence[Step]
-) -> tuple[list[tuple[int, str]], Step | None]:
-    """List the logs and modes that are outliers, and return the step that the last ones may be.
+) -> tuple[list[tuple[int, str]], list[tuple[int, str]]]:
+    """List the logs and modes that are outliers, and those that may show a step.
 
     Two or more last logs in which a mode deviates to the same side have something in common, even
     if it is not clear yet what: they are no outliers, unless there are already `MAX_STEPS` steps.
@@ -308,7 +311,7 @@ def _outliers(
     standardised = np.array([epoch.standardised for epoch in epochs])
     outlying = np.array([epoch.outlying for epoch in epochs])
     found: list[tuple[int, str]] = []
-    begun: list[int] = []  # first logs of what has changed
+    changed: list[tuple[int, str]] = []
     for mode in history.modes:
         columns = history.columns(mode)
         own = [*columns, *(n_series + i for i in columns)]
@@ -320,10 +323,10 @@ def _outliers(
         logs = np.flatnonzero(np.isfinite(standardised[:, own]).any(axis=1))
         last = logs[np.logical_and.accumulate(side[logs][::-1] == side[logs][-1:])[::-1]]
         if len(last) > 1 and side[last[0]] and n_steps < constants.MAX_STEPS:
-            begun.append(int(last[0]))
+            changed += [(k, mode) for k in last.tolist()]
             logs = logs[: -len(last)]
         found += [(k, mode) for k in logs[side[logs] != 0].tolist()]
-    return found, Step.found("step", min(begun), len(epochs)) if begun else None
+    return found, changed
 
 
 def _undetected(history: History) -> BoolArray:

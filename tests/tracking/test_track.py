@@ -579,6 +579,7 @@ def test_last_logs_that_deviate_alike_are_no_outliers(stage: Stage) -> None:
     assert (found.outliers, found.events) == ((), ())
     assert found.suspected is not None
     assert found.suspected.first == 14
+    assert found.unconfirmed == ((14, "roll"), (15, "roll"))
     assert accepted_estimates(history, found).steps == (found.suspected,)
     two = (14, "roll"), (15, "roll")
     assert track(jumping({14: off, 15: -off}), stage).outliers == two

@@ -7,6 +7,7 @@ The noise comes from the sensors and from forces that still excite the same mode
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from scipy import ndimage
@@ -129,37 +130,62 @@ def identify_decays(
         if group:
             found += _fit_bands(log, group, decays, limits, targets)
     modes = numbered(merge(_distinct(found), (), log.refused))
-    rejected = sorted((row for band in found for row in band.rejected), key=lambda row: -row[0])
+    rejected = sorted((row for band in found for row in band.rejected), key=lambda row: -row.snr)
     if targets:
-        refused = {f"pole_{k}": Refusal(log.name, *why[:2], frequency=why.frequency)
-                   for k, (_, why) in enumerate(rejected)}  # fmt: skip
-        return _named(modes, targets, log.name).publish(modes, targets, refused)
+        return _named(modes, rejected, targets, log.name)
     if not modes.names:
         nothing = ("not-excited", "nothing decays in the band: stop harder, or change the band")
-        raise BadLog(log.name, *(rejected[0][1][:2] if rejected else nothing))
+        raise BadLog(log.name, *(rejected[0].why[:2] if rejected else nothing))
     return modes
+
+
+class _Rejected(NamedTuple):
+    """A resonance that is not credible."""
+
+    snr: float
+    why: Rejection
+    damping_ratio: float = np.nan  # NaN where it is no decay
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _BandModes:
-    """Modes of a band of one kind of channels, and its other resonances with their SNR."""
+    """Modes of a band of one kind of channels, and its other resonances."""
 
     modes: Modes
-    rejected: tuple[tuple[float, Rejection], ...]
+    rejected: tuple[_Rejected, ...]
 
     @property
     def strongest_rejection(self) -> str:
         """Why the strongest resonance is no mode; empty where it is one."""
-        snr, why = max(self.rejected, key=lambda row: row[0], default=(0.0, Rejection("", "")))
-        return why.reason if snr > self.modes.snr.max(initial=0.0) else ""
+        nothing = _Rejected(0.0, Rejection("", ""))
+        strongest = max(self.rejected, key=lambda row: row.snr, default=nothing)
+        return strongest.why.reason if strongest.snr > self.modes.snr.max(initial=0.0) else ""
 
 
-def _named(modes: Modes, targets: tuple[Target, ...], log: str) -> Named:
-    """Name the resonances of decays; the machine may be anywhere within the searches."""
-    f, zeta = modes.frequency.tolist(), modes.damping_ratio.tolist()
-    names, ambiguous = assign(f, targets, pairing_probability(f, targets, damping=zeta))
-    own = {given: name for given, name in zip(modes.names, names, strict=True) if name}
-    return Named(own, frozenset(), ambiguous, frozenset(), log)
+def _named(
+    modes: Modes, rejected: Sequence[_Rejected], targets: tuple[Target, ...], log: str
+) -> Modes:
+    """Name the resonances of decays, with which stronger ones compete that are refused.
+
+    The machine may be anywhere within the searches. Where they hold more resonances than modes, it
+    is as likely at its description: else a map makes all places within a search equally likely.
+    """
+    refused = {f"pole_{k}": Refusal(log, *row.why[:2], frequency=row.why.frequency)
+               for k, row in enumerate(rejected)}  # fmt: skip
+    rows = [*zip(modes.frequency.tolist(), modes.damping_ratio.tolist(), modes.names, strict=True)]
+    # Weaker poles may be errors of the model of a mode.
+    rows += [
+        (row.why.frequency, row.damping_ratio, name)
+        for name, row in zip(refused, rejected, strict=True)
+        if row.why.frequency and row.damping_ratio > 0 and row.snr > modes.snr.max(initial=0.0)
+    ]
+    rows = [row for row in sorted(rows) if any(is_near(t, row[0]) for t in targets)]
+    f, zeta = [row[0] for row in rows], [row[1] for row in rows]
+    more = len(rows) > len(targets)
+    probability = pairing_probability(f, targets, damping=zeta, standing=more)
+    names, ambiguous = assign(f, targets, probability)
+    given = {row[2]: name for row, name in zip(rows, names, strict=True) if name}
+    return Named(given, frozenset(), ambiguous, frozenset(), log).publish(modes, targets, refused)
 
 
 def _distinct(bands: Sequence[_BandModes]) -> list[Modes]:
@@ -353,7 +379,7 @@ def _accept(
     fit: PoleFit, channels: Sequence[Channel], limits: Range, *, linear: bool = True
 ) -> _BandModes:
     """Estimate the poles of a band within its limits; reject those that are not credible."""
-    lines, modal, rejected = fit.is_line(), list[int](), list[tuple[float, Rejection]]()
+    lines, modal, rejected = fit.is_line(), list[int](), list[_Rejected]()
     for i, f in enumerate(fit.frequency.tolist()):
         if not limits[0] <= f <= limits[1]:
             continue
@@ -364,7 +390,7 @@ def _accept(
         if not linear:
             unlike = f"the resonance at {f:.5g} Hz is no sum of decays in stationary noise, however"
             why = Rejection("not-linear", f"{unlike} late the decay is started", f)
-        rejected.append((float(peak_snr(fit, i).max()), why))
+        rejected.append(_Rejected(float(peak_snr(fit, i).max()), why))
     if not modal:
         return _BandModes(merge((), (), ()), tuple(rejected))
     result = estimate(fit, modal)
@@ -377,8 +403,9 @@ def _accept(
         if (incredible := _incredible(fit, i, result, k)) is None:
             credible.append(k)
         else:
-            f = float(modes.frequency[k])
-            rejected.append((float(modes.snr[k]), incredible._replace(frequency=f)))
+            f, zeta = float(modes.frequency[k]), float(modes.damping_ratio[k])
+            why = incredible._replace(frequency=f)
+            rejected.append(_Rejected(float(modes.snr[k]), why, zeta))
     return _BandModes(modes.select(credible), tuple(rejected))
 
 

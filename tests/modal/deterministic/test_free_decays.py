@@ -266,6 +266,23 @@ def test_which_of_two_resonances_a_name_means_is_not_guessed() -> None:
     assert [r.reason for r in modes.refused] == ["ambiguous"]
 
 
+def test_beside_a_resonance_that_nobody_described_the_one_at_the_description_is_the_mode() -> None:
+    """Of a machine that stands at its description; control: the other one alone may be worn."""
+    stage = make_stage(MODES[:1])
+    both = of_pieces(log_of(14, [Ring(53.2, 0.01), Ring(60.0, 0.01)]), stage)
+    assert both.names == ("roll",)
+    np.testing.assert_allclose(both.frequency, [60.0], rtol=1e-3)
+    assert of_pieces(log_of(14, [Ring(53.2, 0.01)]), stage).names == ("roll",)
+
+
+def test_a_refused_resonance_leaves_its_name_to_no_weaker_one() -> None:
+    """A mode at its description, whose damping one stop does not show, is refused as that."""
+    rings = [Ring(53.2, 0.01), Ring(60.0, 0.0015, (3.0,), ambient=0.2)]
+    modes = of_pieces(log_of(15, rings, n_stops=1), make_stage([("roll", 60.0, 0.002)]))
+    assert modes.names == ()
+    assert [(r.mode, r.reason) for r in modes.refused] == [("roll", "line-not-mode")]
+
+
 def test_what_cannot_be_analysed_is_said() -> None:
     """Too short decays, too slow a sample rate, no channel, no mode in the band, no stop."""
     log = log_of(15)
