@@ -134,6 +134,9 @@ MIN_FIT = 1e-3
 """Residuals of a life whose χ² is less probable are explained by no state of the parameters and no
 mode that moves alone: then no health is published."""
 
+RISEN = 1.05
+"""Share of its baseline that no wear reaches: above it with 95 %, a parameter is not healthy."""
+
 DEGRADED_SHARE = 0.25
 """A parameter is degraded once it has lost this share of the distance from baseline to limit. At a
 limit of 0.6 this is a loss of 10 %, four half-widths of a 90 % interval of the shipped stages."""

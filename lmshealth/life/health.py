@@ -123,6 +123,14 @@ class Health(Result):
         """Return quantiles at the last epoch, shape ``(..., n_parameters)``."""
         return np.asarray(np.quantile(self.samples[-1], level, axis=0))
 
+    def risen(self, baselines: FloatArray) -> BoolArray:
+        """Return which parameters are above their baselines, which no wear does, at the last epoch.
+
+        Of those that may be published; shape ``(n_parameters,)`` as of the baselines.
+        """
+        above = self.latest(np.array(0.05)) > constants.RISEN * baselines
+        return np.asarray(above & self.publishable_parameters())
+
     def title(self) -> str:
         """Return machine, number of epochs, and the last one."""
         n = len(self.recorded_at)

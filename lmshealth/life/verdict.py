@@ -1,7 +1,7 @@
 """Verdict on a stage: its most probable state at the last epoch."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import compress
@@ -96,8 +96,8 @@ def judge(
         if there are fewer logs than a baseline needs, if no life of the parameters explains the
         logs, or if no parameter is informed; ``why`` then reports alarms. ``alarm`` or ``no-alarm``
         of tracked modes if the description has no parameter. Otherwise the state of most draws: a
-        set of degraded parameters; without any, ``outside-map`` if a mode moved alone, or
-        ``healthy``.
+        set of degraded parameters; without any, ``outside-map`` if a mode moved alone or a
+        parameter is above its baseline, or ``healthy``.
 
     Examples
     --------
@@ -318,6 +318,12 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
         name = health.modes[mode]
         why = f"{lone_sentence(next(m for m in health.lone_modes if m.mode == name), stage)} {why}"
     probability = draws[chosen] / draws.total()
+    baselines = np.array([one.baseline for one in stage.parameters])
+    if verdict == "healthy" and (risen := health.risen(baselines)).any():
+        verdict = OUTSIDE_MAP
+        above = (health.samples[-1] > constants.RISEN * baselines)[:, risen].all(axis=1)
+        probability = float(np.mean(above & ~degraded.any(axis=1)))
+        why = f"{_risen_sentence(compress(health.parameters, risen))} {why}"
     return Verdict(history.stage, history.recorded_at[-1], verdict, probability, why)
 
 
@@ -334,6 +340,14 @@ def lone_sentence(lone: LoneMode, stage: Stage) -> str:
         size=size,
         std=std,
         states=states,
+    )
+
+
+def _risen_sentence(names: Iterable[str]) -> str:
+    return fact(
+        "{names} is above its baseline value, which no wear does: work was not entered, or "
+        "something else moved the modes, or other resonances have their names.",
+        names=" and ".join(map(spell, names)).capitalize(),
     )
 
 

@@ -34,9 +34,6 @@ DRIFT_SIGMA = 6.0
 """Drift in standard deviations that is reported where no verdict is possible yet: three times what
 is expected where the reported errors are too small by a factor of two, as of a first log that
 shares a cause with no other."""
-RISEN = 1.05
-"""Share of its baseline that no wear reaches: a parameter above it with 95 % is reported."""
-
 POSTPONED_WEEKS, POSTPONED_SHOWN = (0, 1, 2, 4, 8, 13, 26, 52, 104), 5
 """Weeks by which a service may be late, of which a page has the risk, and how many of those that
 are not past yet it shows."""

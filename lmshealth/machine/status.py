@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
+from itertools import compress
 from typing import Any, Literal
 
 import msgspec
@@ -101,10 +102,8 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
         return
     if not health.explained:
         yield _noticed("unexplained-drifts", p=health.fit[-1])
-    known = health.publishable_parameters()
-    for name, low, own in zip(health.parameters, health.latest(np.array(0.05)), known, strict=True):
-        if own and low > constants.RISEN:
-            yield _noticed("above-baseline", name, name=spell(name).capitalize())
+    for name in compress(health.parameters, health.risen(np.ones(len(health.parameters)))):
+        yield _noticed("above-baseline", name, name=spell(name).capitalize())
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
             yield _noticed("end-of-map", name, name=spell(name))

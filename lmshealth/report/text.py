@@ -313,7 +313,7 @@ def verdict_text(summary: Summary) -> str:
         "no-alarm": tr("modes tracked, no alarm"),
         "not-enough-data": tr("not enough data for a verdict"),
         "step": tr("sudden change without a known cause"),
-        OUTSIDE_MAP: tr("a mode moved alone, by a cause outside the map"),
+        OUTSIDE_MAP: tr("modes moved by a cause outside the map"),
     }
     if summary.step.partial and summary.life:
         names = joined(map(spell, summary.life.undetermined))

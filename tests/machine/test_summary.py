@@ -31,7 +31,7 @@ def summary(assessment: Assessment) -> Summary:
         ("mount", "Loss of mount stiffness", "bad"),
         ("both", "Loss of guide preload and mount stiffness", "bad"),
         ("step", "Sudden change without a known cause", "bad"),
-        ("outside-map", "A mode moved alone, by a cause outside the map", "open"),
+        ("outside-map", "Modes moved by a cause outside the map", "open"),
         ("not-enough-data", "Not enough data for a verdict", "open"),
         ("no-alarm", "Modes tracked, no alarm", "open"),
     ],
@@ -91,7 +91,7 @@ def test_a_mode_that_moved_alone_orders_no_service(make: Maker) -> None:
     outside = replace(assessment.judgement, verdict="outside-map")
     found = summary(replace(assessment, judgement=outside))
     sentence = next_step(found.step)
-    assert sentence.startswith("Find out what moved the mode: its sensor, cables, payload")
+    assert sentence.startswith("Find out what moved the modes: sensors, cables, payload")
     assert summary(assessment).step.kind in ("plan", "service-now")
     healthy = make("sound", wear_km=400000, floor=0.98)
     assert found.urgency < summary(healthy).urgency
