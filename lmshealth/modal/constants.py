@@ -89,9 +89,8 @@ STEADY_PHASE = 0.5
 # Damping ratio above which a resonance without a description is attributed to the noise.
 MOST_DAMPING = 0.1
 # Least distance of two modes in half-power bandwidths, where channels see them alike (modal
-# assurance criterion above the third) and otherwise, where a difference of bandwidths counts, too:
-# strength and damping of closer modes cannot be estimated separately, and their likelihood is not
-# normal.
+# assurance criterion above the third) and otherwise: strength and damping of closer modes cannot be
+# estimated separately, and their likelihood is not normal.
 SEPARATION_ALIKE, SEPARATION, ALIKE_MAC = 1.0, 0.2, 0.8
 # Standard deviations within which modes that different channels show are one, and the ratio of
 # dampings up to which those of different clusters are.

@@ -793,20 +793,6 @@ def test_a_narrow_mode_on_a_broad_one_is_another_mode(seed: int) -> None:
         assert np.abs(deviations(found, name, f, zeta)).max() < 4
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_narrow_mode_on_a_damped_one_of_another_shape_is_found(seed: int) -> None:
-    """At nearly the same frequency, without a description: both are published."""
-    modes = [
-        Mode(130.5, 0.05, 1.0, (1.0, 0.3, -0.2)),
-        Mode(131.0, 0.01, 0.02, (0.3, -0.8, 1.0)),
-    ]
-    found = identify(acceleration_log(rng(seed), modes, 30, RATE, 0.1), band=(90.0, 180.0))
-    assert found.flags == ("", "")
-    i = int(found.damping_ratio.argmin())
-    assert found.frequency[i] == pytest.approx(131.0, abs=4 * found.frequency_std[i])
-    assert found.damping_ratio[i] == pytest.approx(0.01, rel=0.4)
-
-
 @pytest.mark.slow
 def test_no_channel_of_a_long_record_is_unlike_the_others() -> None:
     """Of a quarter of an hour the errors of bins, not of channels, are significant."""

@@ -147,16 +147,9 @@ def _closest(fit: ClusterFit) -> tuple[str, str] | None:
     f, zeta = found.modes.frequency, found.modes.damping_ratio
     shapes = found.modes.shapes / found.fitted.unit
     shapes = shapes / np.linalg.norm(shapes, axis=1, keepdims=True)
-    width = zeta * f
-    steady = np.array(["unsteady" not in flag for flag in found.modes.flags])
     for i, j in combinations(range(f.size), 2):
+        apart = abs(f[i] - f[j]) / (zeta[i] * f[i] + zeta[j] * f[j])
         alike = float(shapes[i] @ shapes[j]) ** 2 > constants.ALIKE_MAC
-        apart = abs(f[i] - f[j]) / (width[i] + width[j])
-        if not alike and steady[i] and steady[j]:
-            # A broad mode below a narrow one is another mode: the square of the correlation of two
-            # responses is 1 / (1 + d²), d as here of equal widths. One mode of an unsteady channel
-            # has a narrow and a broad part.
-            apart = np.hypot(f[i] - f[j], width[i] - width[j]) / np.sqrt(4 * width[i] * width[j])
         if apart < (constants.SEPARATION_ALIKE if alike else constants.SEPARATION):
             return found.names[i], found.names[j]
     return None

@@ -56,6 +56,8 @@ _WINDOWS = (0.003, 0.006, 0.012, 0.024)
 _STATICS = 0.0, -1.0
 # Sweeps of the model whose modes are chosen: fits see its other modes as foreign.
 _SWEEPS = 20
+# Ratio of bandwidths up to which two poles of unlike shapes are two modes.
+_SIMILAR = 2.0
 # Modes closer than this, in half-power bandwidths, are neighbours; of these, those that overlap.
 _NEIGHBOUR, _OVERLAP = 12.0, 4.0
 
@@ -275,18 +277,19 @@ def _with_likelier_static(model: JointModel) -> JointModel:
 def _without_splits(model: JointModel, most: int) -> JointModel:
     """Drop the weaker pole of pairs that no fit separates, while there are more than ``most``.
 
-    One mode that is not as the model is explained better by several poles, of which none is the
-    mode. They have its shape: two of unlike shapes are modes, left to the fit.
+    One mode that is not as the model is explained better by several poles of unlike bandwidths, of
+    which none is the mode. Two of unlike shapes and similar bandwidths are modes, left to the fit.
     """
     while model.f.size > most:
         width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
         alike = np.abs(model.phi.conj().T @ model.phi) ** 2
         alike = alike > constants.ALIKE_MAC * np.outer(power, power)
-        np.fill_diagonal(alike, val=False)
-        apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width)
-        apart[~alike] = np.inf
+        limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
+        apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
+        apart[~alike & (np.abs(np.log(width[:, None] / width)) < np.log(_SIMILAR))] = np.inf
+        np.fill_diagonal(apart, np.inf)
         i, j = np.unravel_index(int(apart.argmin()), apart.shape)
-        if apart[i, j] > constants.SEPARATION_ALIKE:
+        if apart[i, j] > 1:
             break
         weaker = i if power[i] / model.zeta[i] < power[j] / model.zeta[j] else j
         f = float(model.f[weaker])

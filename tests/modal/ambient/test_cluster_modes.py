@@ -57,23 +57,6 @@ def test_modes_are_close_within_a_bandwidth_unless_their_shapes_differ(
         assert f"{np.exp(fit.modes.estimate[0]):.5g}" in detail
 
 
-@pytest.mark.parametrize(
-    ("shapes", "flags", "n"),
-    [(UNLIKE, ("", ""), 2), (ALIKE, ("", ""), 1), (UNLIKE, ("", "unsteady"), 1)],
-)
-def test_a_narrow_mode_on_a_broad_one_is_another_of_another_shape(
-    shapes: list[list[float]], flags: tuple[str, str], n: int
-) -> None:
-    """At one frequency; one resonance has one shape, unless a channel is unsteady."""
-    fit = brought_to(0.0, found(both()), shapes)
-    estimate = fit.modes.estimate
-    modes = replace(fit.modes, ln_damping=np.log([0.02, 0.1]), flags=flags)
-    assert estimate[0] == estimate[1]
-    kept = separate(ClusterFit(replace(fit, modes=modes), {}), ()).credible
-    assert kept is not None
-    assert len(kept.names) == n
-
-
 def test_what_was_not_sought_by_name_is_left_as_one() -> None:
     """One mode for both, half of their distance in its standard deviation, and flagged."""
     fit = brought_to(0.5, found(both()), ALIKE)

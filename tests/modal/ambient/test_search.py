@@ -102,18 +102,6 @@ def test_no_harmonic_is_read_from_masked_ordinates() -> None:
     assert find_harmonic(model, recording) is None
 
 
-@pytest.mark.parametrize(("second", "n"), [((0.5, -1.0), 2), ((1.0, 0.4), 1)])
-def test_only_poles_of_one_shape_are_a_split_of_one_mode(
-    second: tuple[float, float], n: int
-) -> None:
-    """Two poles at one frequency, of unlike bandwidths."""
-    data = band_of(np.random.default_rng(8).standard_normal((11_999, 2, 2)) @ [1, 1j])
-    phi = np.array([(1.0, 0.5), second], dtype=complex).T
-    poles, r = (np.array([20.0, 20.0]), np.array([0.01, 0.1])), np.eye(2, dtype=complex)
-    model = JointModel(data, np.full((2, 1), 2.0), *poles, phi, np.zeros_like(phi), r)
-    assert search._without_splits(model, 0).f.size == n
-
-
 def test_the_score_of_the_joint_model_is_the_derivative_of_its_misfit() -> None:
     """The gradient by the force in one channel equals a difference of the misfit; sweeps gain."""
     rng = np.random.default_rng(8)
