@@ -27,7 +27,7 @@ from lmshealth.tracking.track import Track, accepted_estimates
 # Of descriptions without parameters ``alarm`` and ``no-alarm`` are all that can be found.
 NO_HEALTH = ("alarm", "no-alarm", "not-enough-data")
 OUTSIDE_MAP = "outside-map"
-"""Verdict on a mode that moved alone, by a cause that the map does not have."""
+"""Verdict on a mode that moved alone, or a parameter above its baseline: no wear does either."""
 _WITHOUT_LOSS = ("healthy", "step", OUTSIDE_MAP, *NO_HEALTH)
 
 
@@ -322,7 +322,7 @@ def _judge_posterior(stage: Stage, history: History, health: Health) -> Verdict:
     if verdict == "healthy" and (risen := health.risen(baselines)).any():
         verdict = OUTSIDE_MAP
         above = (health.samples[-1] > constants.RISEN * baselines)[:, risen].all(axis=1)
-        probability = float(np.mean(above & ~degraded.any(axis=1)))
+        probability = float(np.mean((above | (modes != NO_MODE)) & ~degraded.any(axis=1)))
         why = f"{_risen_sentence(compress(health.parameters, risen))} {why}"
     return Verdict(history.stage, history.recorded_at[-1], verdict, probability, why)
 

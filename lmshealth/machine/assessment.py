@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import date
-from itertools import takewhile
+from itertools import compress, takewhile
 
 import numpy as np
 from numpy.linalg import LinAlgError
@@ -167,6 +167,15 @@ class Assessment:
         if health is None or not (health.recorded_at and health.parameters):
             return None
         return health.relative_to(np.array([spec.baseline for spec in self.stage.parameters]))
+
+    @property
+    def risen(self) -> tuple[str, ...]:
+        """Parameters that are above their baselines, which no wear does."""
+        health = self.latest_health
+        if health is None:
+            return ()
+        names = health.parameters
+        return tuple(compress(names, health.risen(np.ones(len(names)))))
 
     def urgency(self, service: Service) -> tuple[int, float, float, str]:
         """Return a sort key: day of the service; sudden changes first, no verdict before safe ones.

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from datetime import date, datetime, timedelta
-from itertools import compress
 from typing import Any, Literal
 
 import msgspec
@@ -102,7 +101,7 @@ def _of_health(assessment: Assessment) -> Iterator[Notice]:
         return
     if not health.explained:
         yield _noticed("unexplained-drifts", p=health.fit[-1])
-    for name in compress(health.parameters, health.risen(np.ones(len(health.parameters)))):
+    for name in assessment.risen:
         yield _noticed("above-baseline", name, name=spell(name).capitalize())
     for name, edge in zip(health.parameters, health.at_edge[-1], strict=True):
         if edge:
@@ -217,7 +216,7 @@ class Status(msgspec.Struct, frozen=True, kw_only=True):
     # Modes whose alarm, and conditions whose begin was a change since the baseline;
     # ``silent`` since the last log.
     announced: tuple[str, ...] = ()
-    # Whether the work that its next step would be about was entered after the last log.
+    # Whether work that restores the lost parameters was entered after the last log.
     worked: bool = False
     works: int | None = None  # declared steps and baselines; None in statuses of earlier versions
     warnings: dict[str, str]  # code and severity of what was noticed

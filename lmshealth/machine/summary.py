@@ -84,8 +84,10 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
     first, words = first_limit(prognosis), {x.name: x.word for x in assessment.stage.parameters}
     name = first[0] if first else "" if prognosis is None else prognosis.parameters[0]
-    works = set(RESTORING.get(words.get(name, ""), RESETS))
-    is_worked = any(x.code == "no-log-since" and x.where in works for x in assessment.notices)
+    # Work on one part does not restore another.
+    lost = degraded_words(assessment.judgement.verdict) or (words.get(name, ""),)
+    done = {notice.where for notice in assessment.notices if notice.code == "no-log-since"}
+    is_worked = all(done.intersection(RESTORING.get(word, RESETS)) for word in lost)
     case = "worked" if is_worked else _class_of(assessment), kind, age
     step = step_of(*case)
     if prognosis is None:

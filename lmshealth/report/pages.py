@@ -148,7 +148,8 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
 def _outside_map(assessment: Assessment) -> Iterator[dict[str, Any]]:
     """Yield the modes that moved alone: change, MAC, and since which log half of it is there."""
     health, track, mac = assessment.health, assessment.track, _mac(assessment)
-    is_verdict = assessment.judgement.verdict == OUTSIDE_MAP  # of the most probable one
+    # The most probable one, unless a parameter that is above its baseline is the cause.
+    is_verdict = assessment.judgement.verdict == OUTSIDE_MAP and not assessment.risen
     for n, lone in enumerate(health.lone_modes if health and track else ()):
         assert track is not None
         if lone.probability < LONE_NAMED and not (is_verdict and n == 0):

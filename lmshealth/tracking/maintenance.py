@@ -135,7 +135,7 @@ def _machine(row: Row) -> str:
 def baseline_notices(refused: Iterable[Refusal], used: str) -> list[Notice]:
     """Return notices of refused logs that were declared as baseline.
 
-    `used` is the log with which the baseline begins instead.
+    `used` is the log with which the present baseline begins. A harmless copy has no notice.
     """
     return [
         Notice(
@@ -144,7 +144,7 @@ def baseline_notices(refused: Iterable[Refusal], used: str) -> list[Notice]:
             one.log,
             fact(
                 "{log} is declared as baseline (baseline = true), and was refused ({reason}: "
-                "{detail}): the present baseline begins with {used} instead.",
+                "{detail}); the present baseline begins with {used}.",
                 log=one.log,
                 reason=one.reason,
                 detail=one.detail,
@@ -153,7 +153,7 @@ def baseline_notices(refused: Iterable[Refusal], used: str) -> list[Notice]:
             fact("Correct that log or its row, or declare another one in manifest.csv."),
         )
         for one in refused
-        if one.baseline
+        if one.baseline and one.reason != "duplicate"
     ]
 
 

@@ -433,7 +433,7 @@ def accepted_estimates(history: History, track: Track) -> History:
 
 def outlier_refusals(history: History, track: Track) -> list[Refusal]:
     """List the outliers of a track as refusals."""
-    refused, works = [], {0, *(one.first for one in history.steps if one.kind == "reset")}
+    refused = []
     for k, mode in track.outliers:
         i, own = track.modes.index(mode), history.columns(mode)
         found = float(np.exp(np.nanmean(history.ln_frequency[k, own])))
@@ -442,7 +442,7 @@ def outlier_refusals(history: History, track: Track) -> list[Refusal]:
             f"{found:.5g} Hz, or its damping, is far from the estimates of all logs before "
             f"({before:.5g} Hz): a jump is accepted once the next log confirms it"
         )
-        if k in works and k + 2 < len(track.logs):  # judged by those after it
+        if k in (0, *history.baselines) and k + 2 < len(track.logs):  # judged by those after it
             after = float(np.exp(track.ln_frequency[k + 2, i]))
             detail = (
                 f"{found:.5g} Hz, or its damping, is far from the estimates of all logs after "

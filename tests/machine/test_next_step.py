@@ -118,26 +118,30 @@ def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "limit", "is_worked"),
+    ("verdict", "actions", "limit", "is_worked"),
     [
-        ("preload-adjust", 0, True),
-        ("guide-replaced", 0, True),
-        ("mount-tightened", 0, False),
-        ("mount-tightened", 1, True),
-        ("regrease", 0, False),
+        ("preload", ("preload-adjust",), 0, True),
+        ("preload", ("guide-replaced",), 0, True),
+        ("preload", ("mount-tightened",), 0, False),
+        ("preload", ("regrease",), 0, False),
+        ("mount", ("mount-tightened",), 1, True),
+        ("both", ("preload-adjust",), 0, False),
+        ("both", ("preload-adjust", "mount-tightened"), 0, True),
     ],
 )
 def test_work_that_was_entered_is_not_ordered_again(
-    make: Maker, action: str, limit: int, is_worked: bool
+    make: Maker, verdict: str, actions: tuple[str, ...], limit: int, is_worked: bool
 ) -> None:
     """The effect of work after the last log is seen in the next; other work is still ordered."""
     made = make()
+    made = replace(made, judgement=replace(made.judgement, verdict=verdict))
     assert made.prognosis is not None
     remaining = np.array(made.prognosis.remaining)
     remaining[:, 1 - limit] = np.inf
     remaining[:, 2] = remaining[:, limit]
     moments = made.history.recorded_at
-    work = Maintenance((Action("M7-Y", moments[-1] + timedelta(days=1), action),))
+    day = moments[-1] + timedelta(days=1)
+    work = Maintenance(tuple(Action("M7-Y", day, action) for action in actions))
     notices = (*made.notices, *maintenance_notices(work, moments))
     prognosis = replace(made.prognosis, remaining=remaining)
     found = replace(made, prognosis=prognosis, notices=notices)
@@ -149,7 +153,7 @@ def test_work_that_was_entered_is_not_ordered_again(
     assert ("record logs now, to see its effect" in text.next_step(summary.step)) == is_worked
     assert (text.service_on_day(summary) == "unknown without a log") == is_worked
     assert {"loss", "service-due"}.isdisjoint(codes) == is_worked
-    assert ("no-log-since-maintenance" in codes) == (action != "regrease")
+    assert ("no-log-since-maintenance" in codes) == (actions != ("regrease",))
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:

@@ -291,4 +291,4 @@ def test_a_declared_baseline_that_is_left_out_is_named() -> None:
     (notice,) = (one for one in found.notices if one.code == "baseline-refused")
     assert (notice.where, found.history.baseline) == ("1.csv", 0)
     assert "baseline = true" in notice.what and "travel_km 100000 contradicts" in notice.what
-    assert "begins with 0.csv instead" in notice.what and "manifest.csv" in notice.to_do
+    assert "begins with 0.csv" in notice.what and "manifest.csv" in notice.to_do

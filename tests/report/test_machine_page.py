@@ -171,6 +171,25 @@ def test_a_mode_outside_the_map_is_helped_with(make: Maker, tmp_path: Path) -> N
 
 
 @pytest.mark.usefixtures("blank")
+def test_a_parameter_above_its_baseline_is_helped_with(make: Maker, tmp_path: Path) -> None:
+    """What may have raised it is listed, and no mode that hardly moved alone is named."""
+    made = make()
+    assert made.health is not None
+    lone = (LoneMode("roll", 0.01, 0.002, 0.04),)
+    raised = replace(
+        made,
+        health=replace(made.health, chains=1.6 * made.health.chains, lone_modes=lone),
+        judgement=replace(made.judgement, verdict="outside-map"),
+    )
+    text = words(one(tmp_path, raised))
+    helped = text[text.index("moved by a cause outside the map Check") :]
+    helped = helped[: helped.index("Since the last report")]
+    assert "Work since the baseline." in helped
+    assert "alone" not in helped
+    assert 'href="#outside"' in one(tmp_path, raised).source
+
+
+@pytest.mark.usefixtures("blank")
 def test_an_undetermined_parameter_shows_no_number(make: Maker, tmp_path: Path) -> None:
     """An undetermined parameter is named as such on the bar, in the table and on the fleet page."""
     page = one(tmp_path, blind(make()))

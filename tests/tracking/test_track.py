@@ -19,7 +19,7 @@ from lmshealth.tracking import constants
 from lmshealth.tracking.constants import JUMP_STD
 from lmshealth.tracking.filters import state_space
 from lmshealth.tracking.filters.track_state import Event, loop_evidence
-from lmshealth.tracking.history import History, StepKind
+from lmshealth.tracking.history import History, Step, StepKind
 from lmshealth.tracking.track import (
     Consistency,
     Track,
@@ -518,6 +518,29 @@ def test_the_first_log_after_work_is_judged_and_one_before_work_is_not(stage: St
     shortest = track(cut(worked, 9), stage)
     (refused,) = outlier_refusals(cut(worked, 9), replace(shortest, outliers=((8, "roll"),)))
     assert "logs before" in refused.detail
+
+
+@pytest.mark.parametrize("first", [1, 3])
+def test_the_first_log_of_a_declared_baseline_is_judged(stage: Stage, first: int) -> None:
+    """No work began it: it is a log as others, and the reference of all drifts since."""
+    later = quiet(np.random.default_rng(36), 17)
+    ln_f = np.array(later.ln_frequency)
+    ln_f[first] += 0.03
+    found = track(replace(later, ln_frequency=ln_f, baselines=(first,)), stage)
+    assert found.outliers == ((first, "roll"), (first, "pitch"))
+    assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
+
+
+def test_logs_of_an_ended_retuning_do_not_judge_the_first_log(stage: Stage) -> None:
+    """Back to the servo of before, the modes differ from the first log since work."""
+    rng, n = np.random.default_rng(37), 17
+    tuned = (np.arange(n) >= 6) & (np.arange(n) < 9)
+    servo = Step("servo", 6, tuned, name="B")
+    ln_f = np.array(quiet(rng, n).ln_frequency) + 0.03 * tuned[:, None]
+    history = replace(
+        quiet(rng, n), ln_frequency=ln_f, steps=(servo, since("reset", 8, n)), baselines=(0, 8)
+    )
+    assert track(history, stage).outliers == ()
 
 
 def test_a_first_log_is_left_out_from_the_log_on_that_shows_it(stage: Stage) -> None:

@@ -231,16 +231,16 @@ def _filter(state: TrackState, k: int) -> TrackState:
 
 
 def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
-    """Judge the first log of a machine, or after work on it, by those up to log k.
+    """Judge the first log of a baseline by those up to log k.
 
     No log before it shows whether it is an outlier: the filters are run from log k back to it, at
     the length of a window, and where a step or an alarm is new.
     """
-    space, first, baselines = state.space, state.start, state.space.history.baselines
-    works = {0, *(one.first for one in space.steps if one.kind == "reset")}
-    steps = [one.first for one in space.steps if first < one.first <= k]
+    space, first = state.space, state.start
+    parts = [one.there[first : k + 1] for one in space.steps]
+    stepped = any(part.any() and not part.all() for part in parts)
     due = k - first in _WINDOWS or (news and k - first >= _WINDOWS[0])
-    if not due or k - first > _WINDOWS[-1] or first not in works.intersection(baselines) or steps:
+    if not due or k - first > _WINDOWS[-1] or stepped:
         return state
     at = first - state.checkpoints[0].index
     left_out = state.checkpoints[at].epoch.outlying
