@@ -221,8 +221,8 @@ RULES: tuple[tuple[str, bool, Callable[[Any, Truth], bool | None]], ...] = (
     (r"Record a log at once|.*unless it was repaired", False, lambda m, t: t.unexplained),
     (f"caution: inspection-overdue:.* by {_DAY}", False,
      lambda m, t: t.last <= at(m[1]) < t.today),
-    (r"(?:Verdict: )?(?:. )?(At the last log: healthy|Healthy|Loss of.*|Sudden change.*|A mode "
-     r"moved alone.*)", False, lambda m, t: t.verdict(m[1])),
+    (r"(?:Verdict: )?(?:. )?(At the last log: healthy|Healthy|Loss of.*|Sudden change.*|Modes "
+     r"moved by a cause.*)", False, lambda m, t: t.verdict(m[1])),
     ("(?:.*: )?(?:Ver|ver|reco)[a-z]+: (?:still|.* →) (.*)", False, lambda m, t: t.verdict(m[1])),
     ("(?:Verdict: )?(?:. )?Alarm|serious: alarm", False, lambda m, t: t.changed),
     (f"(Guide preload|Mount stiffness)(?:: \\d+ %|:? .*(?:90 %:|interval)) *{_RANGE}", True,
