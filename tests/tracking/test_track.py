@@ -531,6 +531,17 @@ def test_the_first_log_of_a_declared_baseline_is_judged(stage: Stage, first: int
     assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
 
 
+def test_the_first_log_of_a_baseline_after_a_found_step_is_judged(stage: Stage) -> None:
+    """The state has the step by then, and the filters before it do not."""
+    n = 24
+    history = quiet(np.random.default_rng(38), n)
+    ln_f = history.ln_frequency - 0.03 * (np.arange(n) >= 7)[:, None]
+    ln_f[14] += 0.03
+    found = track(replace(history, ln_frequency=ln_f, baselines=(0, 14)), stage)
+    assert "step" in {one.kind for one in found.events}
+    assert {k for k, _ in found.outliers} == {14}
+
+
 def test_logs_of_an_ended_retuning_do_not_judge_the_first_log(stage: Stage) -> None:
     """Back to the servo of before, the modes differ from the first log since work."""
     rng, n = np.random.default_rng(37), 17

@@ -240,7 +240,9 @@ def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
     parts = [one.there[first : k + 1] for one in space.steps]
     stepped = any(part.any() and not part.all() for part in parts)
     due = k - first in _WINDOWS or (news and k - first >= _WINDOWS[0])
-    if not due or k - first > _WINDOWS[-1] or stepped:
+    # A step that was found begins no baseline.
+    is_first = first in space.history.baselines
+    if not is_first or not due or k - first > _WINDOWS[-1] or stepped:
         return state
     at = first - state.checkpoints[0].index
     left_out = state.checkpoints[at].epoch.outlying
@@ -250,7 +252,9 @@ def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
     outlying, standardised = _judged_backwards(space.backwards(first, k))
     if (outlying == left_out).all():
         return state
-    bank = restart(space, state.checkpoints[at - 1].bank, anew=True) if first else initial(space)
+    bank = initial(space)
+    if first:
+        bank = restart(space, state.checkpoints[at - 1].bank.padded(space.size), anew=True)
     again = replace(
         state,
         space=space.without(first, outlying),
