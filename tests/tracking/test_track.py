@@ -12,12 +12,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from lmshealth._private.arrays import FloatArray
+from lmshealth._private.arrays import BoolArray, FloatArray
 from lmshealth.errors import NotEnoughData
 from lmshealth.stage.description import Stage, Usage
 from lmshealth.tracking import constants
 from lmshealth.tracking.constants import JUMP_STD
-from lmshealth.tracking.filters import state_space
+from lmshealth.tracking.filters import state_space, track_state
+from lmshealth.tracking.filters.state_space import StateSpace
 from lmshealth.tracking.filters.track_state import Event, loop_evidence
 from lmshealth.tracking.history import History, Step, StepKind
 from lmshealth.tracking.track import (
@@ -531,15 +532,26 @@ def test_the_first_log_of_a_declared_baseline_is_judged(stage: Stage, first: int
     assert np.abs(found.drift[-1] / std_of(found)[-1]).max() < 3
 
 
-def test_the_first_log_of_a_baseline_after_a_found_step_is_judged(stage: Stage) -> None:
-    """The state has the step by then, and the filters before it do not."""
-    n = 24
+def test_only_the_first_log_of_a_baseline_is_judged(
+    stage: Stage, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A step that was found begins a regime, and no baseline."""
+    judge, judged, n = track_state._judged_backwards, set[str](), 24
+
+    def noted(space: StateSpace) -> tuple[BoolArray, FloatArray]:
+        judged.add(space.history.logs[-1])
+        return judge(space)
+
+    monkeypatch.setattr(track_state, "_judged_backwards", noted)
     history = quiet(np.random.default_rng(38), n)
     ln_f = history.ln_frequency - 0.03 * (np.arange(n) >= 7)[:, None]
-    ln_f[14] += 0.03
-    found = track(replace(history, ln_frequency=ln_f, baselines=(0, 14)), stage)
+    found = track(replace(history, ln_frequency=ln_f), stage)
     assert "step" in {one.kind for one in found.events}
+    assert judged <= {history.logs[0]}
+    off = ln_f + 0.03 * (np.arange(n) == 14)[:, None]
+    found = track(replace(history, ln_frequency=off, baselines=(0, 14)), stage)
     assert {k for k, _ in found.outliers} == {14}
+    assert history.logs[14] in judged
 
 
 def test_logs_of_an_ended_retuning_do_not_judge_the_first_log(stage: Stage) -> None:

@@ -252,9 +252,7 @@ def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
     outlying, standardised = _judged_backwards(space.backwards(first, k))
     if (outlying == left_out).all():
         return state
-    bank = initial(space)
-    if first:
-        bank = restart(space, state.checkpoints[at - 1].bank.padded(space.size), anew=True)
+    bank = restart(space, state.checkpoints[at - 1].bank, anew=True) if first else initial(space)
     again = replace(
         state,
         space=space.without(first, outlying),
