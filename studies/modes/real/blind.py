@@ -7,8 +7,8 @@ Method
     frame (as its integration makes it) and a light frame, once also with all six channels, which
     two recorders took. A mode is found within its published tolerance. What else is reported is
     false in simulated sets; a real structure may have more modes than are published. Beside:
-    presets of pyOMA2's clustering and the automatic selections of pyoma-toolbox, with the settings
-    of `without_description`.
+    presets of pyOMA2's clustering, the automatic selections of pyoma-toolbox, and koma, with the
+    settings of `without_description`.
 Run time
     About two minutes on one processor. Needs the extra ``peers``.
 Data
@@ -46,7 +46,7 @@ from studies.modes.real.sets import (
     WEIMAR_RATE,
     to_log,
 )
-from studies.modes.without_description.peers import pyoma2, toolbox
+from studies.modes.without_description.peers import koma, pyoma2, toolbox
 from studies.modes.without_description.worlds import World
 
 HALF_HOUR, BUILDING_RATE, BUILDING = 180_000, 100.0, (1.882, 2.422, 2.687)
@@ -59,8 +59,8 @@ def main() -> None:
     """Run the study; ``--quick`` leaves the other programs out and records nothing."""
     study, data = Study(__file__, __doc__), real_data()
     os.environ.update(one_thread() | {"TQDM_DISABLE": "1"})
-    if not study.quick and not (find_spec("pyoma2") and find_spec("pyOMA")):
-        raise SystemExit("pyOMA-2 and pyoma-toolbox not installed: pip install '.[peers]'")
+    if not study.quick and not all(map(find_spec, ("pyoma2", "pyOMA", "koma"))):
+        raise SystemExit("pyOMA-2, pyoma-toolbox or koma not installed: pip install '.[peers]'")
     rows = [examine(one, peers=not study.quick) for one in sets(data)]
     study.conclude({"sets": rows, "passed": verdicts(rows)})
 
@@ -113,7 +113,8 @@ def examine(one: Set, *, peers: bool) -> Row:
         samples = np.stack([c.values[:] for c in accelerations], axis=1)
         nothing = np.zeros(len(known))
         world = World(name, log.sample_rate, samples, 0, band, np.array(known), nothing)
-        found = pyoma2(world) | toolbox(world, method="SSI") | toolbox(world, method="VarPLSCF")
+        found = pyoma2(world) | koma(world)
+        found |= toolbox(world, method="SSI") | toolbox(world, method="VarPLSCF")
         row["others"] = {tool: count(f, known, reach) for tool, (f, _) in found.items()}
     return row
 
