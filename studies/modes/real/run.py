@@ -29,7 +29,7 @@ from studies.modes.real.sets import Z95, study_koma, study_mpstd, study_weimar
 
 NOT_MET = {
     "building: no end of life visible": "no log excludes that an end begins within a time as short "
-    "as that of all logs, here less than a day: see the onsets in lmshealth/prognosis/README.md",
+    "as that of all logs, here less than a day: see the onsets in lmshealth/life/README.md",
     "building: damping within 1.2 to 1.8 %": (
         "the first mode of the whole record has 1.802 %, known to less than a twentieth of it"
     ),
