@@ -41,6 +41,7 @@ NOT_MET = {
         "outcomes of all logs are read and associated again, their figures drawn, and their rows "
         "written"
     ),
+    "growth with the history": "as these grow with the number of logs",
     "memory": (
         "most of it is imported libraries, among them pyarrow: pandas imports it where it is "
         "installed"

@@ -27,6 +27,25 @@ from studies.harness.cost import in_own_process
 from studies.harness.study import Row, Study
 
 QUICK = "walker"
+_SEARCH = (
+    "three quarters are the search for modes, which refines every mode of every set that it tries: "
+    "1,450 evaluations of a likelihood of a log of four channels"
+)
+NOT_MET = {
+    "identify the record of three modes": _SEARCH,
+    "60 s of four channels at 20 kHz, Parquet to modes": _SEARCH,
+    "tracking 10,000 epochs of five modes": (
+        "all settings are filtered at once, and each log is searched for outliers, steps and new "
+        "rates, in many small steps of which none dominates"
+    ),
+    "modes of a log of 4 s, whole process": (
+        "three quarters of what is left are imports of numpy, SciPy and pandas"
+    ),
+    "prognose after a step, whole process": (
+        "the bound is 6 s over the 60 s that the code before took on another machine"
+    ),
+    "no bench failed": "a figure that is missed fails its bench",
+}
 
 
 def main() -> None:
@@ -51,7 +70,7 @@ def main() -> None:
         "passed": {name: not row["missed"] for name, row in found.items()},
     }
     answer["passed"]["no bench failed"] = done.returncode == 0
-    study.conclude(answer)
+    study.conclude(answer, not_met=NOT_MET)
 
 
 def claims(answer: Row) -> Iterator[Claim]:
