@@ -101,7 +101,7 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
         page = make_page(found, summary, before=record.before)
-    rows = machine_tables(found) if logs else {}
+    rows = machine_tables(found, summary) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
     of_logs = [log_tables(one) for one in sort_by_time(logs)]
     for name in of_logs[0] if of_logs else ():

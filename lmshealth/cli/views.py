@@ -477,6 +477,9 @@ def _limit_cells(
 
 def _advice(life: Life, service: Service) -> Iterator[str]:
     """Yield when to service, by which rule, and the risk of a planned service."""
+    if math.isnan(service.wait):
+        yield "Service: not known before a log shows the effect of the work that was entered."
+        return
     if service.max_risk:
         rule = f"accepted risk {text.percent(service.max_risk)}"
     else:

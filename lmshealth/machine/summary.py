@@ -17,7 +17,14 @@ from lmshealth.life.prognosis import LawWeight, Prognosis
 from lmshealth.life.verdict import NO_HEALTH, OUTSIDE_MAP, degraded_words, undeclared_events
 from lmshealth.machine import constants
 from lmshealth.machine.assessment import Assessment
-from lmshealth.machine.service import Service, day_after, days_to, remaining_days, risk_before
+from lmshealth.machine.service import (
+    Service,
+    day_after,
+    days_to,
+    decide,
+    remaining_days,
+    risk_before,
+)
 from lmshealth.stage.description import ParameterSpec, Stage
 from lmshealth.tracking.maintenance import RESETS, RESTORING
 
@@ -65,10 +72,9 @@ class NextStep:
     """What to do next with a machine; `report.text.next_step` puts it into a sentence."""
 
     kind: Step
-    # parameter, word: the parameter whose limit is most probably reached first, and its word in
-    # verdicts; "" without a service.
-    parameter: str = ""
-    word: str = ""
+    # Parameters that the service restores, and their words in verdicts, without those for which
+    # work was entered since the last log; that whose limit is most probably reached first is first.
+    parts: tuple[tuple[str, str], ...] = ()
     by: date | None = None  # day of the service
     log_every: float = np.inf  # days from one log to the next
     horizon: float = np.nan  # travel in m beyond which nothing is claimed
@@ -82,12 +88,19 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     kind = "unknown" if prognosis is None else service.kind
     n_logs = len(assessment.history.logs) - assessment.history.baseline
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
-    first, words = first_limit(prognosis), {x.name: x.word for x in assessment.stage.parameters}
-    name = first[0] if first else "" if prognosis is None else prognosis.parameters[0]
+    first = first_limit(prognosis)
+    words = {one.name: one.word for one in assessment.stage.parameters}
+    names = [] if prognosis is None else [first[0] if first else prognosis.parameters[0]]
+    degraded = degraded_words(assessment.judgement.verdict)
+    lost = [name for name, word in words.items() if word in degraded] or names
     # Work on one part does not restore another.
-    lost = degraded_words(assessment.judgement.verdict) or (words.get(name, ""),)
     done = {notice.where for notice in assessment.notices if notice.code == "no-log-since"}
-    is_worked = all(done.intersection(RESTORING.get(word, RESETS)) for word in lost)
+    left = {
+        name: words.get(name, "")
+        for name in (*names, *lost)
+        if not done & {*RESTORING.get(words.get(name, ""), RESETS)}
+    }
+    is_worked = bool(done) and not left.keys() & {*lost}
     case = "worked" if is_worked else _class_of(assessment), kind, age
     step = step_of(*case)
     if prognosis is None:
@@ -95,8 +108,7 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
     every = days_to(prognosis, service.inspect_every)
     return NextStep(
         kind=step,
-        parameter=name,
-        word=words.get(name, ""),
+        parts=tuple(left.items()),
         by=service.by,
         log_every=every,
         horizon=prognosis.horizon,
@@ -263,6 +275,9 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     modes, deviates = assessment.track.modes if assessment.track else (), (*assessment.left_out,)
     if set(modes) == {*deviates}:
         deviates = ("all",)
+    step = next_step(assessment, service)
+    if step.kind == "see-effect":  # the day was that of the state before the work
+        service = decide(None, assessment.stage.description.decision)
     return Summary(
         file=file,
         identity=judgement.stage,
@@ -281,7 +296,7 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
         health=tuple(_parameters(assessment)),
         life=summarise_life(prognosis, assessment.stage, of_fleet) if prognosis else None,
         service=service,
-        step=next_step(assessment, service),
+        step=step,
         deviates=deviates if judgement.probability >= 0 else (),
         postponed=tuple(_postponed(prognosis, service)),
     )

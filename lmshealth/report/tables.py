@@ -18,6 +18,7 @@ from lmshealth.stage.constants import TYPICAL_DURATION
 
 if TYPE_CHECKING:
     from lmshealth.machine.assessment import Assessment
+    from lmshealth.machine.summary import Summary
     from lmshealth.modal.deterministic.frequency_response import FrfReading
     from lmshealth.modal.log_estimates import LogEstimates
     from lmshealth.modal.mode_shapes import ModeShapes
@@ -83,19 +84,18 @@ def log_tables(reading: LogEstimates) -> dict[str, str]:
     return {name: csv_text(name, own) for name, own in rows.items()}
 
 
-def machine_tables(assessment: Assessment) -> dict[str, list[Row]]:
+def machine_tables(assessment: Assessment, summary: Summary) -> dict[str, list[Row]]:
     """Return the rows of the tables of one machine without those of its logs, by table."""
     from lmshealth.machine.status import notices  # late: single logs need nothing of lives
-    from lmshealth.machine.summary import prognosis_rows, summarise_life
+    from lmshealth.machine.summary import prognosis_rows
 
     rows: dict[str, list[Row]] = {}
     if assessment.track is not None:
         rows |= track_tables(assessment.track)
     if assessment.health is not None:
         rows["health"] = to_rows(assessment.health.to_columns())
-    if assessment.prognosis is not None:
-        life = summarise_life(assessment.prognosis, assessment.stage, assessment.calibration)
-        rows["prognosis"] = prognosis_rows(life, assessment.service())
+    if summary.life is not None:
+        rows["prognosis"] = prognosis_rows(summary.life, summary.service)
     found = assessment.judgement
     if assessment.stage.parameters:  # else all that is known is in events.csv and warnings.csv
         rows["verdict"] = TABLES["verdict"].rows_of([found])

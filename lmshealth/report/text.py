@@ -374,8 +374,10 @@ _WORK = {"preload": mark("a preload adjustment"), "mount": mark("a tightening of
 
 def next_step(step: NextStep) -> str:
     """Return what to do next in a sentence."""
-    known = _WORK.get(step.word)
-    work = tr(known) if known else tr("work on {name}", name=spell(step.parameter))
+    work = joined(
+        tr(_WORK[word]) if word in _WORK else tr("work on {name}", name=spell(name))
+        for name, word in step.parts
+    )
     by = "" if step.by is None else day(step.by)
     if step.kind == "check-loss":
         by = tr("now") if step.case[1] == "now" else tr("by {day}", day=by)

@@ -1091,12 +1091,15 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     [made] = assessing._update(((machine, "key", None, lives), pack(own), None))
     assert isinstance(made, PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
-    tables = machine_tables(found)
+    tables = machine_tables(found, summarise(found, found.service()))
     row = tables["prognosis"][-1]
     travel = np.quantile(own.prognosis.remaining[:, -1], 0.01, method="inverted_cdf")
     assert row["rul_km_calibrated"] == pytest.approx(travel / 1000)
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
-    assert machine_tables(own)["prognosis"][-1]["calibrated_lives"] is None
+    assert (
+        machine_tables(own, summarise(own, own.service()))["prognosis"][-1]["calibrated_lives"]
+        is None
+    )
     [few] = assessing._update(((machine, "key", None, lives[:8]), pack(own), None))
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

@@ -11,11 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 
+from lmshealth.cli import views
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine import constants
 from lmshealth.machine.status import judge_on, make_status, on_day
 from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
 from lmshealth.report import text
+from lmshealth.report.tables import machine_tables
 from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.maintenance import Action, Maintenance, maintenance_notices
 from tests.assessments import Maker, make
@@ -80,7 +82,7 @@ def test_every_combination_has_a_step_and_every_step_a_sentence() -> None:
         assert step_of(*case) in get_args(Step)
     assert {case[0] for case in CASES} == set(get_args(Step))
     for kind in get_args(Step):
-        sentence = text.next_step(NextStep(kind, "guide_preload", "preload", horizon=2e7))
+        sentence = text.next_step(NextStep(kind, (("guide_preload", "preload"),), horizon=2e7))
         assert (sentence == "") == (kind == "none")
 
 
@@ -118,21 +120,33 @@ def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
 
 
 @pytest.mark.parametrize(
-    ("verdict", "actions", "limit", "is_worked"),
+    ("verdict", "actions", "limit", "ordered"),
     [
-        ("preload", ("preload-adjust",), 0, True),
-        ("preload", ("guide-replaced",), 0, True),
-        ("preload", ("mount-tightened",), 0, False),
-        ("preload", ("regrease",), 0, False),
-        ("mount", ("mount-tightened",), 1, True),
-        ("both", ("preload-adjust",), 0, False),
-        ("both", ("preload-adjust", "mount-tightened"), 0, True),
+        ("preload", ("preload-adjust",), 0, ""),
+        ("preload", ("guide-replaced",), 0, ""),
+        ("preload", ("mount-tightened",), 0, "preload"),
+        ("preload", ("regrease",), 0, "preload"),
+        ("preload", ("regrease",), 1, "mount preload"),
+        ("preload", ("preload-adjust",), 1, ""),
+        ("mount", ("mount-tightened",), 1, ""),
+        ("both", (), 0, "preload mount"),
+        ("both", ("preload-adjust",), 0, "mount"),
+        ("both", ("preload-adjust", "mount-tightened"), 0, ""),
     ],
 )
 def test_work_that_was_entered_is_not_ordered_again(
-    make: Maker, verdict: str, actions: tuple[str, ...], limit: int, is_worked: bool
+    make: Maker,
+    capsys: pytest.CaptureFixture[str],
+    verdict: str,
+    actions: tuple[str, ...],
+    limit: int,
+    ordered: str,
 ) -> None:
-    """The effect of work after the last log is seen in the next; other work is still ordered."""
+    """The effect of work after the last log is seen in the next; other work is still ordered.
+
+    Without other work no output has a day of a service, which was that of the state before.
+    """
+    is_worked = not ordered
     made = make()
     made = replace(made, judgement=replace(made.judgement, verdict=verdict))
     assert made.prognosis is not None
@@ -153,7 +167,17 @@ def test_work_that_was_entered_is_not_ordered_again(
     assert ("record logs now, to see its effect" in text.next_step(summary.step)) == is_worked
     assert (text.service_on_day(summary) == "unknown without a log") == is_worked
     assert {"loss", "service-due"}.isdisjoint(codes) == is_worked
-    assert ("no-log-since-maintenance" in codes) == (actions != ("regrease",))
+    assert ("no-log-since-maintenance" in codes) == (not {*actions} <= {"regrease"})
+    kinds = {status.service, machine_tables(found, summary)["prognosis"][-1]["service"]}
+    assert (kinds == {"unknown"}) == is_worked
+    days = {summary.service.by, status.service_by, status.inspect_by}
+    assert (days == {None}) == is_worked
+    views.print_summaries([summary])
+    assert ("not known before a log" in capsys.readouterr().out) == is_worked
+    if ordered:
+        orders = {"preload": "a preload adjustment", "mount": "a tightening of the mount"}
+        work = " and ".join(orders[part] for part in ordered.split())
+        assert f" {work} " in text.next_step(summary.step)
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:

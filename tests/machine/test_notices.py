@@ -66,7 +66,11 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     }
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
-    (row, *_) = [row for row in machine_tables(bad)["warnings"] if row["code"] == code]
+    (row, *_) = [
+        row
+        for row in machine_tables(bad, summarise(bad, bad.service()))["warnings"]
+        if row["code"] == code
+    ]
     assert tuple(row) == TABLES["warnings"].names
     assert row["what"].endswith(".")
 

@@ -17,7 +17,7 @@ from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import Verdict
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import decide, probability_before
-from lmshealth.machine.summary import prognosis_rows, summarise_life
+from lmshealth.machine.summary import prognosis_rows, summarise, summarise_life
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.report.tables import (
@@ -138,7 +138,10 @@ def frame(table: str, rows: Sequence[Row]) -> pd.DataFrame:
 
 def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
-    found = {name: frame(name, own) for name, own in machine_tables(made).items()}
+    found = {
+        name: frame(name, own)
+        for name, own in machine_tables(made, summarise(made, made.service())).items()
+    }
     of_logs = [log_tables(reading) for reading in readings]
     for name in of_logs[0] if of_logs else ():
         text = "".join(join_csv([own[name] for own in of_logs]))
