@@ -4,6 +4,7 @@ Memory holds the packed tables of all machines, and besides them only the machin
 """
 
 import os
+import re
 import threading
 import time
 from collections import Counter
@@ -22,6 +23,7 @@ from lmshealth._private.files import remove_abandoned, replacing, write_text
 from lmshealth._private.serialize import VERSION, fingerprint, pack, unpack
 from lmshealth._private.tables import RUN_TABLES
 from lmshealth.batch import constants
+from lmshealth.batch.alerts import FILE as STATUSES
 from lmshealth.batch.alerts import Scope, announce, deliver, last_number, write_statuses
 from lmshealth.batch.assess import (
     Machine,
@@ -38,7 +40,7 @@ from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
 from lmshealth.io.manifest import MISSPELT, NOT_LOGS
-from lmshealth.io.refusal import visible
+from lmshealth.io.refusal import listed, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
@@ -269,12 +271,14 @@ def run(
                 write_index(out, rows, refused, today=judging.today)
         unsent = deliver(store, statuses, settings.alerts, out)
         write_statuses(statuses, out)
-        notes += (*store.notes, *without_logs(work.actions, ingested.machines))
+        notes += [*store.notes, *without_logs(work.actions, ingested.machines)]
+        notes += _of_names(ingested.machines, [one.stage for one in statuses])
     counts, lost = _count(ingested, refused, made)
     if not machines:
         raise NothingUsable(
-            f"{folder}: no usable log: {len(ingested.logs)} found{_others(folder, ingested.logs)}, "
-            f"{len(lost)} refused{_commonest(refused, lost)}; {out / 'refused.csv'} lists all"
+            f"{folder}: no usable log: {_of_tables(refused)}{len(ingested.logs)} found"
+            f"{_others(folder, ingested.logs)}, {len(lost)} refused{_commonest(refused, lost)}; "
+            f"{out / 'refused.csv'} lists all"
             + "".join(f"; {name}: {why}" for name, why in unsent.items())
         )
     misspelt = tuple(f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT)
@@ -381,6 +385,35 @@ def _others(folder: Path, logs: frozenset[str]) -> str:
     if not found:
         return " (the folder has no files; name the one that has the logs)"
     return f" (files: {found}; `lmshealth init FILE` tries one)"
+
+
+def _of_names(machines: Iterable[str], announced: Iterable[str]) -> Iterator[str]:
+    """Yield sentences on machines with names that are almost the same, and on those without logs.
+
+    Each may be a machine whose name was misspelt, or is written in another way now.
+    """
+    groups: dict[str, list[str]] = {}
+    for name in machines:
+        groups.setdefault(re.sub(r"[\W_]", "", name).casefold(), []).append(name)
+    for alike in groups.values():
+        if len(alike) > 1:
+            yield (
+                f"machines whose names differ only in case or signs: {listed(alike)}; if they are "
+                "one, give it one name in manifest.csv"
+            )
+    present = {name for alike in groups.values() for name in alike}
+    if gone := [name for name in announced if name not in present]:
+        yield (
+            f"{STATUSES} keeps the last status of machines without a usable log in this run: "
+            f"{listed(gone)}; see Retention in OPERATING.md to remove one"
+        )
+
+
+def _of_tables(refused: Iterable[Refusal]) -> str:
+    """Return why a table beside the logs cannot be read: the logs may be refused for that."""
+    tables = (one for one in refused if PurePosixPath(one.log).name in NOT_LOGS)
+    first = next(tables, None)
+    return "" if first is None else f"{first.log}: {first.detail}; "
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:

@@ -321,9 +321,29 @@ _OUTPUT = (
 )
 
 
+class _Command(click.Command):
+    """A command that writes no file over one that it reads, and no two into one."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        """Require that each output is a file of its own."""
+        left = super().parse_args(ctx, args)
+        names: dict[Path, str] = {}
+        for option in sorted(self.params, key=lambda one: one.type is OUT):
+            given = ctx.params.get(option.name or "")
+            for path in given if isinstance(given, tuple) else (given,):
+                if not isinstance(path, Path) or (path.exists() and not path.is_file()):
+                    continue  # several outputs may be discarded into one device
+                name = names.setdefault(path.resolve(), option.opts[0])
+                if option.type is OUT and name != option.opts[0]:
+                    name = name if name.startswith("-") else "the input"
+                    detail = f"{path} is also {name}; needed is another file"
+                    raise click.BadParameter(detail, ctx, option)
+        return left
+
+
 def command(*examples: str) -> Callable[[Callable[..., Any]], click.Command]:
     """Return the decorator of a command; the examples are the end of its help."""
     # click does not wrap a paragraph that begins with a backspace.
     lines = ["\b", "Examples:", *(f"    lmshealth {example}" for example in examples)]
-    made = click.command(epilog="\n".join(lines))
+    made = click.command(cls=_Command, epilog="\n".join(lines))
     return lambda function: made(reduce(lambda inner, option: option(inner), _OUTPUT, function))

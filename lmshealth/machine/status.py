@@ -60,8 +60,9 @@ def _of_names(assessment: Assessment) -> Iterator[Notice]:
         for flag in (one for one in own.split() if one not in WARNINGS.values()):
             by_flag.setdefault(flag, []).append(mode)
     for flag, modes in by_flag.items():
-        names, meaning = _listed(dict.fromkeys(modes)), FLAGS.get(flag) or fact("see modes.csv.")
-        yield _noticed("flag", names, flag, flag=flag, names=names, meaning=meaning)
+        modes, meaning = list(dict.fromkeys(modes)), FLAGS.get(flag) or fact("see modes.csv.")
+        values = {"flag": flag, "names": _listed(modes), "meaning": meaning}
+        yield _noticed("flag", ", ".join(modes), flag, **values)
 
 
 def _of_track(assessment: Assessment) -> Iterator[Notice]:
@@ -74,13 +75,13 @@ def _of_track(assessment: Assessment) -> Iterator[Notice]:
         yield _noticed("large-drift", mode, mode=name, size=moved, n=n_logs, n_std=n_std)
     left = {k: n for k, n in assessment.left_out.items() if k not in assessment.drifted}
     for n in sorted(set(left.values())):
-        names = _listed(mode for mode, own in left.items() if own == n)
+        modes = [mode for mode, own in left.items() if own == n]
         key = "last-logs-left-out, more" if n > 1 else "last-logs-left-out, one"
-        yield _noticed(key, names, n=n, names=names)
+        yield _noticed(key, ", ".join(modes), n=n, names=_listed(modes))
     first = assessment.history.baseline
     if track is not None and (modes := [mode for k, mode in track.outliers if k == first]):
-        names, day = _listed(modes), track.recorded_at[first].date().isoformat()
-        yield _noticed("baseline-left-out", names, names=names, day=day)
+        day = track.recorded_at[first].date().isoformat()
+        yield _noticed("baseline-left-out", ", ".join(modes), names=_listed(modes), day=day)
     if track is not None and track.suspected is not None:
         day = track.recorded_at[track.suspected.first].date().isoformat()
         yield _noticed("step-suspected", day=day)

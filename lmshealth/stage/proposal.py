@@ -44,7 +44,10 @@ _TIME_UNITS = {
 _SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECASE)
 # By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
 _SIGNALS = {
-    "delta_e": ("follow|error|deviat|lag|delta|schlepp|regelabw|PE|pos_?diff", "length", 1e-6, "m"),
+    "delta_e": (
+        "follow|error|err(?![a-z])|deviat|lag|delta|schlepp|regelabw|PE|pos_?(?:diff|err)",
+        *("length", 1e-6, "m"),
+    ),
     "acc": ("acc|beschl|vibr", "acceleration", 1.0, "m/s²"),
     "current": ("current(?! *pos| *vel)|strom|courant|i_?q|ampere", "current", 1.0, "A"),
 }

@@ -39,6 +39,8 @@ _LOOP = "delta_e_below_40hz_um"
 _OF_LOG = ("stage", "recorded_at", "travel_km", "servo_id", _LOOP, _RATE, "baseline")
 # Columns of text that may be missing, and what is assumed instead.
 _TEXTS = {"mode": "", "source": "unknown", "servo_id": "", "channel": "", "baseline": ""}
+# The column that only tables of drifts have.
+_DRIFT = "drift"
 _CROSS_TERMS = ("log", "source_a", "mode_a", "source_b", "mode_b", "cov_ln_f")
 _SHAPE = "shape_"
 
@@ -73,12 +75,17 @@ def read_estimates(
 
     `cross_terms` are covariances between estimates of one log, in the columns of ``modes_cov.csv``.
     The covariates of the stage are read too, and other mode names than its own are refused.
-    `BadTable` if a table cannot be read, a column is missing, a value is not valid, an estimate
-    exists twice, or rows of one log contradict each other. The notes returned state what the table
-    lacks, and what is assumed instead. Logs after the moment `latest`, by default a day from now,
-    are refused.
+    `BadTable` if a table cannot be read or is one of drifts, a column is missing, a value is not
+    valid, an estimate exists twice, or rows of one log contradict each other. The notes returned
+    state what the table lacks, and what is assumed instead. Logs after the moment `latest`, by
+    default a day from now, are refused.
     """
     table = _read(path, _NEEDED, "estimate")
+    if _DRIFT in table.columns:
+        raise BadTable(
+            f"{path}: has a column {_DRIFT}, as a track, whose rows depend on each other by its "
+            "filter; needed are independent estimates, such as modes.csv"
+        )
     covariates = [*known_covariates()]
     if stage is not None:
         covariates += [c.name for c in stage.description.covariate if c.name not in covariates]
@@ -146,7 +153,7 @@ def read_machines(
 
 def has_drifts(path: Path) -> bool:
     """Return whether a table has drifts, as ``track.csv`` does, rather than estimates."""
-    return "drift" in read_rows(path, ()).columns
+    return _DRIFT in read_rows(path, ()).columns
 
 
 def read_drifts(

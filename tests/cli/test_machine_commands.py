@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -81,6 +82,32 @@ def test_a_table_becomes_track_effects_and_events(estimates: Path, tmp_path: Pat
     assert set(pd.read_csv(out["effects"])["covariate"]) == {"temperature_c", "scale:acc"}
     assert len(pd.read_csv(out["track_cov"])) == N
     assert "Events" in result.output
+
+
+def test_no_output_replaces_an_input_or_another_output(estimates: Path, tmp_path: Path) -> None:
+    """Wrong usage before anything is read; a device may take several outputs."""
+    before, link = estimates.read_bytes(), tmp_path / "link.csv"
+    link.symlink_to(estimates)
+    for path in (estimates, tmp_path / "." / "modes.csv", link):
+        result = run(estimates, "--out", path)
+        assert (
+            result.exit_code == 2 and "is also the input; needed is another file" in result.stderr
+        )
+    both = tmp_path / "both.csv"
+    result = run(estimates, "--out", both, "--events", both)
+    assert result.exit_code == 2 and "is also --out; needed is another file" in result.stderr
+    assert estimates.read_bytes() == before and not both.exists()
+    if Path(os.devnull).exists():
+        assert run(estimates, "--out", os.devnull, "--events", os.devnull).exit_code == 0
+
+
+def test_a_track_is_not_tracked_again(estimates: Path, tmp_path: Path) -> None:
+    """Filtered rows are no independent estimates: the message names what is needed."""
+    out = tmp_path / "track.csv"
+    assert run(estimates, "--out", out).exit_code == 0
+    result = run(out, "--out", tmp_path / "again.csv")
+    assert result.exit_code == 1 and not (tmp_path / "again.csv").exists()
+    assert "has a column drift, as a track" in result.stderr and "modes.csv" in result.stderr
 
 
 def test_without_stage_and_names_modes_are_born(estimates: Path, tmp_path: Path) -> None:

@@ -41,6 +41,8 @@ def write(path: Path, names: str, *columns: np.ndarray, before: str = "") -> Pat
         ("Beschleunigung X", "acc_beschleunigung_x", 1.0),
         ("Following error [nm]", "delta_e_following_error_nm", 1e-9),
         ("Schleppfehler", "delta_e_schleppfehler", 1e-6),
+        ("PosErr", "delta_e_poserr", 1e-6),
+        ("err_um", "delta_e_err_um", 1e-6),
         ("PE(0) [mm]", "delta_e_pe_0_mm", 1e-3),
         ("sensor_b [V]", "acc_sensor_b", 1.0),
         ("acc_feed_g", "acc_feed_g", 9.80665),
