@@ -62,7 +62,8 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
     """
     prognosis, health, fleet = assessment.prognosis, assessment.latest_health, assessment.fleet
     highest = max((one.high for one in summary.health), default=1.0)
-    content = {
+    content = _track_content(assessment)
+    content |= {
         "assessment": assessment,
         "notices": notices(assessment),
         "summary": summary,
@@ -70,9 +71,8 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "first_limit": first_limit(prognosis),
         "before": before,
         "mark": _MARK,
-        "outside": list(_outside_map(assessment)),
+        "outside": list(_outside_map(assessment, content["mac"])),
         "news": before and [*text.changes(before, summary)],
-        **_track_content(assessment),
         "health": health,
         "pairs": [] if health is None else list(_pairs(health)),
         "fleet": fleet,
@@ -80,12 +80,16 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "pace": _pace,
         "fit": prognosis and chi_square_side(prognosis.chi_square, prognosis.degrees_of_freedom),
     }
-    draw = _track_pictures(assessment, content["influences"])
-    draw |= _health_pictures(assessment, summary.service)
-    pictures = {
-        key: figures.svg(plot, salt=f"p{k}", size=_SIZES.get(key[0], figures.SIZE))
-        for k, (key, plot) in enumerate(draw.items())
-    }
+    pictures: dict[tuple[str, ...], str] = {}
+
+    def add(plot: Callable[..., object], *key: str, **given: Any) -> None:
+        """Draw a picture of the page under its key."""
+        size = _SIZES.get(key[0], figures.SIZE)
+        draw = partial(plot, **given)
+        pictures[key] = figures.svg(draw, salt=f"p{len(pictures)}", size=size)
+
+    _draw_history(assessment, content, add)
+    _draw_life(assessment, content["pairs"], summary.service, add)
     for key, (whole, size) in _log_pictures(assessment).items():
         pictures[key, "all"] = figures.inline(whole, salt=key, size=size)
     # An HTML parser needs no namespaces; without them the page names no address at all.
@@ -145,9 +149,9 @@ def chi_square_side(value: float, dof: float) -> dict[str, Any] | None:
     return found | {"is_refuted": bool(chdtrc(dof, value) < MIN_FIT)}
 
 
-def _outside_map(assessment: Assessment) -> Iterator[dict[str, Any]]:
+def _outside_map(assessment: Assessment, mac: Mapping[str, float]) -> Iterator[dict[str, Any]]:
     """Yield the modes that moved alone: change, MAC, and since which log half of it is there."""
-    health, track, mac = assessment.health, assessment.track, _mac(assessment)
+    health, track = assessment.health, assessment.track
     # The most probable one, unless a parameter that is above its baseline is the cause.
     is_verdict = assessment.judgement.verdict == OUTSIDE_MAP and not assessment.risen
     for n, lone in enumerate(health.lone_modes if health and track else ()):
@@ -182,8 +186,9 @@ def _track_content(assessment: Assessment) -> dict[str, Any]:
             "largest_drift": float(np.nanmax(np.abs(np.expm1(track.drift[-1])), initial=0.0)),
         }
     corrected = [one for one in influences if one.values.size]
+    found = np.isfinite(history.ln_frequency)
     return content | {
-        "seen": _seen(history),
+        "seen": [mode for mode in history.modes if found[:, history.columns(mode)].any()],
         "influences": influences,
         "corrected": _grouped(corrected, attrgetter("covariate")),
         "uncorrected": list(_uncorrected(history, stage)),
@@ -272,26 +277,25 @@ def _pace(law: LawPrior, pace: Pace) -> str:
     return tr("{rate} per {distance} ({interval})", **own)
 
 
-def _track_pictures(
-    assessment: Assessment, influences: Sequence[CovariateEffect]
-) -> dict[tuple[str, ...], Any]:
+def _draw_history(
+    assessment: Assessment, content: Mapping[str, Any], add: Callable[..., None]
+) -> None:
+    """Draw modes, spectra over life, covariates and NIS, from `_track_content`."""
     history, track, waterfall = assessment.history, assessment.track, assessment.waterfall
-    draw: dict[tuple[str, ...], Any] = {}
     lives: dict[str, Any] = {"history": history, "track": track}
-    for mode in _seen(history):
-        draw["frequency", mode] = partial(figures.plot_frequencies, **lives, mode=mode)
-        draw["damping", mode] = partial(figures.plot_damping, **lives, mode=mode)
+    for mode in content["seen"]:
+        add(figures.plot_frequencies, "frequency", mode, **lives, mode=mode)
+        add(figures.plot_damping, "damping", mode, **lives, mode=mode)
     if waterfall is not None and history.has_odometer:
         moved = None if track is None else covariate_shifts(history, track, assessment.stage)
         lives |= {"waterfall": waterfall, "moved": moved}
-        draw["waterfall", "all"] = partial(figures.plot_waterfall, **lives)
-    for one in influences:
+        add(figures.plot_waterfall, "waterfall", "all", **lives)
+    for one in content["influences"]:
         if one.values.size:
             key = "influence", one.covariate, one.mode
-            draw[key] = partial(figures.plot_influence, influence=one, history=history)
-    if track is not None and _nis(track) is not None:
-        draw["nis", "all"] = partial(figures.plot_nis, track=track)
-    return draw
+            add(figures.plot_influence, *key, influence=one, history=history)
+    if content["nis"] is not None:
+        add(figures.plot_nis, "nis", "all", track=track)
 
 
 def _mac(assessment: Assessment) -> dict[str, float]:
@@ -318,24 +322,25 @@ def _log_pictures(assessment: Assessment) -> dict[str, tuple[Any, tuple[float, f
     return found
 
 
-def _health_pictures(assessment: Assessment, service: Service) -> dict[tuple[str, ...], Any]:
+def _draw_life(
+    assessment: Assessment,
+    pairs: Iterable[tuple[tuple[str, ...], str, float]],
+    service: Service,
+    add: Callable[..., None],
+) -> None:
+    """Draw health and remaining life, where there are any."""
     prognosis, health = assessment.prognosis, assessment.latest_health
     specs = {spec.name: spec for spec in assessment.stage.parameters}
-    draw: dict[tuple[str, ...], Any] = {}
-    if health is not None:
-        drawn: Any = partial(figures.plot_posterior, health=health)
-        for names, key, _ in _pairs(health):
-            draw["posterior", key] = partial(drawn, parameters=names)
-        drawn = partial(figures.plot_health, health=health)
-        for name in health.parameters:
-            draw["health", name] = partial(drawn, parameter=name, limit=limit_of(specs[name]))
+    for names, title, _ in pairs:
+        add(figures.plot_posterior, "posterior", title, health=health, parameters=names)
+    for name in () if health is None else health.parameters:
+        own: Any = {"health": health, "parameter": name, "limit": limit_of(specs[name])}
+        add(figures.plot_health, "health", name, **own)
     if prognosis is not None:
-        drawn = partial(figures.plot_life, prognosis=prognosis)
         for name in prognosis.parameters[:-1]:
-            draw["life", name] = partial(drawn, parameter=name, baseline=specs[name].baseline)
-        drawn = partial(figures.plot_survival, prognosis=prognosis)
-        draw["survival", "any"] = partial(drawn, service=service)
-    return draw
+            own = {"parameter": name, "baseline": specs[name].baseline}
+            add(figures.plot_life, "life", name, prognosis=prognosis, **own)
+        add(figures.plot_survival, "survival", "any", prognosis=prognosis, service=service)
 
 
 def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
@@ -346,12 +351,6 @@ def _pairs(health: Health) -> Iterator[tuple[tuple[str, ...], str, float]]:
     for i, j in combinations(range(len(names)), 2):
         title = tr("{one} against {other}", one=spell(names[i]), other=spell(names[j]))
         yield (names[i], names[j]), title, float(health.correlation[-1, i, j])
-
-
-def _seen(history: History) -> list[str]:
-    """Return the modes with at least one estimate."""
-    found = np.isfinite(history.ln_frequency)
-    return [mode for mode in history.modes if found[:, history.columns(mode)].any()]
 
 
 # Fleet page
