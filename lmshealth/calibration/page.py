@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -130,8 +130,8 @@ def render_page(
 ) -> str:
     """Render a page: ``good``, ``bad`` or ``open`` with headline and reasons, then its blocks."""
     state, headline, why = verdict
-    content = {"title": title, "sub": sub, "state": state, "headline": headline, "why": why}
-    return render("calibration.html.j2", **content, blocks=[asdict(one) for one in blocks])
+    content: dict[str, Any] = {"title": title, "sub": sub, "blocks": blocks}
+    return render("calibration.html.j2", state=state, headline=headline, why=why, **content)
 
 
 def verdict_of(check: CalibrationCheck) -> tuple[str, str, list[str]]:
