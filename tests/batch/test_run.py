@@ -990,6 +990,27 @@ def test_an_archive_of_bad_logs_only_is_an_error_with_its_reasons_written(
     assert refused["empty.csv"] == "empty"
 
 
+def test_a_table_that_cannot_be_read_is_named_before_the_logs(
+    tmp_path: Path, modes_only: Stage
+) -> None:
+    """What its rows state of the logs is missing for that: the logs are not what to correct."""
+    logs = tmp_path / "logs"
+    logs.mkdir()
+    (logs / "one.csv").write_text("# sample_rate_hz: 1000\nacc_pitch_m_s2\n0\n1\n0\n")
+    (logs / "manifest.csv").write_text("file;stage;travel_km\none.csv;axis-7;0\n")
+    with pytest.raises(NothingUsable, match=r"log: manifest\.csv: columns are file;stage"):
+        run(logs, [modes_only], tmp_path / "out")
+
+
+def test_names_that_are_almost_the_same_are_noted() -> None:
+    """Numbers tell machines apart, case and signs hardly; names without a log now are noted too."""
+    names = ["axis-7", "axis-8", "Axis 7", "axis_7", "press/A"]
+    alike, gone = running._of_names(names, [*names, "axis-9"])
+    assert "differ only in case or signs: axis-7, Axis 7, axis_7; " in alike
+    assert "without a usable log in this run: axis-9; " in gone
+    assert list(running._of_names(["axis-7", "axis-8"], ["axis-8"])) == []
+
+
 def test_an_empty_folder_is_an_error(tmp_path: Path, modes_only: Stage) -> None:
     """A folder without a log has its own error."""
     (tmp_path / "logs").mkdir()
