@@ -41,11 +41,14 @@ def _detections(
     ctx: click.Context, option: click.Parameter, values: tuple[str, ...]
 ) -> list[tuple[str, float]]:
     """Parse NAME=LOSS, without duplicates."""
-    pairs = [value.split("=") for value in values]
-    try:
-        return list(dict.fromkeys((name, float(loss)) for name, loss in pairs))
-    except ValueError as error:
-        raise click.BadParameter(f"needs NAME=LOSS with a number, got {values}") from error
+    found = dict[tuple[str, float], None]()
+    for value in values:
+        name, _, loss = value.partition("=")
+        try:
+            found[name, float(loss)] = None
+        except ValueError as error:
+            raise click.BadParameter(f"needs NAME=LOSS with a number, got {value!r}") from error
+    return list(found)
 
 
 @options.command(

@@ -99,5 +99,5 @@ def test_losses_are_read_once_each() -> None:
 @pytest.mark.parametrize("value", ["a", "a=", "a=much", "a=b=0.1", "0.1"])
 def test_what_is_no_name_and_number_is_wrong_usage(value: str) -> None:
     """The error contains the expected form and the input."""
-    with pytest.raises(click.BadParameter, match=f"NAME=LOSS.*{value}"):
+    with pytest.raises(click.BadParameter, match=f"NAME=LOSS.*'{value}'"):
         read_detect("--detect", value)
