@@ -72,8 +72,24 @@ def replacing(target: Path) -> Iterator[IO[str]]:
         yield stream
 
 
+def _is_stream(target: Path) -> bool:
+    """Return whether a path is a device or a pipe, which takes what is written and stays.
+
+    Of links only those of the system's own folder are followed, such as /dev/stdout.
+    """
+    is_own = target.absolute().parent == Path("/dev")
+    try:
+        mode = target.stat(follow_symlinks=is_own).st_mode
+    except OSError:
+        return False
+    return is_own or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+
+
 @contextmanager
 def _in_place_of(target: Path) -> Iterator[Path]:
+    if _is_stream(target):
+        yield target
+        return
     # A random name: nobody can have put a link there.
     part = target.with_name(f".{secrets.token_hex(8)}.part")
     try:

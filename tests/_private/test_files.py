@@ -10,7 +10,13 @@ from pathlib import Path
 import pytest
 import xarray as xr
 
-from lmshealth._private.files import remove_abandoned, write_bytes, write_draws, write_text
+from lmshealth._private.files import (
+    _is_stream,
+    remove_abandoned,
+    write_bytes,
+    write_draws,
+    write_text,
+)
 from lmshealth.errors import BadTable
 
 
@@ -21,6 +27,22 @@ def test_folders_are_made_and_nothing_else_is_left(tmp_path: Path) -> None:
         write_text(target, text)
         assert target.read_bytes().decode() == text
     assert os.listdir(target.parent) == ["table.csv"]
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names on this system")
+def test_a_pipe_takes_what_is_written_and_stays(tmp_path: Path) -> None:
+    """So does a device: as root, a file in its place would have replaced it for all programs."""
+    os.mkfifo(pipe := tmp_path / "pipe")
+    reader = os.open(pipe, os.O_RDWR)
+    try:
+        write_text(pipe, "one,")
+        write_bytes(pipe, b"two")
+        assert os.read(reader, 100) == b"one,two" and pipe.is_fifo()
+    finally:
+        os.close(reader)
+    (tmp_path / "link").symlink_to(pipe)
+    found = [os.devnull, "/dev/stdout", tmp_path / "link", tmp_path, tmp_path / "none"]
+    assert [_is_stream(Path(one)) for one in found] == [True, True, False, False, False]
 
 
 def test_a_link_in_the_place_of_a_file_is_replaced(tmp_path: Path) -> None:

@@ -236,7 +236,7 @@ def test_last_logs_that_are_left_out_are_counted(
     whole = replace(bad, track=every)
     assert headline(summarise(whole, whole.service())).endswith("last log, which deviates")
     (whole_told,) = (one for one in notices(whole) if one.code == "last-logs-left-out")
-    assert whole_told.where == "pitch, roll and yaw"
+    assert whole_told.where == "pitch, roll, yaw"
     assert "unconfirmed-jump" in make_status(bad, after).conditions
     # A second log alike leaves the jump unconfirmed; one bad log does not hide a service.
     later = replace(good, track=replace(good.track, suspected=Step.found("step", n - 2, n)))

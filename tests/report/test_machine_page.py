@@ -81,7 +81,8 @@ def test_the_first_screen_of_a_worn_stage(make: Maker, tmp_path: Path) -> None:
     assert f"By {by.isoformat()}" in first and "accepted risk of 5 %" in first
     assert re.search(r"Median [\d ]+ km [\d ]+ days", first)
     assert "service planned for 2027-03-01" in first
-    plan = f"Order and plan a preload adjustment before {by.isoformat()}; until then a log"
+    work = "a preload adjustment and a tightening of the mount"
+    plan = f"Order and plan {work} before {by.isoformat()}; until then a log"
     assert plan in first.replace("\u2011", "-")
     assert "Guide preload over 1 600 km: 1" in plain(first) and "limit of 60 %" in plain(first)
     assert assessment.prognosis is not None
