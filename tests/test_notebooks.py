@@ -20,11 +20,14 @@ def test_a_notebook_has_a_question_and_its_limits(path: Path) -> None:
     assert f"[{path.stem}]({path.name})" in path.with_name("README.md").read_text(encoding="utf-8")
 
 
-# Chains of full length are those of the README and of the examples, see `test_examples`.
+# Chains of full length are those of the README and of the examples, see `test_examples`; pictures
+# of the pages beside a notebook, of which no cell shows one, are those of `tests.report`.
 QUICK = (
-    "from studies.harness.command_line import quick_posteriors\n"
-    "quick = quick_posteriors()\n"
-    "quick.__enter__()"
+    "from contextlib import ExitStack\n"
+    "from studies.harness.command_line import no_pictures, quick_posteriors\n"
+    "quick = ExitStack()\n"
+    "for one in (quick_posteriors(), no_pictures()):\n"
+    "    quick.enter_context(one)"
 )
 
 

@@ -39,6 +39,8 @@ _MOST_MEMORY_MB = 400
 _LONGEST_MESSAGE = 700
 # On SQLite every so many of the names, SQL and markup, are tried; on PostgreSQL all.
 _EVERY = 19
+# Names, tables and links act by no number of samples: logs have two short channels.
+_SECONDS, _LEFT_OUT = 3.0, "acc_pitch_m_s2"
 _TALKATIVE = (
     "import logging, sys; logging.basicConfig(level=logging.DEBUG);"
     "from lmshealth.cli.main import main; main(sys.argv[1:])"
@@ -59,7 +61,9 @@ def lmshealth(*words: str | Path, cwd: Path) -> Done:
 def attack(folder: Path, url: str, password: str, *, every: int) -> dict[str, list[str]]:
     """Run and report a hostile archive; return what is wrong, by what is required."""
     logs, out = folder / "logs", folder / "out"
-    machines, refused = hostile.make_hostile(folder, recordings(1)[0], every=every)
+    (base,) = recordings(1, _SECONDS)
+    del base[_LEFT_OUT]
+    machines, refused = hostile.make_hostile(folder, base, every=every)
     (folder / "stage.toml").write_text(hostile.STAGE)
     links = _links(folder, out)
     guards.plant(url)
