@@ -166,10 +166,10 @@ def test_laws_and_health_are_those_of_importance_sampling(
 
 @pytest.mark.slow
 def test_importance_sampling_alone_has_the_same_posterior(
-    found: LifePosterior, history: History, stage: Stage
+    found: LifePosterior, unchained: LifePosterior
 ) -> None:
     """Without chains quantiles are the same within their error, of as many draws."""
-    quick = fit_life(history, stage, 11, chains=False)
+    quick = unchained
     assert quick.health.shape == found.health.shape == (4, 1000, 2)
     assert (quick.sampler, found.sampler) == ("importance", "emcee")
     (way,) = quick.scenarios
