@@ -43,14 +43,17 @@ _EVERY = 19
 _SECONDS, _LEFT_OUT = 3.0, "acc_pitch_m_s2"
 _TALKATIVE = (
     "import logging, sys; logging.basicConfig(level=logging.DEBUG);"
-    "from lmshealth.cli.main import main; main(sys.argv[1:])"
+    "{more}from lmshealth.cli.main import main; main(sys.argv[1:])"
 )
+# Pages have the pictures that the run drew from the same contents (`tests.batch.test_run`).
+_NO_PICTURES = "from lmshealth.report import figures; figures.inline = lambda *_, **__: '';"
 Done = subprocess.CompletedProcess[str]
 
 
-def lmshealth(*words: str | Path, cwd: Path) -> Done:
-    """Run a command at the most talkative level of logging."""
-    command = [sys.executable, "-c", _TALKATIVE, *(str(word) for word in words)]
+def lmshealth(*words: str | Path, cwd: Path, more: str = "") -> Done:
+    """Run a command at the most talkative level of logging, after more code."""
+    script = _TALKATIVE.format(more=more)
+    command = [sys.executable, "-c", script, *(str(word) for word in words)]
     paths = {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     return subprocess.run(
         command, capture_output=True, cwd=cwd, check=False, text=True, errors="surrogateescape",
@@ -80,8 +83,8 @@ def attack(folder: Path, url: str, password: str, *, every: int) -> dict[str, li
     ]
     done = [lmshealth("run", logs, *words, "--out", out, cwd=folder)]
     if every == 1:
-        words = ["--store", url, "--workers", "1"]
-        done.append(lmshealth("report", *words, "--out", out / "again", cwd=folder))
+        words = ["--store", url, "--workers", "1", "--out", str(out / "again")]
+        done.append(lmshealth("report", *words, cwd=folder, more=_NO_PICTURES))
     # Who names a link means what it points to.
     named = [path for path in sorted(logs.glob("*.csv")) if not path.is_symlink()]
     # Names are the same in all modes: a band spares most of the time.
