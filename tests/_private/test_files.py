@@ -41,8 +41,12 @@ def test_a_pipe_takes_what_is_written_and_stays(tmp_path: Path) -> None:
     finally:
         os.close(reader)
     (tmp_path / "link").symlink_to(pipe)
-    found = [os.devnull, "/dev/stdout", tmp_path / "link", tmp_path, tmp_path / "none"]
-    assert [_is_stream(Path(one)) for one in found] == [True, True, False, False, False]
+    found = [
+        Path(os.devnull),
+        Path("/dev/stdout"),
+        *(tmp_path / end for end in ("link", "", "none")),
+    ]
+    assert [_is_stream(one) for one in found] == [True, True, False, False, False]
 
 
 def test_a_link_in_the_place_of_a_file_is_replaced(tmp_path: Path) -> None:

@@ -176,8 +176,8 @@ def test_work_that_was_entered_is_not_ordered_again(
     assert ("not known before a log" in capsys.readouterr().out) == is_worked
     if ordered:
         orders = {"preload": "a preload adjustment", "mount": "a tightening of the mount"}
-        work = " and ".join(orders[part] for part in ordered.split())
-        assert f" {work} " in text.next_step(summary.step)
+        ordered_work = " and ".join(orders[part] for part in ordered.split())
+        assert f" {ordered_work} " in text.next_step(summary.step)
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:
