@@ -54,7 +54,7 @@ def write_text(target: Path, text: str) -> None:
 
 def write_bytes(target: Path, content: bytes) -> None:
     """Write bytes in the same way."""
-    with _writing(target), _in_place_of(target) as part, part.open("wb") as stream:
+    with _writing(target), _in_place_of(target) as part, part.open("ab") as stream:
         stream.write(content)
 
 
@@ -67,22 +67,20 @@ def replacing(target: Path) -> Iterator[IO[str]]:
     odd = "backslashreplace"  # one unprintable name must not keep all others from being written
     with (
         _in_place_of(target) as part,
-        part.open("w", encoding="utf-8", errors=odd, newline="\n") as stream,
+        part.open("a", encoding="utf-8", errors=odd, newline="\n") as stream,
     ):
         yield stream
 
 
 def _is_stream(target: Path) -> bool:
-    """Return whether a path is a device or a pipe, which takes what is written and stays.
+    """Return whether a path of the system is a device or a stream, which stays in its place.
 
-    Of links only those of the system's own folder are followed, such as /dev/stdout.
+    Such as /dev/null, and the links /dev/stdout and /dev/fd/63. In other folders nobody writes to
+    what may be in the place of a file: a pipe without a reader would stop a run.
     """
-    is_own = target.absolute().parent == Path("/dev")
-    try:
-        mode = target.stat(follow_symlinks=is_own).st_mode
-    except OSError:
+    if not any(target.absolute().is_relative_to(top) for top in ("/dev", "/proc")):
         return False
-    return is_own or stat.S_ISCHR(mode) or stat.S_ISFIFO(mode)
+    return target.is_symlink() or (target.exists() and not target.is_file())
 
 
 @contextmanager

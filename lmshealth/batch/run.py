@@ -16,6 +16,7 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryFile
 from typing import Any
+from unicodedata import normalize
 
 import msgspec
 
@@ -39,7 +40,7 @@ from lmshealth.batch.store import Resources, Store, cached, default_url, unpack_
 from lmshealth.batch.workers import Progress
 from lmshealth.errors import LmshealthError, NothingUsable
 from lmshealth.io.log import Refusal
-from lmshealth.io.manifest import MISSPELT, NOT_LOGS
+from lmshealth.io.manifest import MANIFEST, MISSPELT, NOT_LOGS
 from lmshealth.io.refusal import listed, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
@@ -394,12 +395,12 @@ def _of_names(machines: Iterable[str], announced: Iterable[str]) -> Iterator[str
     """
     groups: dict[str, list[str]] = {}
     for name in machines:
-        groups.setdefault(re.sub(r"[\W_]", "", name).casefold(), []).append(name)
+        groups.setdefault(_bare(name), []).append(name)
     for alike in groups.values():
         if len(alike) > 1:
             yield (
-                f"machines whose names differ only in case or signs: {listed(alike)}; if they are "
-                "one, give it one name in manifest.csv"
+                "machines whose names differ only in case, spaces or punctuation: "
+                f"{listed(alike)}; if they are one machine, use one name for it"
             )
     present = {name for alike in groups.values() for name in alike}
     if gone := [name for name in announced if name not in present]:
@@ -409,10 +410,17 @@ def _of_names(machines: Iterable[str], announced: Iterable[str]) -> Iterator[str
         )
 
 
+def _bare(name: str) -> str:
+    """Return a name without case, spaces and punctuation, but between digits and a last sign."""
+    plain = normalize("NFKC", name).casefold()
+    between = re.sub(r"(?<=\d)[\W_]+(?=\d)", "|", plain)
+    return re.sub(r"[^\w|]|_", "", between) + (plain[-1] if plain[-1:] in ("+", "-") else "")
+
+
 def _of_tables(refused: Iterable[Refusal]) -> str:
-    """Return why a table beside the logs cannot be read: the logs may be refused for that."""
-    tables = (one for one in refused if PurePosixPath(one.log).name in NOT_LOGS)
-    first = next(tables, None)
+    """Return why a manifest cannot be read: the logs may be refused for that."""
+    tables = (one for one in refused if PurePosixPath(one.log).name == MANIFEST)
+    first = next((one for one in tables if one.reason not in (MISSPELT, "bad-row")), None)
     return "" if first is None else f"{first.log}: {first.detail}; "
 
 

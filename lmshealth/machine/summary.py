@@ -100,7 +100,8 @@ def next_step(assessment: Assessment, service: Service) -> NextStep:
         for name in (*names, *lost)
         if not done & {*RESTORING.get(words.get(name, ""), RESETS)}
     }
-    is_worked = bool(done) and not left.keys() & {*lost}
+    needed = {*lost, *(names if kind in ("now", "by") else ())}
+    is_worked = bool(done) and not left.keys() & needed
     case = "worked" if is_worked else _class_of(assessment), kind, age
     step = step_of(*case)
     if prognosis is None:
@@ -275,13 +276,13 @@ def summarise(assessment: Assessment, service: Service, file: str = "") -> Summa
     modes, deviates = assessment.track.modes if assessment.track else (), (*assessment.left_out,)
     if set(modes) == {*deviates}:
         deviates = ("all",)
-    step = next_step(assessment, service)
+    step, urgency = next_step(assessment, service), assessment.urgency(service)
     if step.kind == "see-effect":  # the day was that of the state before the work
         service = decide(None, assessment.stage.description.decision)
     return Summary(
         file=file,
         identity=judgement.stage,
-        urgency=assessment.urgency(service),
+        urgency=urgency,
         recorded_at=judgement.recorded_at,
         baseline_at=[*history.recorded_at, judgement.recorded_at][history.baseline],
         description=assessment.stage.digest,

@@ -45,7 +45,8 @@ _SET_POINT = re.compile(r"ref|\bset|cmd|command|soll|target|demand", re.IGNORECA
 # By prefix of a signal: words, dimension, SI value of one without a unit, and SI unit.
 _SIGNALS = {
     "delta_e": (
-        "follow|error|err(?![a-z])|deviat|lag|delta|schlepp|regelabw|PE|pos_?(?:diff|err)",
+        "follow|error|deviat|lag|delta|schlepp|regelabw|PE|pos_?(?:diff|err)"
+        "|(?<![a-z0-9][_ ])err(?![a-z])",  # alone: crc_err and the like are flags
         *("length", 1e-6, "m"),
     ),
     "acc": ("acc|beschl|vibr", "acceleration", 1.0, "m/s²"),

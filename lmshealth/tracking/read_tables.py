@@ -83,8 +83,8 @@ def read_estimates(
     table = _read(path, _NEEDED, "estimate")
     if _DRIFT in table.columns:
         raise BadTable(
-            f"{path}: has a column {_DRIFT}, as a track, whose rows depend on each other by its "
-            "filter; needed are independent estimates, such as modes.csv"
+            f"{path}: has a column {_DRIFT}, so it is a track: a filter has made its rows depend "
+            "on each other; needed are independent estimates, such as modes.csv"
         )
     covariates = [*known_covariates()]
     if stage is not None:

@@ -1003,10 +1003,10 @@ def test_a_table_that_cannot_be_read_is_named_before_the_logs(
 
 
 def test_names_that_are_almost_the_same_are_noted() -> None:
-    """Numbers tell machines apart, case and signs hardly; names without a log now are noted too."""
-    names = ["axis-7", "axis-8", "Axis 7", "axis_7", "press/A"]
+    """Numbers tell machines apart, case and punctuation hardly; nor is one forgotten in silence."""
+    names = ["axis-7", "axis-8", "Axis 7", "axis_7", "press/A", "axis-1.2", "axis-12", "X+", "X-"]
     alike, gone = running._of_names(names, [*names, "axis-9"])
-    assert "differ only in case or signs: axis-7, Axis 7, axis_7; " in alike
+    assert "only in case, spaces or punctuation: axis-7, Axis 7, axis_7; " in alike
     assert "without a usable log in this run: axis-9; " in gone
     assert list(running._of_names(["axis-7", "axis-8"], ["axis-8"])) == []
 

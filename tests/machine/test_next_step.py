@@ -127,7 +127,7 @@ def test_the_cause_of_a_jump_is_sought_where_it_is(make: Maker) -> None:
         ("preload", ("mount-tightened",), 0, "preload"),
         ("preload", ("regrease",), 0, "preload"),
         ("preload", ("regrease",), 1, "mount preload"),
-        ("preload", ("preload-adjust",), 1, ""),
+        ("preload", ("preload-adjust",), 1, "mount"),
         ("mount", ("mount-tightened",), 1, ""),
         ("both", (), 0, "preload mount"),
         ("both", ("preload-adjust",), 0, "mount"),

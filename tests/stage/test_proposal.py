@@ -62,13 +62,13 @@ def test_a_signal_is_found_and_read(tmp_path: Path, name: str, target: str, scal
 
 def test_the_remaining_quantities(tmp_path: Path) -> None:
     """Set points, currents and further columns of times are recognised; a position is no error."""
-    names = "Zeit [ms],Acc_X,Soll [mm],I_q [A],Pos [mm],Timestamp"
-    columns = 1e3 * TIME, NOISE[0], TIME, NOISE[1], NOISE[2], TIME
+    names = "Zeit [ms],Acc_X,Soll [mm],I_q [A],Pos [mm],Timestamp,crc_err"
+    columns = 1e3 * TIME, NOISE[0], TIME, NOISE[1], NOISE[2], TIME, NOISE[1]
     text, guesses = propose(write(tmp_path / "a.csv", names, *columns))
     found = {g.source: g.target for g in guesses}
     assert found == {
         "Zeit": "time_ms", "Acc_X": "acc_x", "Soll": "reference_position_mm",
-        "I_q": "current_i_q_a", "Pos": "", "Timestamp": "",
+        "I_q": "current_i_q_a", "Pos": "", "Timestamp": "", "crc_err": "",
     }  # fmt: skip
     assert "assumed: set it" in text
 
