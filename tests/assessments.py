@@ -18,6 +18,7 @@ from msgspec.structs import asdict
 
 from lmshealth._private.arrays import FloatArray
 from lmshealth._private.files import write_text
+from lmshealth._private.tables import Row
 from lmshealth.io.log import Notice, Refusal
 from lmshealth.life.health import Health
 from lmshealth.life.prognosis import Prognosis
@@ -27,6 +28,7 @@ from lmshealth.machine.status import make_status, on_day
 from lmshealth.machine.summary import Summary, summarise
 from lmshealth.modal.spectra_summary import Waterfall
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
+from lmshealth.report.tables import machine_tables
 from lmshealth.signal.spectral_lines import Line
 from lmshealth.stage.degradation_laws import HertzWear, Law, Loosening
 from lmshealth.stage.description import Stage, load_stage
@@ -399,6 +401,11 @@ def worn(folder: Path, identity: str = "M7-Y") -> Assessment:
         seed=0,
         waterfall=make_waterfall(history),
     )
+
+
+def tables_of(assessment: Assessment) -> dict[str, list[Row]]:
+    """Return the rows of the tables of a machine, as a run writes them."""
+    return machine_tables(assessment, summarise(assessment, assessment.service()))
 
 
 def leaves(value: Any, path: str = "") -> Iterator[tuple[str, Any]]:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from xarray import DataTree
 
 
+# Folders of the system whose devices, and links to streams, are written to and stay.
+_STREAMS = ("/dev", "/dev/fd", "/proc/self/fd")
 # Far above every table that is read as a whole.
 _LARGEST_TABLE = 64 << 20
 
@@ -73,12 +75,12 @@ def replacing(target: Path) -> Iterator[IO[str]]:
 
 
 def _is_stream(target: Path) -> bool:
-    """Return whether a path of the system is a device or a stream, which stays in its place.
+    """Return whether a path is a device or a stream of the system, such as /dev/stdout.
 
-    Such as /dev/null, and the links /dev/stdout and /dev/fd/63. In other folders nobody writes to
-    what may be in the place of a file: a pipe without a reader would stop a run.
+    In other folders, /dev/shm among them, what is in the place of a file is replaced: a pipe
+    without a reader would stop a run, and a link may have been put there by others.
     """
-    if not any(target.absolute().is_relative_to(top) for top in ("/dev", "/proc")):
+    if str(target.absolute().parent) not in _STREAMS:
         return False
     return target.is_symlink() or (target.exists() and not target.is_file())
 

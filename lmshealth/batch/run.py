@@ -276,12 +276,9 @@ def run(
         notes += _of_names(ingested.machines, [one.stage for one in statuses])
     counts, lost = _count(ingested, refused, made)
     if not machines:
-        raise NothingUsable(
-            f"{folder}: no usable log: {_of_tables(refused)}{len(ingested.logs)} found"
-            f"{_others(folder, ingested.logs)}, {len(lost)} refused{_commonest(refused, lost)}; "
-            f"{out / 'refused.csv'} lists all"
-            + "".join(f"; {name}: {why}" for name, why in unsent.items())
-        )
+        why = _none_usable(folder, ingested.logs, refused, lost)
+        failed_alerts = "".join(f"; {name}: {reason}" for name, reason in unsent.items())
+        raise NothingUsable(f"{why}; {out / 'refused.csv'} lists all{failed_alerts}")
     misspelt = tuple(f"{one.log}: {one.detail}" for one in refused if one.reason == MISSPELT)
     return RunResult(
         index=out / "index.html",
@@ -417,11 +414,16 @@ def _bare(name: str) -> str:
     return re.sub(r"[^\w|]|_", "", between) + (plain[-1] if plain[-1:] in ("+", "-") else "")
 
 
-def _of_tables(refused: Iterable[Refusal]) -> str:
-    """Return why a manifest cannot be read: the logs may be refused for that."""
+def _none_usable(
+    folder: Path, logs: frozenset[str], refused: Sequence[Refusal], lost: set[str]
+) -> str:
+    """Return why no log is usable; first of a manifest that cannot be read, if there is one."""
     tables = (one for one in refused if PurePosixPath(one.log).name == MANIFEST)
     first = next((one for one in tables if one.reason not in (MISSPELT, "bad-row")), None)
-    return "" if first is None else f"{first.log}: {first.detail}; "
+    manifest = "" if first is None else f"{first.log}: {first.detail}; "
+    found = f"{len(logs)} found{_others(folder, logs)}"
+    why = f"{len(lost)} refused{_commonest(refused, lost)}"
+    return f"{folder}: no usable log: {manifest}{found}, {why}"
 
 
 def _commonest(refused: Iterable[Refusal], lost: Container[str]) -> str:

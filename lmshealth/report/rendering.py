@@ -19,6 +19,7 @@ from markupsafe import Markup
 from lmshealth._private.files import write_bytes
 from lmshealth._private.tables import TABLES
 from lmshealth.errors import LmshealthError
+from lmshealth.io.manifest import NOT_LOGS
 from lmshealth.report import constants, language, text
 
 
@@ -76,7 +77,7 @@ def _environment() -> Any:
     pages.filters |= {"place": place, "sha256": sha256, "translated_svg": translated_svg}
     pages.filters |= {name: getattr(language, name) for name in ("sentence", "is_known", "label")}
     pages.globals |= {"covariate": text.covariate, "constants": constants, "tables": TABLES}
-    pages.globals |= {"language": language.language, "_n": _counted}
+    pages.globals |= {"language": language.language, "_n": _counted, "not_logs": NOT_LOGS}
     return pages
 
 

@@ -6,6 +6,7 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import pytest
 import xarray as xr
@@ -47,6 +48,9 @@ def test_a_stream_takes_what_is_written_and_stays(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(os.devnull)
     others = [tmp_path / name for name in ("link", "", "none", "pipe")]
     assert not any(map(_is_stream, others))
+    with TemporaryDirectory(dir="/dev/shm" if os.path.isdir("/dev/shm") else None) as shared:
+        (link := Path(shared) / "link").symlink_to(os.devnull)
+        assert not _is_stream(link)
     assert _is_stream(Path(os.devnull)) and _is_stream(Path("/dev/stdout"))
     write_text(pipe, "a file")
     assert pipe.read_text() == "a file"
@@ -108,6 +112,7 @@ def test_a_failure_to_write_is_an_error(tmp_path: Path) -> None:
 HOLD = """
 import sys, time
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from lmshealth._private.files import replacing
 with replacing(Path(sys.argv[1])) as stream:
     print("writing", flush=True)

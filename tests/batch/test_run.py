@@ -58,7 +58,6 @@ from lmshealth.modal import identification
 from lmshealth.modal.identification import ModalReading, read_modes
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.pages import make_page
-from lmshealth.report.tables import machine_tables
 from lmshealth.stage.description import LifeSpec, Stage, load_stage
 from lmshealth.stage.priors import Lognormal
 from lmshealth.tracking.maintenance import NO_MAINTENANCE
@@ -67,7 +66,7 @@ from lmshealth.tracking.track import accepted_estimates, track
 from studies.cost.new_log.life import apart
 from studies.harness import servers
 from studies.modes.frf import hammer
-from tests.assessments import Maker, make
+from tests.assessments import Maker, make, tables_of
 from tests.signals import ARCHIVE_MODES, sine, write_archive, write_archive_stage, write_log
 from tests.stops import Ring, stop
 
@@ -1112,15 +1111,12 @@ def test_machines_are_calibrated_by_the_ended_lives_of_their_fleet(make: Maker) 
     [made] = assessing._update(((machine, "key", None, lives), pack(own), None))
     assert isinstance(made, PackedAssessment)
     found: Assessment = unpack(made.content, Assessment)
-    tables = machine_tables(found, summarise(found, found.service()))
+    tables = tables_of(found)
     row = tables["prognosis"][-1]
     travel = np.quantile(own.prognosis.remaining[:, -1], 0.01, method="inverted_cdf")
     assert row["rul_km_calibrated"] == pytest.approx(travel / 1000)
     assert (row["calibrated_coverage"], row["calibrated_lives"]) == (pytest.approx(0.9), 9)
-    assert (
-        machine_tables(own, summarise(own, own.service()))["prognosis"][-1]["calibrated_lives"]
-        is None
-    )
+    assert tables_of(own)["prognosis"][-1]["calibrated_lives"] is None
     [few] = assessing._update(((machine, "key", None, lives[:8]), pack(own), None))
     assert isinstance(few, PackedAssessment)
     assert unpack(few.content, Assessment).calibration is None

@@ -18,11 +18,10 @@ from lmshealth.machine.status import make_status, notices
 from lmshealth.machine.summary import summarise
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.report.language import in_language, sentence
-from lmshealth.report.tables import machine_tables
 from lmshealth.report.text import changes, headline, service_on_day
 from lmshealth.stage.description import load_stage
 from lmshealth.tracking.history import Step
-from tests.assessments import Assessment, Maker, make, nothing
+from tests.assessments import Assessment, Maker, make, nothing, tables_of
 from tests.lives import FREQUENCY, MODES, make_reading, make_stage
 
 __all__ = ["make"]
@@ -66,11 +65,7 @@ def test_each_cause_has_its_notice(make: Maker, code: str) -> None:
     }
     bad = replace(good, **wrong[code])
     assert codes(bad) == {code}
-    (row, *_) = [
-        row
-        for row in machine_tables(bad, summarise(bad, bad.service()))["warnings"]
-        if row["code"] == code
-    ]
+    (row, *_) = [row for row in tables_of(bad)["warnings"] if row["code"] == code]
     assert tuple(row) == TABLES["warnings"].names
     assert row["what"].endswith(".")
 

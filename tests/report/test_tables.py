@@ -17,7 +17,7 @@ from lmshealth.life.prognosis import Prognosis
 from lmshealth.life.verdict import Verdict
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.service import decide, probability_before
-from lmshealth.machine.summary import prognosis_rows, summarise, summarise_life
+from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.modal.log_estimates import LogEstimates
 from lmshealth.modal.modes import Modes
 from lmshealth.report.tables import (
@@ -25,7 +25,6 @@ from lmshealth.report.tables import (
     join_csv,
     lines_rows,
     log_tables,
-    machine_tables,
     modes_rows,
     refused_rows,
     track_rows,
@@ -35,6 +34,7 @@ from lmshealth.stage.description import Decision, Stage, load_stage
 from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.history import History, Series
 from lmshealth.tracking.track import Effect, Track
+from tests.assessments import tables_of
 from tests.lives import health_of
 from tests.signals import write_archive_stage
 
@@ -138,10 +138,7 @@ def frame(table: str, rows: Sequence[Row]) -> pd.DataFrame:
 
 def frames(readings: Sequence[LogEstimates], made: Assessment) -> dict[str, pd.DataFrame]:
     """Make the tables of one machine."""
-    found = {
-        name: frame(name, own)
-        for name, own in machine_tables(made, summarise(made, made.service())).items()
-    }
+    found = {name: frame(name, own) for name, own in tables_of(made).items()}
     of_logs = [log_tables(reading) for reading in readings]
     for name in of_logs[0] if of_logs else ():
         text = "".join(join_csv([own[name] for own in of_logs]))
