@@ -3,6 +3,7 @@
 No message quotes the secrets of an address.
 """
 
+import logging
 import os
 import re
 import socket
@@ -21,6 +22,9 @@ from sqlalchemy.schema import CreateTable
 
 from lmshealth.batch import constants
 from lmshealth.errors import LmshealthError
+
+# A run that is interrupted while a connection returns to its pool would print a traceback.
+logging.getLogger("sqlalchemy").addHandler(logging.NullHandler())
 
 INSERT: dict[str, Any] = {"sqlite": sqlite.insert, "postgresql": postgresql.insert}
 """Insert statements that know of conflicts, by the kind of database."""

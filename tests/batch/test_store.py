@@ -6,6 +6,7 @@ import os
 import signal
 import socket
 import sqlite3
+import subprocess
 import sys
 import time
 from collections.abc import Callable
@@ -444,6 +445,26 @@ def test_one_run_at_a_time_is_alone(url: str) -> None:
             first.put("hashed", {"l": b"2"})
             raise KeyboardInterrupt
         assert dict(second.of_keys("hashed", ["k", "l"])) == {"k": b"1"}
+
+
+def test_an_interrupt_as_a_connection_returns_prints_nothing(file_url: str) -> None:
+    """The pool of connections logs the traceback of an interrupt, which nothing else handles."""
+    code = (
+        "import sys\n"
+        "from sqlalchemy import event\n"
+        "from sqlalchemy.pool import Pool\n"
+        "from lmshealth.batch.store import Store\n"
+        "def interrupt(*_): raise KeyboardInterrupt\n"
+        "store = Store(sys.argv[1])\n"
+        "event.listen(Pool, 'reset', interrupt)\n"
+        "try:\n"
+        "    store.put('hashed', {'k': b'1'})\n"
+        "except KeyboardInterrupt:\n"
+        "    print('interrupted')\n"
+    )
+    words = [sys.executable, "-c", code, file_url]
+    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("interrupted\n", "")
 
 
 def test_a_store_in_a_read_only_folder_is_read(
