@@ -20,7 +20,7 @@ from lmshealth.life.health import Health, epochs_to_publish, health_of, infer_dr
 from lmshealth.life.posterior.fit import LifePosterior, fit_life
 from lmshealth.life.prognosis import prognosis_of
 from lmshealth.life.verdict import doubt_of_names
-from lmshealth.machine.service import decide, probability_before
+from lmshealth.machine.service import decide, probability_before, without_limits
 from lmshealth.machine.summary import prognosis_rows, summarise_life
 from lmshealth.report import tables
 from lmshealth.stage.constants import MOST_COST_RATIO, RISK
@@ -32,6 +32,13 @@ from lmshealth.tracking.history import (
     contradiction_notices,
     doubt_of_clock,
     missing_mode_notices,
+)
+from lmshealth.tracking.maintenance import (
+    Action,
+    Maintenance,
+    maintenance_notices,
+    read_actions,
+    restored,
 )
 from lmshealth.tracking.read_tables import has_drifts, read_drifts, read_machines
 from lmshealth.tracking.track import accepted_estimates, outlier_refusals, smooth
@@ -194,13 +201,19 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     """Read the machines of a table of estimates, and print what it lacks."""
     machines, notes = read_machines(table, given["stage"], **_reading(given))
     print_notes(notes)
+    work = Maintenance(_actions(given))
     for history, refused in machines:
-        found = missing_mode_notices(history, refused)
+        found = maintenance_notices(work.of(history.stage), history.recorded_at)
+        found += missing_mode_notices(history, refused)
         found += contradiction_notices(history, refused)
         found += covariate_notices(history.covariates, given["stage"])
         # What is serious is printed as the reason why there is no life.
         print_notes(f"{history.stage}: {one}" for one in found if one.severity != "serious")
     return machines
+
+
+def _actions(given: dict[str, Any]) -> tuple[Action, ...]:
+    return read_actions(given["maintenance"], given["latest"]) if given["maintenance"] else ()
 
 
 @options.command(
@@ -235,7 +248,8 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
 def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """Predict the remaining travel and time until each limit, and the service date.
 
-    Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km.
+    Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. The
+    service is that of the limits which no work after the last log has restored (--maintenance).
     --max-risk and --cost-ratio replace [decision] of the stage description.
     """
     stage, by = given["stage"], given["by"]
@@ -249,8 +263,15 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             found.append((prognosis_of(posterior, history, stage), posterior))
         except NotEnoughData as why:
             lost.append(str(why))
+    words = {one.name: one.word for one in stage.parameters}
     for prognosis, _ in found:
-        life, service, before = summarise_life(prognosis, stage), decide(prognosis, decision), None
+        done = [
+            one.action
+            for one in _actions(given)
+            if one.stage == prognosis.stage and one.recorded_at > prognosis.recorded_at
+        ]
+        left = without_limits(prognosis, restored(words, done))
+        life, service, before = summarise_life(prognosis, stage), decide(left, decision), None
         last = prognosis.recorded_at.date()
         if by is not None and by > last:
             before = by, probability_before(prognosis, by)

@@ -1,6 +1,7 @@
 """Service date: last day of an accepted risk, or the day of least long-run costs."""
 
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, replace
 from datetime import date, datetime, time, timedelta
 from typing import Literal
 
@@ -80,6 +81,20 @@ def decide(prognosis: Prognosis | None, decision: Decision) -> Service:
     end = day_after(prognosis, earliest)
     log_by = min((day for day in (next_log, by, end) if day is not None), default=None)
     return Service(kind, by, wait, risk, planned, planned_risk, *criterion, log_by, every, end)
+
+
+def without_limits(prognosis: Prognosis | None, restored: Collection[str]) -> Prognosis | None:
+    """Leave the limits of some parameters out, which work after the last log has restored.
+
+    None where no limit is left: what remains is not known before the next log.
+    """
+    if prognosis is None or not restored:
+        return prognosis
+    kept = np.array([name not in restored for name in prognosis.parameters[:-1]], bool)
+    if not kept.any():
+        return None
+    parts = np.where(kept, prognosis.remaining[:, :-1], np.inf)
+    return replace(prognosis, remaining=np.column_stack([parts, parts.min(axis=1)]))
 
 
 def risk_before(prognosis: Prognosis, day: date) -> tuple[float, float]:

@@ -24,9 +24,10 @@ from lmshealth.machine.service import (
     decide,
     remaining_days,
     risk_before,
+    without_limits,
 )
 from lmshealth.stage.description import ParameterSpec, Stage
-from lmshealth.tracking.maintenance import RESETS, RESTORING
+from lmshealth.tracking.maintenance import restored
 
 Step = Literal[
     "see-effect", "inspect", "find-cause", "check-drift", "check-loss", "log-now", "none", "record",
@@ -84,38 +85,53 @@ class NextStep:
 
 def next_step(assessment: Assessment, service: Service) -> NextStep:
     """Choose the next step at the last log by `CASES`."""
-    prognosis = assessment.prognosis
+    whole, mended = assessment.prognosis, restored_since(assessment)
+    prognosis = without_limits(whole, mended)
     kind = "unknown" if prognosis is None else service.kind
     n_logs = len(assessment.history.logs) - assessment.history.baseline
     age = "young" if n_logs <= constants.YOUNG_LOGS else "old"
-    first = first_limit(prognosis)
     words = {one.name: one.word for one in assessment.stage.parameters}
-    names = [] if prognosis is None else [first[0] if first else prognosis.parameters[0]]
     degraded = degraded_words(assessment.judgement.verdict)
-    lost = [name for name, word in words.items() if word in degraded] or names
+    first, left = _ending_first(whole), _ending_first(prognosis)
+    lost = [name for name, word in words.items() if word in degraded] or first
+    parts = {name: words.get(name, "") for name in (*left, *lost) if name not in mended}
     # Work on one part does not restore another.
-    done = {notice.where for notice in assessment.notices if notice.code == "no-log-since"}
-    left = {
-        name: words.get(name, "")
-        for name in (*names, *lost)
-        if not done & {*RESTORING.get(words.get(name, ""), RESETS)}
-    }
-    needed = {*lost, *(names if kind in ("now", "by") else ())}
-    is_worked = bool(done) and not left.keys() & needed
-    case = "worked" if is_worked else _class_of(assessment), kind, age
+    needed = {*lost, *(first if kind in ("now", "by") else ()), *(left if kind == "now" else ())}
+    done = any(notice.code == "no-log-since" for notice in assessment.notices)
+    case = "worked" if done and not parts.keys() & needed else _class_of(assessment), kind, age
     step = step_of(*case)
     if prognosis is None:
-        return NextStep(step, case=case)
+        return NextStep(step, tuple(parts.items()), case=case)
     every = days_to(prognosis, service.inspect_every)
     return NextStep(
         kind=step,
-        parts=tuple(left.items()),
+        parts=tuple(parts.items()),
         by=service.by,
         log_every=every,
         horizon=prognosis.horizon,
         partial=bool(prognosis.unidentifiable),
         case=case,
     )
+
+
+def restored_since(assessment: Assessment) -> set[str]:
+    """Return the parameters that work after the last log has restored."""
+    work = {notice.where for notice in assessment.notices if notice.code == "no-log-since"}
+    return restored({one.name: one.word for one in assessment.stage.parameters}, work)
+
+
+def service_since(assessment: Assessment) -> Service:
+    """Choose the day of the service, without the limits that work after the last log restored."""
+    left = without_limits(assessment.prognosis, restored_since(assessment))
+    return decide(left, assessment.stage.description.decision)
+
+
+def _ending_first(prognosis: Prognosis | None) -> list[str]:
+    """Return the parameter whose limit is most probably reached first; of a single one that."""
+    if prognosis is None:
+        return []
+    first = first_limit(prognosis)
+    return [first[0] if first else prognosis.parameters[0]]
 
 
 def step_of(verdict: str, service: str, age: str, day: str = "") -> Step:
@@ -264,7 +280,7 @@ class Summary:
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
-    """Summarise an assessment, with its page and the result of `Assessment.service`."""
+    """Summarise an assessment, with its page and the result of `service_since`."""
     judgement, prognosis = assessment.judgement, assessment.prognosis
     history, of_fleet = assessment.history, assessment.calibration
     healthy: State = "open" if assessment.left_out else "good"  # until a jump is confirmed or not

@@ -25,9 +25,9 @@ from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
-from lmshealth.machine.service import Service
+from lmshealth.machine.service import Service, without_limits
 from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
-from lmshealth.machine.summary import Summary, first_limit, limit_of
+from lmshealth.machine.summary import Summary, first_limit, limit_of, restored_since
 from lmshealth.report import constants, figures, text
 from lmshealth.report.language import mark, tr, tr_month
 from lmshealth.report.log_figures import plot_shapes, plot_spectra, shapes_size, spectra_size
@@ -68,7 +68,7 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
-        "first_limit": first_limit(prognosis),
+        "first_limit": first_limit(without_limits(prognosis, restored_since(assessment))),
         "before": before,
         "mark": _MARK,
         "outside": list(_outside_map(assessment, content["mac"])),

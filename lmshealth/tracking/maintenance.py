@@ -1,6 +1,6 @@
 """Maintenance: actions on a machine, and which of them open a new baseline."""
 
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime
 from difflib import get_close_matches
@@ -69,6 +69,11 @@ def without_logs(actions: Iterable[Action], machines: Collection[str]) -> Iterat
         near = get_close_matches(name, machines, 1)
         hint = f"; is it {near[0]}?" if near else ""
         yield f"maintenance.csv: work on {name} is not used: no usable log is of it{hint}"
+
+
+def restored(words: Mapping[str, str], work: Collection[str]) -> set[str]:
+    """Return the parameters that work restores; ``words`` has their words in verdicts."""
+    return {name for name, word in words.items() if {*work} & {*RESTORING.get(word, RESETS)}}
 
 
 def read_maintenance(

@@ -195,6 +195,28 @@ def test_maintenance_of_other_machines_is_noted(table: Path, toml: Path, tmp_pat
     )
 
 
+@pytest.mark.usefixtures("quick")
+def test_work_after_the_last_log_leaves_its_limit_out(
+    table: Path, toml: Path, tmp_path: Path
+) -> None:
+    """The day was that of the state before the work, which no log shows; of others it stays."""
+    actions, out = tmp_path / "maintenance.csv", tmp_path / "p.csv"
+    for action, known in (("regrease", True), ("preload-adjust", False)):
+        actions.write_text(
+            "stage,recorded_at,action\n"
+            f"AX-1,2026-03-25T00:00:00Z,{action}\nAX-2,2026-02-02T00:00:00Z,preload-adjust\n"
+        )
+        result = call(table, "--stage", toml, "--out", out, "--maintenance", actions)
+        assert result.exit_code == 0, result.output
+        rows = pd.read_csv(out).set_index(["stage", "parameter"])
+        assert rows.loc[("AX-2", "any"), "service"] == "by"
+        assert rows.loc[("AX-1", "any"), "service"] == ("by" if known else "unknown")
+        assert pd.isna(rows.loc[("AX-1", "any"), "service_by"]) == (not known)
+        assert ("Service: not known before a log" in result.stdout) == (not known)
+        note = "AX-1: preload-adjust on 2026-03-25: no log since"
+        assert (note in plain(result.stderr)) == (not known)
+
+
 @pytest.mark.parametrize("option", ["--max-risk", "--cost-ratio"])
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_a_number_that_is_not_finite_is_wrong_usage(

@@ -15,9 +15,19 @@ from lmshealth.cli import views
 from lmshealth.life.posterior.fit import LoneMode
 from lmshealth.machine import constants
 from lmshealth.machine.status import judge_on, make_status, on_day
-from lmshealth.machine.summary import CASES, NextStep, Step, next_step, step_of, summarise
+from lmshealth.machine.summary import (
+    CASES,
+    NextStep,
+    Step,
+    next_step,
+    service_since,
+    step_of,
+    summarise,
+)
 from lmshealth.report import text
+from lmshealth.report.pages import make_page
 from lmshealth.report.tables import machine_tables
+from lmshealth.report.text import plain
 from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.maintenance import Action, Maintenance, maintenance_notices
 from tests.assessments import Maker, make
@@ -151,7 +161,7 @@ def test_work_that_was_entered_is_not_ordered_again(
     made = replace(made, judgement=replace(made.judgement, verdict=verdict))
     assert made.prognosis is not None
     remaining = np.array(made.prognosis.remaining)
-    remaining[:, 1 - limit] = np.inf
+    remaining[:, 1 - limit] = remaining[:, limit] if verdict == "both" else np.inf
     remaining[:, 2] = remaining[:, limit]
     moments = made.history.recorded_at
     day = moments[-1] + timedelta(days=1)
@@ -159,7 +169,7 @@ def test_work_that_was_entered_is_not_ordered_again(
     notices = (*made.notices, *maintenance_notices(work, moments))
     prognosis = replace(made.prognosis, remaining=remaining)
     found = replace(made, prognosis=prognosis, notices=notices)
-    summary = summarise(found, found.service())
+    summary = summarise(found, service_since(found))
     status, later = make_status(found, summary), moments[-1].date() + timedelta(days=900)
     summary = on_day(summary, status, later)
     codes = judge_on(status, later, None).conditions
@@ -178,6 +188,31 @@ def test_work_that_was_entered_is_not_ordered_again(
         orders = {"preload": "a preload adjustment", "mount": "a tightening of the mount"}
         ordered_work = " and ".join(orders[part] for part in ordered.split())
         assert f" {ordered_work} " in text.next_step(summary.step)
+
+
+def test_a_day_is_of_the_limits_that_no_work_has_restored(make: Maker) -> None:
+    """Of two lost parts one was restored: the day, step and first limit are of the other."""
+    made = make()
+    made = replace(made, judgement=replace(made.judgement, verdict="both"))
+    prognosis = made.prognosis
+    assert prognosis is not None
+    remaining = np.array(prognosis.remaining)
+    remaining[:, 0], remaining[:, 1] = 1e4, 1e6
+    remaining[:, 2] = remaining.min(axis=1)
+    mount = remaining.copy()
+    mount[:, 0], mount[:, 2] = np.inf, 1e6
+    moments = made.history.recorded_at
+    work = Action("M7-Y", moments[-1] + timedelta(days=1), "preload-adjust")
+    notices = maintenance_notices(Maintenance((work,)), moments)
+    both = replace(made, prognosis=replace(prognosis, remaining=remaining))
+    found = replace(both, notices=(*made.notices, *notices))
+    alone = replace(made, prognosis=replace(prognosis, remaining=mount))
+    assert service_since(found) == service_since(alone) != service_since(both) == both.service()
+    summary = summarise(found, service_since(found))
+    assert [name for name, _ in summary.step.parts] == ["mount_stiffness"]
+    for one, first in ((found, "mount stiffness"), (both, "guide preload")):
+        page = make_page(one, summarise(one, service_since(one)))
+        assert f"First limit reached, most probably: {first} (" in plain(page)
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:
