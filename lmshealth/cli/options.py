@@ -112,6 +112,12 @@ FOLLOW_LINKS = eager_option(
 )
 
 
+def _inputs() -> list[Path]:
+    """Return the files that options of this command were read from."""
+    found: list[Path] = click.get_current_context().meta.setdefault(_INPUTS, [])
+    return found
+
+
 def follow_links() -> bool:
     """Return whether ``--follow-links`` is set."""
     return bool(click.get_current_context().meta.get(__name__))
@@ -119,7 +125,9 @@ def follow_links() -> bool:
 
 def described(reference: str) -> Stage:
     """Load a stage description as ``--follow-links`` allows."""
-    return load_stage(reference, follow_links=follow_links())
+    stage = load_stage(reference, follow_links=follow_links())
+    _inputs().append(Path(reference))
+    return stage
 
 
 def stage_option(*name: str, **settings: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -152,15 +160,16 @@ def layouts_folder() -> Path | None:
     return folder
 
 
-def _columns(ctx: click.Context, option: click.Parameter, path: str | None) -> ColumnMap | None:
+def _columns(ctx: click.Context, option: click.Parameter, path: Path | None) -> ColumnMap | None:
     """Load a column map, with the layouts of ``--layouts``; None without both."""
     own = layouts()
     if path is None and not own:
         return None
+    _inputs().extend([path] if path else [])
     return replace(ColumnMap() if path is None else load_columns(path), layouts=own)
 
 
-_LAYOUTS = f"{__name__}.layouts"
+_LAYOUTS, _INPUTS = f"{__name__}.layouts", f"{__name__}.inputs"
 LAYOUTS = eager_option(
     "--layouts",
     type=FOLDER,
@@ -169,7 +178,7 @@ LAYOUTS = eager_option(
     help="Folder of layouts (*.toml), by which text of further programs is read.",
 )
 _COLUMNS = click.option(
-    "--columns", type=click.Path(), callback=_columns, help="Column map of the export."
+    "--columns", type=TABLE, callback=_columns, help="Column map of the export."
 )
 MOST_MEMORY = click.option(
     "--max-memory",
@@ -327,7 +336,7 @@ class _Command(click.Command):
     def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
         """Require that each output is a file of its own."""
         left = super().parse_args(ctx, args)
-        names: dict[Path, str] = {}
+        names = {path.resolve(): "the input" for path in _inputs()}
         for option in sorted(self.params, key=lambda one: one.type is OUT):
             given = ctx.params.get(option.name or "")
             for path in given if isinstance(given, tuple) else (given,):

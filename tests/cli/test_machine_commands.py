@@ -92,6 +92,10 @@ def test_no_output_replaces_an_input_or_another_output(estimates: Path, tmp_path
         assert (
             result.exit_code == 2 and "is also the input; needed is another file" in result.stderr
         )
+    make_stage(tmp_path / "stage", (FADING,))
+    toml = tmp_path / "stage" / "small.toml"
+    result = run(estimates, "--stage", toml, "--out", toml)
+    assert result.exit_code == 2 and "is also the input" in result.stderr
     both = tmp_path / "both.csv"
     result = run(estimates, "--out", both, "--events", both)
     assert result.exit_code == 2 and "is also --out; needed is another file" in result.stderr
