@@ -44,7 +44,7 @@ from lmshealth.io.manifest import MANIFEST, MISSPELT, NOT_LOGS
 from lmshealth.io.refusal import listed, visible
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.status import Change, Status, judge_on, make_status, on_day
-from lmshealth.machine.summary import Summary, service_since, summarise
+from lmshealth.machine.summary import Summary, after_work, summarise
 from lmshealth.report.language import Language, in_language
 from lmshealth.report.pages import by_urgency, date_page, file_names, make_page, write_index
 from lmshealth.report.tables import csv_text, join_csv, log_tables, machine_tables, refused_rows
@@ -100,10 +100,11 @@ def machine_output(record: MachineRecord) -> MachineOutput | None:
         return None
     instead = baseline_notices(record.lost, found.history.logs[found.history.baseline])
     found = replace(found, lost=record.lost, notices=(*found.notices, *instead))
-    summary = summarise(found, service_since(found), record.file)
+    left = after_work(found)
+    summary = summarise(found, left.service(), record.file)
     status = make_status(found, summary)
     with _DRAWING, in_language(record.language):
-        page = make_page(found, summary, before=record.before)
+        page = make_page(left, summary, before=record.before)
     rows = machine_tables(found, summary) if logs else {}
     tables = {name: csv_text(name, own) for name, own in rows.items()}
     of_logs = [log_tables(one) for one in sort_by_time(logs)]

@@ -90,11 +90,19 @@ def without_limits(prognosis: Prognosis | None, restored: Collection[str]) -> Pr
     """
     if prognosis is None or not restored:
         return prognosis
-    kept = np.array([name not in restored for name in prognosis.parameters[:-1]], bool)
-    if not kept.any():
+    kept = [k for k, name in enumerate(prognosis.parameters[:-1]) if name not in restored]
+    if not kept:
         return None
-    parts = np.where(kept, prognosis.remaining[:, :-1], np.inf)
-    return replace(prognosis, remaining=np.column_stack([parts, parts.min(axis=1)]))
+    parts = prognosis.remaining[:, kept]
+    return replace(
+        prognosis,
+        parameters=tuple(prognosis.parameters[k] for k in (*kept, -1)),
+        limits=prognosis.limits[[*kept, -1]],
+        remaining=np.column_stack([parts, parts.min(axis=1)]),
+        health=prognosis.health[:, kept],
+        curve_quantiles=prognosis.curve_quantiles[:, :, kept],
+        laws=tuple(law for law in prognosis.laws if law.parameter not in restored),
+    )
 
 
 def risk_before(prognosis: Prognosis, day: date) -> tuple[float, float]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import date, datetime
 from typing import Literal
 
@@ -120,10 +120,10 @@ def restored_since(assessment: Assessment) -> set[str]:
     return restored({one.name: one.word for one in assessment.stage.parameters}, work)
 
 
-def service_since(assessment: Assessment) -> Service:
-    """Choose the day of the service, without the limits that work after the last log restored."""
+def after_work(assessment: Assessment) -> Assessment:
+    """Leave the limits out that work after the last log has restored, unless these are all."""
     left = without_limits(assessment.prognosis, restored_since(assessment))
-    return decide(left, assessment.stage.description.decision)
+    return replace(assessment, prognosis=left or assessment.prognosis)
 
 
 def _ending_first(prognosis: Prognosis | None) -> list[str]:
@@ -280,8 +280,8 @@ class Summary:
 
 
 def summarise(assessment: Assessment, service: Service, file: str = "") -> Summary:
-    """Summarise an assessment, with its page and the result of `service_since`."""
-    judgement, prognosis = assessment.judgement, assessment.prognosis
+    """Summarise an assessment, with its page and the service by `after_work`."""
+    judgement, prognosis = assessment.judgement, after_work(assessment).prognosis
     history, of_fleet = assessment.history, assessment.calibration
     healthy: State = "open" if assessment.left_out else "good"  # until a jump is confirmed or not
     states: dict[str, State] = {"healthy": healthy, OUTSIDE_MAP: "open"}

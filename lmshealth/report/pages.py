@@ -25,7 +25,7 @@ from lmshealth.life.posterior.likelihood import expected_scatter, scatter_prior
 from lmshealth.life.verdict import OUTSIDE_MAP
 from lmshealth.machine.assessment import Assessment
 from lmshealth.machine.constants import LEVELS, RUL_LEVELS
-from lmshealth.machine.service import Service, without_limits
+from lmshealth.machine.service import Service
 from lmshealth.machine.status import Status, chi_square_band, coming_states, notices
 from lmshealth.machine.summary import Summary, first_limit, limit_of, restored_since
 from lmshealth.report import constants, figures, text
@@ -68,7 +68,8 @@ def make_page(assessment: Assessment, summary: Summary, *, before: Summary | Non
         "notices": notices(assessment),
         "summary": summary,
         "bar": float(np.clip(np.ceil(10 * highest + 0.5) / 10, 1.2, 2.0)),
-        "first_limit": first_limit(without_limits(prognosis, restored_since(assessment))),
+        "first_limit": first_limit(prognosis),
+        "restored": text.joined(map(spell, sorted(restored_since(assessment)))),
         "before": before,
         "mark": _MARK,
         "outside": list(_outside_map(assessment, content["mac"])),

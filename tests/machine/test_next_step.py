@@ -19,15 +19,14 @@ from lmshealth.machine.summary import (
     CASES,
     NextStep,
     Step,
+    after_work,
     next_step,
-    service_since,
     step_of,
     summarise,
 )
 from lmshealth.report import text
 from lmshealth.report.pages import make_page
 from lmshealth.report.tables import machine_tables
-from lmshealth.report.text import plain
 from lmshealth.tracking.filters.track_state import Event
 from lmshealth.tracking.maintenance import Action, Maintenance, maintenance_notices
 from tests.assessments import Maker, make
@@ -169,7 +168,7 @@ def test_work_that_was_entered_is_not_ordered_again(
     notices = (*made.notices, *maintenance_notices(work, moments))
     prognosis = replace(made.prognosis, remaining=remaining)
     found = replace(made, prognosis=prognosis, notices=notices)
-    summary = summarise(found, service_since(found))
+    summary = summarise(found, after_work(found).service())
     status, later = make_status(found, summary), moments[-1].date() + timedelta(days=900)
     summary = on_day(summary, status, later)
     codes = judge_on(status, later, None).conditions
@@ -207,12 +206,17 @@ def test_a_day_is_of_the_limits_that_no_work_has_restored(make: Maker) -> None:
     both = replace(made, prognosis=replace(prognosis, remaining=remaining))
     found = replace(both, notices=(*made.notices, *notices))
     alone = replace(made, prognosis=replace(prognosis, remaining=mount))
-    assert service_since(found) == service_since(alone) != service_since(both) == both.service()
-    summary = summarise(found, service_since(found))
+    left, whole = after_work(found), summarise(both, both.service())
+    assert left.service() == after_work(alone).service() == alone.service() != both.service()
+    summary = summarise(found, left.service())
     assert [name for name, _ in summary.step.parts] == ["mount_stiffness"]
-    for one, first in ((found, "mount stiffness"), (both, "guide preload")):
-        page = make_page(one, summarise(one, service_since(one)))
-        assert f"First limit reached, most probably: {first} (" in plain(page)
+    assert summary.life is not None and whole.life is not None
+    assert summary.life.any.travel == whole.life.limits[1].travel > whole.life.any.travel
+    assert summary.postponed[0][2][1] < 0.06
+    for one, shown in ((both, True), (left, False)):
+        page = make_page(one, summary)
+        assert ("First limit reached, most" in page) == shown
+        assert ("Without guide preload, which later work has restored." in page) != shown
 
 
 def test_logs_are_asked_for_before_a_machine_is_silent(make: Maker) -> None:
