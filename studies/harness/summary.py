@@ -89,8 +89,8 @@ def overview() -> str:
     claims = [claim for record in there for claim in record.claims]
     lines = [
         f"{len(claims)} claims of {len(there)} records; "
-        f"**{sum(not claim.met for claim in claims)} are not met**. Not recorded are "
-        f"{len(found) - len(there)} studies, which are new or whose code was corrected since.",
+        f"**{sum(not claim.met for claim in claims)} are not met**. Of {len(found)} studies "
+        f"{len(found) - len(there)} have no record: they are new, or their code was corrected.",
         "",
         "| study | question | answer: the first claim | claims | not met | recorded |",
         "| --- | --- | --- | ---: | ---: | --- |",
