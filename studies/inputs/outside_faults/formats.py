@@ -283,12 +283,8 @@ CASES: tuple[Case, ...] = (
         NAMED,
     ),
     *(
-        _case(name, "400 Hz", partial(proposed, _outside(name), (hz,)), NAMED)
-        for name, hz in (
-            ("time_lowercase.csv", " 400 Hz"),
-            ("millis.csv", " 400.003 Hz"),
-            ("axivity.csv", " 400.003 Hz"),
-        )
+        _case(name, "400 Hz", partial(proposed, _outside(name), (" 400 Hz",)), NAMED)
+        for name in ("time_lowercase.csv", "millis.csv", "axivity.csv")
     ),
     _case(
         "12 channels of equal standing",
