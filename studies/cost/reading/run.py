@@ -32,6 +32,7 @@ from studies.harness.cost import in_own_process, in_turns
 from studies.harness.study import Row, Study
 
 _SHARED = "samples come from another process through shared pages, which takes 10 ms for a minute"
+_BUSY = "lines are checked for damage first; 1.29 on 29 November, 1.4 beside other work"
 NOT_MET = dict.fromkeys(("log.h5", "log.tdms", "plain.mat", "packed.mat"), _SHARED)
 
 # Noise and fixed costs do not shrink with the file: the quick form is judged more mildly. An HDF5
@@ -78,7 +79,7 @@ def main() -> None:
             if name in memory
         },
     }
-    study.conclude(answer, not_met=NOT_MET, quick_may_fail=True)
+    study.conclude(answer, not_met=NOT_MET | {"log.csv": _BUSY}, quick_may_fail=True)
 
 
 def timed(name: str, seconds: int, rounds: int) -> Row:
