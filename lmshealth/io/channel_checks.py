@@ -261,27 +261,30 @@ def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[in
         return found
     x = np.stack([c[start : min(start + constants.COMPARED, stop)] for c in columns])
     x = x / np.abs(x).max().clip(np.finfo(float).tiny)
-    for k, r in enumerate(x):
-        rest = [j for j in range(len(x)) if j != k]
-        weights, unexplained = _regression([*x[rest] ** 2, r], r**2)
-        if unexplained < min(constants.MAGNITUDE, 0.1 * _regression(x[rest], r)[1]):
-            own = weights[: len(rest)]
+    (squares, scale), (x, _) = _standardised(x**2), _standardised(x)
+    # Of a regression on all others, 1 / (P)_kk of the inverse of the correlations is unexplained;
+    # that of the squares is extended by r itself.
+    ridge = constants.DEPENDENT * np.eye(len(x))
+    linear = 1 / np.diagonal(np.linalg.inv(x @ x.T + ridge))
+    inverse, cross = np.linalg.inv(squares @ squares.T + ridge), squares @ x.T
+    by = inverse @ cross
+    left = 1 + constants.DEPENDENT - np.sum(cross * by, axis=0)
+    for k, unexplained in enumerate(linear):
+        row = inverse[k] + by[k, k] * by[:, k] / left[k]
+        if 1 / row[k] < min(constants.MAGNITUDE, 0.1 * unexplained):
+            own = -row / scale
+            own[k] = 0.0
             axes = own > own.max() / 2
             if axes.sum() > 1 and own[axes].min() > 0.95 * own.max():
-                found[k] = np.array(rest)[axes].tolist()
+                found[k] = np.flatnonzero(axes).tolist()
     return found
 
 
-def _regression(
-    columns: Sequence[FloatArray] | FloatArray, target: FloatArray
-) -> tuple[FloatArray, float]:
-    """Regress on columns ``(n,)`` and a constant; return weights and the unexplained share."""
-    design = np.stack([c - c.mean() for c in columns], axis=1)
-    centred = target - target.mean()
-    weights = np.linalg.lstsq(design, centred, rcond=1e-12)[0]
-    total = float(centred @ centred)
-    rest = centred - design @ weights
-    return weights, float(rest @ rest) / total if total else 1.0
+def _standardised(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Return rows ``(n_rows, n)`` of mean 0 and length 1, and their lengths before, ``(n_rows,)``."""
+    x = x - x.mean(axis=1, keepdims=True)
+    length = np.sqrt(np.sum(x**2, axis=1)).clip(np.finfo(float).tiny)
+    return x / length[:, None], length
 
 
 def _stuck(values: Samples, low: float, high: float, sign: float) -> int:

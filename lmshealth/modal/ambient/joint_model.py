@@ -166,24 +166,21 @@ class JointModel:
             rho=np.concatenate([self.rho, np.zeros_like(phi)]),
         )
 
-    def joined(self, other: JointModel, n_common: int, data: BandData) -> JointModel:
-        """Add the channels of another model after the first ones, which both have in common.
+    def joined(self, parts: Sequence[JointModel], order: Sequence[int]) -> JointModel:
+        """Add the channels of other models, whose modes are the first ones of this; in an order.
 
-        Its modes are the same, better known, and possibly further ones that only it shows.
+        Its data have the bins and units of all channels, and no cross spectra: they are expected,
+        not fitted.
         """
-        further = ((0, 0), (0, other.f.size - self.f.size))
-        phi, rho = (np.pad(rows[n_common:], further) for rows in (self.phi, self.rho))
-
-        def rows(own: NDArray[T], between: NDArray[T]) -> NDArray[T]:
-            return np.concatenate([own[:n_common], between, own[n_common:]])
-
-        return replace(
-            other,
-            data=data,
-            floor=rows(other.floor, self.floor[n_common:]),
-            phi=rows(other.phi, phi),
-            rho=rows(other.rho, rho),
+        every, most = (self, *parts), self.f.size
+        phi, rho = (
+            np.concatenate([np.pad(x, ((0, 0), (0, most - x.shape[1]))) for x in shapes])
+            for shapes in ([one.phi for one in every], [one.rho for one in every])
         )
+        floor = np.concatenate([one.floor for one in every])
+        scale = np.concatenate([one.data.scale for one in every])[order]
+        data = replace(self.data.of_channels([]), scale=scale)
+        return replace(self, data=data, floor=floor[order], phi=phi[order], rho=rho[order])
 
     @property
     def size(self) -> int:

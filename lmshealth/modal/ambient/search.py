@@ -137,9 +137,10 @@ def search(
         again = _explain(searched, low, high, suspected, hints, out_of_phase=True)
         if again[0].f.size <= model.f.size and again[0].misfit < model.misfit:
             model, harmonics, after, poles = again
+    # On the channels that show most: the time of a sweep grows with the third power of their number.
+    model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))
-    model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
     # What is as narrow as a line, the foot of one or as broad as noise stays in the model, as
     # foreign to modes.
     width = 2 * model.zeta
@@ -195,34 +196,36 @@ def _of_all_channels(
     n, order = len(first), list(first)
     others = [c for c in range(len(spectra.channels)) if c not in first]
     batches = [others[start : start + _MORE] for start in range(0, len(others), _MORE)]
-    plain = _bin(spectra, candidates, *band)
-    alone = model.on(plain.of_channels(first))
-    columns = [np.zeros(len(spectra.channels), dtype=complex) for _ in harmonics]
-    for one, column in zip(harmonics, columns, strict=True):
-        column[first] = one.vector
+
+    # Cross spectra of all channels would be too large.
+    def binned(spectra: LogSpectra, added: list[int]) -> BandData:
+        return _bin(spectra.select([*first, *added]), candidates, *band)
+
+    if harmonics:
+        columns = [np.zeros(len(spectra.channels), dtype=complex) for _ in harmonics]
+        alone = model.on(binned(spectra, []))
         for added in batches:
-            part = alone.with_channels(plain.of_channels([*first, *added]), _beside(harmonics))
-            column[added] = one.seen_by(part)[n:]
-    harmonics = tuple(one.along(v) for one, v in zip(harmonics, columns, strict=True))
-    for one in harmonics:
-        spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
-    whole = _bin(spectra, candidates, *band) if harmonics else plain
-    model = model.on(whole.of_channels(first))
+            part = alone.with_channels(binned(spectra, added), _beside(harmonics))
+            for one, column in zip(harmonics, columns, strict=True):
+                column[first], column[added] = one.vector, one.seen_by(part)[n:]
+        harmonics = tuple(one.along(v) for one, v in zip(harmonics, columns, strict=True))
+        for one in harmonics:
+            spectra = spectra.each(partial(CrossSpectrum.with_foreign, expected=one.expected))
+    model, parts = model.on(binned(spectra, [])), list[JointModel]()
     for added in batches:
-        part = model.of_channels(range(n)).with_channels(whole.of_channels([*first, *added]))
-        part = part.refined(6)
+        part = model.with_channels(binned(spectra, added)).refined(6)
         for _ in range(_ROUNDS):
             more = _grow(part, (), _CLEARLY * constants.LEAST_EXCESS)
-            if more is None:
+            if more is None or _weaker_of_split(more) is not None:
                 break
             part = more.refined(2)
         explained = [k for k in _consistent(part) if k >= n]
         order += [added[k - n] for k in explained]
-        part = part.of_channels([*range(n), *explained])
-        model = model.joined(part, n, whole.of_channels(order))
+        parts.append(part.of_channels(explained))
+        model = part.of_channels(range(n))
     used = sorted(order)
     harmonics = tuple(one.along(one.vector[used]) for one in harmonics)
-    return model.of_channels(np.argsort(order).tolist()), harmonics, spectra.select(used)
+    return model.joined(parts, np.argsort(order).tolist()), harmonics, spectra.select(used)
 
 
 def _beside(harmonics: Sequence[Harmonic]) -> Callable[[FloatArray], BoolArray]:
@@ -280,22 +283,26 @@ def _without_splits(model: JointModel, most: int) -> JointModel:
     One mode that is not as the model is explained better by several poles of unlike bandwidths, of
     which none is the mode. Two of unlike shapes and similar bandwidths are modes, left to the fit.
     """
-    while model.f.size > most:
-        width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
-        alike = np.abs(model.phi.conj().T @ model.phi) ** 2
-        alike = alike > constants.ALIKE_MAC * np.outer(power, power)
-        limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
-        apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
-        apart[~alike & (np.abs(np.log(width[:, None] / width)) < np.log(_SIMILAR))] = np.inf
-        np.fill_diagonal(apart, np.inf)
-        i, j = np.unravel_index(int(apart.argmin()), apart.shape)
-        if apart[i, j] > 1:
-            break
-        weaker = i if power[i] / model.zeta[i] < power[j] / model.zeta[j] else j
+    while model.f.size > most and (weaker := _weaker_of_split(model)) is not None:
         f = float(model.f[weaker])
-        model = model.without(int(weaker))
+        model = model.without(weaker)
         model = model.refined(3, model.nearest(f)).refined(2)
     return model
+
+
+def _weaker_of_split(model: JointModel) -> int | None:
+    """Return the weaker pole of the nearest pair that no fit separates, None without any."""
+    width, power = model.f * model.zeta, np.sum(np.abs(model.phi) ** 2, axis=0)
+    alike = np.abs(model.phi.conj().T @ model.phi) ** 2
+    alike = alike > constants.ALIKE_MAC * np.outer(power, power)
+    limit = np.where(alike, constants.SEPARATION_ALIKE, constants.SEPARATION)
+    apart = np.abs(model.f[:, None] - model.f) / (width[:, None] + width) / limit
+    apart[~alike & (np.abs(np.log(width[:, None] / width)) < np.log(_SIMILAR))] = np.inf
+    np.fill_diagonal(apart, np.inf)
+    i, j = np.unravel_index(int(apart.argmin()), apart.shape)
+    if apart[i, j] > 1:
+        return None
+    return int(i if power[i] / model.zeta[i] < power[j] / model.zeta[j] else j)
 
 
 def _consistent(model: JointModel) -> list[int]:

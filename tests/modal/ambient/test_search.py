@@ -217,15 +217,20 @@ def test_channels_are_added_by_what_they_have_in_common() -> None:
     np.testing.assert_allclose(few.with_channels(turned).phi[2], -whole.phi[2], rtol=1e-6)
 
 
-def test_joined_models_have_the_channels_of_both() -> None:
-    """Channels added in two steps are those added at once, with a mode that only one step has."""
+def test_joined_models_have_the_channels_of_all() -> None:
+    """Channels added in steps are those added at once, with a mode that only later ones have."""
     whole = exact_model()
-    first = whole.of_channels([0, 1, 2])
-    other = whole.of_channels([0, 1, 3]).with_mode(33.0, 0.01, np.array([0.0, 0.0, 1.0]))
-    both = first.joined(other, 2, whole.data)
-    np.testing.assert_array_equal(both.phi[:, :2], whole.phi)
-    np.testing.assert_array_equal(both.phi[:, 2], [0.0, 0.0, 0.0, 1.0])
-    assert both.f.tolist() == [14.0, 25.0, 33.0]
+    later = whole.of_channels([0, 1, 3]).with_mode(33.0, 0.01, np.array([0.0, 0.0, 1.0]))
+    joined = later.of_channels([0, 1]).joined(
+        [whole.of_channels([2]), later.of_channels([2])], [3, 0, 1, 2]
+    )
+    np.testing.assert_array_equal(joined.phi[:, :2], whole.phi[[3, 0, 1, 2]])
+    np.testing.assert_array_equal(joined.phi[:, 2], [1.0, 0.0, 0.0, 0.0])
+    assert joined.f.tolist() == [14.0, 25.0, 33.0]
+    np.testing.assert_array_equal(joined.floor_at(20.0), whole.floor_at(20.0))
+    columns = joined.modal(np.array([True, True, False]), whole.data.frequency)
+    expected = whole.modal(np.array([True, True]), whole.data.frequency)
+    np.testing.assert_allclose(columns, expected[:, [3, 0, 1, 2]], rtol=1e-12)
 
 
 def test_a_harmonic_is_seen_by_all_channels() -> None:
