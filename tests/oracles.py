@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
@@ -482,8 +483,8 @@ class LifeBelief:
 class LifeSetting:
     """A point of the grid: walk, factor on standard deviations, deviation over the history.
 
-    And the index of a mode that moves alone, if one does, and the standard deviation of a wander
-    that all have in common.
+    And the index of a mode that moves alone, if one does, the standard deviation of a wander that
+    all have in common, and whether the first log is in error: in each mode or in all alike.
     """
 
     walk: float
@@ -492,6 +493,7 @@ class LifeSetting:
     prior: float = 1.0
     lone: int | None = None
     common: float = 0.0
+    error: Literal["", "each", "alike"] = ""
 
 
 def lone_drift(t: float, u: float, now: float, steps: Sequence[float] = ()) -> float:
@@ -554,8 +556,9 @@ def life_covariance(
             cov[a, c] += setting.common**2 * sum(lasting) / 2
             if k == o:
                 cov[a, c] += setting.scale**2 * history.cov[first + k][i, j]
-            if k == o and i == j and unknown[k]:
-                cov[a, c] += _unknown(history, known, first + k)
+                cov[a, c] += (i == j) * unknown[k] * _unknown(history, known, first + k)
+            if k == o == 0 and {i, j} <= {*history.in_doubt}:
+                cov[a, c] += 0.03**2 * {"": 0, "each": i == j, "alike": 1}[setting.error]
             if i == j:
                 cov[a, c] += belief.intercept_std**2 + belief.b_std**2 * offset[k] * offset[o]
                 cov[a, c] += setting.walk**2 * shared / clock.max()

@@ -270,7 +270,7 @@ def outcome_of(
         tracked = track(history, stage)
         if doubt := doubt_of_names(stage, history, tracked):
             return msgspec.structs.replace(base, failed=doubt)
-        accepted = accepted_estimates(history, tracked)
+        accepted = accepted_estimates(history, tracked, doubtful=True)
         posterior = fit_life(accepted, stage, seeds, chains=False)
         prognosis = prognosis_or_none(posterior, accepted, stage)
         health = health_of(posterior, accepted, stage, (len(history.logs) - 1,))

@@ -305,7 +305,7 @@ def _lives(
             doubt = doubt_of_clock(history, refused) or doubt_of_names(stage, history, tracked)
             if doubt:
                 raise NotEnoughData(f"{history.stage}: {doubt}")
-            accepted = accepted_estimates(history, tracked)
+            accepted = accepted_estimates(history, tracked, doubtful=True)
             seed = seed_of(given["seed"], history.stage, stage.digest)
             found.append((accepted, fit_life(accepted, stage, seed)))
         except NotEnoughData as why:

@@ -281,7 +281,7 @@ def magnitudes(columns: Sequence[Samples], ranges: _Ranges) -> dict[int, list[in
 
 
 def _standardised(x: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return rows ``(n_rows, n)`` of mean 0 and length 1, and their lengths before, ``(n_rows,)``."""
+    """Return rows of mean 0 and length 1, ``(n_rows, n)``, and their lengths, ``(n_rows,)``."""
     x = x - x.mean(axis=1, keepdims=True)
     length = np.sqrt(np.sum(x**2, axis=1)).clip(np.finfo(float).tiny)
     return x / length[:, None], length

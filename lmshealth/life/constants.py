@@ -48,6 +48,12 @@ LONE_NAMED = 0.5
 COMMON_STDS, COMMON_LOGS = (1e-3, 3e-3), (2.0, 8.0)
 """Its standard deviations of ln f, equally probable, and the numbers of logs that it lasts."""
 
+# A first log that those after it contradict, see posterior/README.md.
+FIRST_LOG_STD = 0.03
+"""Standard deviation of ln f of a first log in error."""
+FIRST_LOG_PRIOR = (0.5, 0.25, 0.25)
+"""Probabilities that it is right, in error in each mode by itself, and in all modes alike."""
+
 # Posterior over scenarios, see posterior/README.md.
 MIN_PROBABILITY = 0.01
 """Scenarios with a lower probability are not published."""

@@ -286,7 +286,7 @@ def assess_from(
     if doubt or not stage.parameters:
         return made, None
     try:
-        accepted = accepted_estimates(history, tracked)
+        accepted = accepted_estimates(history, tracked, doubtful=True)
         return _with_results(made, accepted, epochs, before)
     except LmshealthError as error:
         why = str(error)
@@ -400,7 +400,7 @@ def with_fleet_prior(
     posterior by the description are the start of that with the prior of the fleet.
     """
     assert found.track is not None  # of a machine with evidence
-    history = accepted_estimates(found.history, found.track)
+    history = accepted_estimates(found.history, found.track, doubtful=True)
     stage = prior.apply_to(found.stage)
     seed = seed_of(found.seed, history.stage, stage.digest)
     start = None if before is None else before.start

@@ -88,6 +88,8 @@ class History(Result):
     baselines: tuple[int, ...]  # logs at which health is 1: the first, and one after each reset
     steps: tuple[Step, ...] = ()  # declared ones, in order
     contradictions: int = 0  # most logs in a row that are left out for their odometer or date
+    # Columns of the estimates of the present baseline's first log that those after it contradict.
+    in_doubt: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         n, r = len(self.logs), len(self.series)

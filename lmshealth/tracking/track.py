@@ -415,20 +415,28 @@ def _effects(state: TrackState) -> tuple[Effect, ...]:
     return tuple(effects)
 
 
-def accepted_estimates(history: History, track: Track) -> History:
+def accepted_estimates(history: History, track: Track, *, doubtful: bool = False) -> History:
     """Return a history with the steps of its track and without its outliers.
 
-    A suspected step is among them: a life without it competes with those that have it.
+    A suspected step is among them: a life without it competes with those that have it. One log does
+    not show whether it is in error or the machine has changed since: if ``doubtful``, ln f of the
+    first log of the present baseline stay, and are `History.in_doubt`.
     """
     ln_f, ln_zeta, cov = map(np.array, (history.ln_frequency, history.ln_damping, history.cov))
     steps = track.steps if track.suspected is None else (*track.steps, track.suspected)
-    r = len(history.series)
+    r, in_doubt = len(history.series), list[int]()
     for k, mode in track.outliers:
         own = history.columns(mode)
-        ln_f[k, own] = ln_zeta[k, own] = np.nan
-        both = [*own, *(r + i for i in own)]
-        cov[k, both], cov[k][:, both] = np.nan, np.nan
-    return replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=steps)
+        left_out = [r + i for i in own]
+        if doubtful and k == history.baseline and k + 1 < len(track.logs):
+            in_doubt += own
+        else:
+            left_out += own
+            ln_f[k, own] = np.nan
+        ln_zeta[k, own] = np.nan
+        cov[k, left_out], cov[k][:, left_out] = np.nan, np.nan
+    changed = {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov, "steps": steps}
+    return replace(history, in_doubt=tuple(in_doubt), **changed)
 
 
 def outlier_refusals(history: History, track: Track) -> list[Refusal]:

@@ -47,6 +47,8 @@ _NEGLIGIBLE = 0.01
 
 NO_MODE = -1
 """Index in place of that of a mode that moves alone: none does."""
+RIGHT, EACH, ALIKE = range(3)
+"""Indices of `FIRST_LOG_PRIOR`: whether a first log is in error, and how."""
 
 Nuisances = tuple[np.ndarray, np.ndarray]
 """Indices of the map error and of the grid point of each draw, ``(n,)`` each."""
@@ -60,7 +62,7 @@ class LifeCovariance(ReadOnly):
     of the estimates; `unknown` the variances for want of covariates; `walk` the random walk of ln f
     with variance 1 at the last log; `deviation` that of ln health, likewise; `lone` the drift of a
     mode by a cause of its own, of all modes as if each had one; `common` the wander that all modes
-    have in common, with variance 1.
+    have in common, with variance 1. `in_doubt` is 1 at data of a first log that may be in error.
     """
 
     fixed: FloatArray
@@ -70,6 +72,7 @@ class LifeCovariance(ReadOnly):
     deviation: FloatArray
     lone: FloatArray
     common: FloatArray
+    in_doubt: FloatArray  # ``(n_data,)``
     mode_of: np.ndarray  # index of the mode of each datum, ``(n_data,)``
 
     @classmethod
@@ -107,6 +110,7 @@ class LifeCovariance(ReadOnly):
             deviation=gram[data.mode_of[:, None], data.mode_of] * shared,
             lone=same_mode * lone_kernel(clock, clock, now, data.steps),
             common=common_kernel(np.unique(log_of, return_inverse=True)[1]),
+            in_doubt=((log_of == 0) & np.isin(columns, history.in_doubt)).astype(float),
             mode_of=data.mode_of,
         )
 
@@ -117,10 +121,15 @@ class LifeCovariance(ReadOnly):
         deviation: float,
         lone: int = NO_MODE,
         common: float = 0.0,
+        error: int = RIGHT,
     ) -> FloatArray:
         """Return the Cholesky factor of Σ, shape ``(n_data, n_data)``."""
         total = self.fixed + self.unknown + noise_scale**2 * self.noise + walk**2 * self.walk
         total += common**2 * self.common
+        if error != RIGHT:
+            alike = np.outer(self.in_doubt, self.in_doubt)
+            alike = alike if error == ALIKE else alike * np.equal.outer(self.mode_of, self.mode_of)
+            total += constants.FIRST_LOG_STD**2 * alike
         if lone != NO_MODE:
             own = (self.mode_of == lone).astype(float)
             total += constants.LONE_STD**2 * np.outer(own, own) * self.lone
@@ -198,10 +207,11 @@ class Grid(Rows):
     """Data whitened at the points of a grid of walk, noise scale, deviation and foreign causes.
 
     `lone` is the index of a mode that moves alone, or `NO_MODE`; `common` the standard deviation of
-    a wander that all modes have in common, or 0. `design` is R of each mode, shape
-    ``(n_points, n_modes, n_nodes, n_rows)``; `target` is Qᵀ L⁻¹ y, ``(n_points, n_rows)``; `rest`
-    the χ² that no life explains, `log_weight` the log prior minus ln |L|, and `freedom` the data
-    less the intercepts and coefficients that they determine, all ``(n_points,)``.
+    a wander that all modes have in common, or 0; `error` whether the first log is in error.
+    `design` is R of each mode, shape ``(n_points, n_modes, n_nodes, n_rows)``; `target` is Qᵀ L⁻¹
+    y, ``(n_points, n_rows)``; `rest` the χ² that no life explains, `log_weight` the log prior minus
+    ln |L|, and `freedom` the data less the intercepts and coefficients that they determine, all
+    ``(n_points,)``.
     """
 
     walk: FloatArray
@@ -209,6 +219,7 @@ class Grid(Rows):
     deviation: FloatArray
     lone: np.ndarray
     common: FloatArray
+    error: np.ndarray
     design: FloatArray
     target: FloatArray
     rest: FloatArray
@@ -235,23 +246,25 @@ class Grid(Rows):
         each = common / len(constants.COMMON_STDS)
         together = product(constants.COMMON_STDS, constants.LONE_WALKS)
         ways += [(walk, each * p, NO_MODE, std) for std, (walk, p) in together]
-        for (walk, p, lone, std), (scale, q), (deviation, r) in product(
+        errors = enumerate(constants.FIRST_LOG_PRIOR if covariance.in_doubt.any() else (1.0,))
+        for (error, wrong), (walk, p, lone, std), (scale, q), (deviation, r) in product(
+            errors,
             ways,
             zip(constants.NOISE_SCALES, prior.noise_scale, strict=True),
             zip(constants.DEVIATION_STDS, prior.deviation, strict=True),
         ):
             if p * q * r == 0:
                 continue
-            factor = covariance.factor(walk, scale, deviation, lone, std)
+            factor = covariance.factor(walk, scale, deviation, lone, std, error)
             u, basis_q, basis_r = _reduced(data, basis, factor)
             target = basis_q.T @ u
-            log_weight = np.log(p * q * r) - np.sum(np.log(np.diag(factor)))
+            log_weight = np.log(wrong * p * q * r) - np.sum(np.log(np.diag(factor)))
             design = basis_r.T.reshape(n_modes, -1, target.size)
             rest = np.sum(u**2) - np.sum(target**2)
             # The trace of Σ⁻¹ times the fixed part.
             fixed = np.sum(solve_triangular(factor, root, lower=True) ** 2)
             values = (design, target, rest, log_weight, data.y.size - fixed)
-            points.append((walk, scale, deviation, lone, std, *values))
+            points.append((walk, scale, deviation, lone, std, error, *values))
         return cls(*(np.array(column) for column in zip(*points, strict=True)))
 
 
@@ -376,7 +389,8 @@ class LifeLikelihood:
         """
         point = grid[np.arange(grid.walk.size) == k]
         settings = (float(grid.walk[k]), float(grid.noise_scale[k]), float(grid.deviation[k]))
-        factor = self.covariance.factor(*settings, int(grid.lone[k]), float(grid.common[k]))
+        causes = int(grid.lone[k]), float(grid.common[k]), int(grid.error[k])
+        factor = self.covariance.factor(*settings, *causes)
         n_data = cross.shape[2]
         a = solve_triangular(factor, cross.reshape(-1, n_data).T, lower=True)
         u, q, _ = _reduced(self.data, self.basis, factor)

@@ -8,7 +8,6 @@ from functools import cached_property
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from lmshealth._private.arrays import BoolArray, ComplexArray, FloatArray

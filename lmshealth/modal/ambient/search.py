@@ -137,7 +137,7 @@ def search(
         again = _explain(searched, low, high, suspected, hints, out_of_phase=True)
         if again[0].f.size <= model.f.size and again[0].misfit < model.misfit:
             model, harmonics, after, poles = again
-    # On the channels that show most: the time of a sweep grows with the third power of their number.
+    # On the channels that show most: the time of a sweep is cubic in their number.
     model = _with_likelier_static(_without_splits(model, len(hints)).refined(_SWEEPS))
     if len(first) < len(spectra.channels):
         model, harmonics, after = _of_all_channels(model, harmonics, spectra, first, (low, high))

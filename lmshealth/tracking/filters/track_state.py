@@ -163,6 +163,8 @@ class TrackState:
     alarmed: bool = False  # since the last reset or baseline
     open: ChangeHypothesis | None = None  # a significant change whose kind is not settled
     weighed: tuple[int, int] = (-1, -1)  # the last suspicion that was weighed, and when
+    # Half of what ln f of a first log that was left out is off from ℓ₀, ``(m,)``.
+    off: FloatArray | None = None
 
     def epochs(self) -> list[Epoch]:
         """Return the epochs of all logs."""
@@ -181,7 +183,7 @@ def step(state: TrackState, k: int) -> TrackState:
     resets = [one.first for one in history.steps if one.kind == "reset"]
     if k and (k in history.baselines or k in resets):
         bank = restart(state.space, state.bank, anew=True)
-        state = replace(state, bank=bank, start=k, first=k, alarmed=False)
+        state = replace(state, bank=bank, start=k, first=k, alarmed=False, off=None)
     state = _filter(state, k)
     detected = _detect(state, k)
     news = len(detected.alarms) > len(state.alarms) or len(detected.changes) > len(state.changes)
@@ -273,7 +275,19 @@ def _first_judged(state: TrackState, k: int, *, news: bool) -> TrackState:
         outlying=outlying,
     )
     again = replace(again, checkpoints=(*again.checkpoints[:-1], replace(last, epoch=epoch)))
-    return reduce(_filter, range(first + 1, k + 1), again)
+    again = reduce(_filter, range(first + 1, k + 1), again)
+    return replace(again, off=_half_deviations(again, first, outlying) if outlying.any() else None)
+
+
+def _half_deviations(state: TrackState, first: int, outlying: BoolArray) -> FloatArray:
+    """Return half of what ln f of a log that was left out is off from ℓ₀, ``(m,)``."""
+    space, history = state.space, state.space.history
+    x = state.published.padded(space.size).mean.copy()
+    x[space.level] = x[space.base]
+    n_series = len(history.series)
+    off = history.ln_frequency[first] - (space.matrix(first) @ x)[:n_series]
+    off = np.where(outlying[:n_series], off, 0.0) / 2
+    return np.array([off[list(history.columns(mode))].mean() for mode in history.modes])
 
 
 def _judged_backwards(space: StateSpace) -> tuple[BoolArray, FloatArray]:
@@ -430,9 +444,13 @@ def _alarmed(state: TrackState, k: int, evidence: float) -> TrackState:
 def _row(state: TrackState, own: Gaussian) -> Published:
     """Return what is published of a state."""
     space, size = state.space, 4 * state.space.n_modes
-    cov = own.cov[:size, :size]
+    mean, cov = own.mean[:size].copy(), own.cov[:size, :size].copy()
+    if state.off is not None:
+        # Both explanations of a first log that was left out, an error and a change, are inside.
+        mean[space.base] += state.off
+        cov[space.base, space.base] += np.outer(state.off, state.off)
     return Published(
-        own.mean[:size],
+        mean,
         cov.diagonal().copy(),
         space.drift @ cov @ space.drift.T,
         state.bank.weight @ state.bank.hyperparameters.scales,

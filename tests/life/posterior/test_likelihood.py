@@ -6,6 +6,7 @@ import re
 from dataclasses import replace
 from itertools import product
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pytest
@@ -118,8 +119,8 @@ def believed(model_std: float, common_std: float = 0.0) -> LifeBelief:
     return LifeBelief(slopes, model_std, constants.INTERCEPT_STD, common_std)
 
 
-def settings(life: LifeSpec) -> list[LifeSetting]:
-    """List the points of the grid, with modes that move alone, and a common wander."""
+def settings(life: LifeSpec, *, in_doubt: bool = False) -> list[LifeSetting]:
+    """List the points of the grid, with modes that move alone, a common wander, a first log."""
     lone_mode, common = life.lone_mode, life.common_wander
     ways: list[tuple[float, float, int | None, float]] = [
         (walk, p * (1 - common - 2 * lone_mode), None, 0.0)
@@ -132,9 +133,17 @@ def settings(life: LifeSpec) -> list[LifeSetting]:
         ways += [(walk, common * p / 2, None, e) for e, (walk, p) in walks]
     scales = zip(constants.NOISE_SCALES, constants.NOISE_SCALE_PRIOR, strict=True)
     deviations = zip(constants.DEVIATION_STDS, constants.DEVIATION_PRIOR, strict=True)
-    return [
+    whole = [
         LifeSetting(walk, scale, deviation, r * p * q, lone, e)
         for (walk, r, lone, e), (scale, p), (deviation, q) in product(ways, scales, deviations)
+    ]
+    if not in_doubt:
+        return whole
+    alternatives: dict[Literal["", "each", "alike"], float] = {"": 0.5, "each": 0.25, "alike": 0.25}
+    return [
+        replace(one, prior=one.prior * p, error=how)
+        for how, p in alternatives.items()
+        for one in whole
     ]
 
 
@@ -152,7 +161,8 @@ def book_by_map_error(
 ) -> list[float]:
     """Log likelihood and prior of each error of the map, of one life, by the dense oracle."""
     drift, alone = drifts_of(density, y, history.clock()[history.baseline :])
-    grid = settings(density.likelihood.data.stage.description.life)
+    life = density.likelihood.data.stage.description.life
+    grid = settings(life, in_doubt=bool(history.in_doubt))
     beliefs = [believed(*(scale * std for std in stds)) for scale, _ in MAP_ERRORS]
     constant = density.likelihood.data.y.size / 2 * np.log(2 * np.pi)
     return [
@@ -195,6 +205,23 @@ def test_likelihood_is_the_dense_multivariate_normal(
     own, common = max(stds[0], 1e-4), stds[1]
     known = np.array([book(history, density, point, own, common) for point in y])
     np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+
+
+@pytest.mark.usefixtures("short_grid")
+@pytest.mark.parametrize("in_doubt", [(0,), (0, 1)])
+@pytest.mark.parametrize("baseline", [0, 5])
+def test_a_first_log_in_doubt_is_right_or_in_error(
+    poor_map: Stage, in_doubt: tuple[int, ...], baseline: int
+) -> None:
+    """The likelihood is the mean over its alternatives, as by the dense oracle, to 1e-9."""
+    history = rough_history(np.random.default_rng(2), baseline=baseline)
+    doubted = replace(history, in_doubt=in_doubt)
+    density, certain = density_of(doubted, poor_map), density_of(history, poor_map)
+    y = coordinates(density, 3)
+    found = density.log_probability(y) - density.scenario.log_prior(y)
+    known = np.array([book(doubted, density, point, MODEL_STD, COMMON_STD) for point in y])
+    np.testing.assert_allclose(found, known, rtol=1e-9, atol=1e-7)
+    assert np.abs(found - certain.log_probability(y) + certain.scenario.log_prior(y)).min() > 0.01
 
 
 @pytest.mark.usefixtures("short_grid")
