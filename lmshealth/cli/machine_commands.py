@@ -34,7 +34,7 @@ from lmshealth.tracking.history import (
     missing_mode_notices,
 )
 from lmshealth.tracking.maintenance import (
-    Action,
+    NO_MAINTENANCE,
     Maintenance,
     maintenance_notices,
     read_actions,
@@ -201,7 +201,7 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     """Read the machines of a table of estimates, and print what it lacks."""
     machines, notes = read_machines(table, given["stage"], **_reading(given))
     print_notes(notes)
-    work = Maintenance(_actions(given))
+    work = _work(given)
     for history, refused in machines:
         found = maintenance_notices(work.of(history.stage), history.recorded_at)
         found += missing_mode_notices(history, refused)
@@ -212,8 +212,9 @@ def _machines(table: Path, given: dict[str, Any]) -> list[Machine]:
     return machines
 
 
-def _actions(given: dict[str, Any]) -> tuple[Action, ...]:
-    return read_actions(given["maintenance"], given["latest"]) if given["maintenance"] else ()
+def _work(given: dict[str, Any]) -> Maintenance:
+    path = given["maintenance"]
+    return Maintenance(read_actions(path, given["latest"])) if path else NO_MAINTENANCE
 
 
 @options.command(
@@ -248,8 +249,8 @@ def _actions(given: dict[str, Any]) -> tuple[Action, ...]:
 def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
     """Predict the remaining travel and time until each limit, and the service date.
 
-    Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. The
-    service is that of the limits which no work after the last log has restored (--maintenance).
+    Modes are tracked first, as by `track`; outliers are left out. Every row needs travel_km. Limits
+    that work after the last log has restored are left out (--maintenance), unless these are all.
     --max-risk and --cost-ratio replace [decision] of the stage description.
     """
     stage, by = given["stage"], given["by"]
@@ -263,18 +264,14 @@ def prognose(ctx: click.Context, /, table: Path, **given: Any) -> None:
             found.append((prognosis_of(posterior, history, stage), posterior))
         except NotEnoughData as why:
             lost.append(str(why))
-    words = {one.name: one.word for one in stage.parameters}
+    words, work = {one.name: one.word for one in stage.parameters}, _work(given)
     for prognosis, _ in found:
-        done = [
-            one.action
-            for one in _actions(given)
-            if one.stage == prognosis.stage and one.recorded_at > prognosis.recorded_at
-        ]
+        done = work.of(prognosis.stage).since(prognosis.recorded_at)
         left = without_limits(prognosis, restored(words, done))
-        life, service, before = summarise_life(prognosis, stage), decide(left, decision), None
-        last = prognosis.recorded_at.date()
+        shown, last = left or prognosis, prognosis.recorded_at.date()
+        life, service, before = summarise_life(shown, stage), decide(left, decision), None
         if by is not None and by > last:
-            before = by, probability_before(prognosis, by)
+            before = by, probability_before(shown, by)
         elif by is not None:
             note = f"{life.stage}: --by {by} is not after the last log ({last}): no probability"
             print_notes([f"{note} is given for that day"])

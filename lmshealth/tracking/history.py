@@ -420,7 +420,7 @@ def _nearest(frequency: float, modes: Sequence[ModeSpec]) -> str:
 
 def _line_up(
     estimates: Sequence[Estimates], found: Association, stage: Stage | None
-) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, FloatArray]]:
+) -> tuple[tuple[str, ...], tuple[Series, ...], dict[str, Any]]:
     """Put the estimates of every mode and source in a column; missing ones are NaN."""
     # A jump keeps its name: the tracker decides whether it is an outlier or a step.
     assigned = [

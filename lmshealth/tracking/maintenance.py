@@ -58,6 +58,10 @@ class Maintenance:
         unread = tuple(one for one in self.unread if one.stage in (machine, "", None))
         return replace(self, actions=actions, unread=unread)
 
+    def since(self, moment: datetime) -> set[str]:
+        """Return what was done after a moment, such as that of the last log."""
+        return {one.action for one in self.actions if one.recorded_at > moment}
+
 
 NO_MAINTENANCE = Maintenance()
 """Maintenance without a table."""

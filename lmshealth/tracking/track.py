@@ -435,8 +435,8 @@ def accepted_estimates(history: History, track: Track, *, doubtful: bool = False
             ln_f[k, own] = np.nan
         ln_zeta[k, own] = np.nan
         cov[k, left_out], cov[k][:, left_out] = np.nan, np.nan
-    changed = {"ln_frequency": ln_f, "ln_damping": ln_zeta, "cov": cov, "steps": steps}
-    return replace(history, in_doubt=tuple(in_doubt), **changed)
+    changed = replace(history, ln_frequency=ln_f, ln_damping=ln_zeta, cov=cov, steps=steps)
+    return replace(changed, in_doubt=tuple(in_doubt))
 
 
 def outlier_refusals(history: History, track: Track) -> list[Refusal]:

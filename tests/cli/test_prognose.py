@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +22,7 @@ from lmshealth.tracking.history import History
 from tests.lives import (
     FADING,
     FREQUENCY,
+    MOUNT,
     START,
     TEMPERATURE,
     make_prognosis,
@@ -215,6 +217,43 @@ def test_work_after_the_last_log_leaves_its_limit_out(
         assert ("Service: not known before a log" in result.stdout) == (not known)
         note = "AX-1: preload-adjust on 2026-03-25: no log since"
         assert (note in plain(result.stderr)) == (not known)
+
+
+@pytest.mark.usefixtures("quick")
+def test_rows_are_of_the_limits_that_no_work_has_restored(
+    table: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit that work after the last log has restored has no row, nor a part in any limit."""
+    make_stage(tmp_path / "stage", (FADING, MOUNT), tail=TAIL)
+    soon, late = np.linspace(1e5, 2e5, 1000), np.linspace(1e6, 2e6, 1000)
+
+    def prognose(_: object, history: History, __: Stage) -> Prognosis:
+        both = np.column_stack([soon, late, soon])
+        made = replace(
+            make_prognosis(soon, np.full(1000, 1e4)),
+            stage=history.stage,
+            parameters=("guide_preload", "mount_stiffness", "any"),
+            limits=np.array([0.6, 0.7, np.nan]),
+            remaining=both,
+            health=np.full((1000, 2), 0.8),
+            curve_quantiles=np.full((5, 3, 2), 0.8),
+        )
+        return made
+
+    monkeypatch.setattr(machine_commands, "prognosis_of", prognose)
+    actions, out = tmp_path / "maintenance.csv", tmp_path / "p.csv"
+    actions.write_text("stage,recorded_at,action\nAX-1,2026-03-25T00:00:00Z,preload-adjust\n")
+    words = ("--stage", tmp_path / "stage" / "small.toml", "--by", "2026-05-01", "--out", out)
+    result = call(table, *words, "--maintenance", actions)
+    assert result.exit_code == 0, result.output
+    rows = pd.read_csv(out).set_index("stage")
+    mended, other = rows.loc["AX-1"], rows.loc["AX-2"]
+    assert mended["parameter"].tolist() == ["mount_stiffness", "any"]
+    assert other["parameter"].tolist() == ["guide_preload", "mount_stiffness", "any"]
+    same = ["rul_km_q50", "probability_at_most"]
+    assert mended[same].iloc[1].tolist() == other[same].iloc[1].tolist()
+    assert mended["rul_km_q50"].iloc[1] > 5 * other["rul_km_q50"].iloc[2]
+    assert mended["service_by"].iloc[1] > other["service_by"].iloc[2]
 
 
 @pytest.mark.parametrize("option", ["--max-risk", "--cost-ratio"])
